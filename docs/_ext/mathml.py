@@ -3,6 +3,7 @@
 `latex2mathml` translates at build time. A formula that it does not know is a warning, and an error with -W.
 """
 
+import re
 from html import escape
 
 from docutils import nodes
@@ -10,11 +11,18 @@ from latex2mathml.converter import convert
 from sphinx.util import logging
 
 _LOG = logging.getLogger(__name__)
+# browsers show no other variant of a letter than the letter itself, so a bold one is Unicode's
+_BOLD = re.compile(r"\\mathbf\s*(?:\{([A-Za-z])\}|([A-Za-z]))")
+
+
+def _bold(match: re.Match[str]) -> str:
+    letter = match[1] or match[2]
+    return chr(0x1D400 + ord(letter) - ord("A") if letter.isupper() else 0x1D41A + ord(letter) - ord("a"))
 
 
 def _formula(node, display: str) -> str:
     try:
-        return convert(node.astext(), display=display)
+        return convert(_BOLD.sub(_bold, node.astext()), display=display)
     except (
         Exception
     ) as error:  # a formula is a text that its author wrote: whatever the translator raises, say where

@@ -427,6 +427,8 @@ def _shown(member: object) -> bool:
     return (inspect.isfunction(function) or isinstance(member, property)) and bool(inspect.getdoc(member))
 
 
+#: Pages that are written by hand, and belong to the reference.
+WRITTEN = ("commands", "folders", "json", "extending", "scripts")
 PAGES = {
     "commands": commands_page,
     "keys": keys_page,
@@ -451,7 +453,7 @@ def write(folder: Path) -> None:
         "",
     ]
     pages = {name: page() for name, page in PAGES.items()}
-    pages["index"] = "\n".join([*index, *PAGES, "```", ""])
+    pages["index"] = "\n".join([*index, *PAGES, *(f"../{one}" for one in WRITTEN), "```", ""])
     for name, text in pages.items():
         path = folder / f"{name}.md"
         if not path.is_file() or path.read_text(encoding="utf-8") != text:

@@ -51,6 +51,8 @@ def test_pages_quote_what_was_measured(maker):
         text = page.read_text(encoding="utf-8")
         quoted += text.count("<!--=-->")
         assert maker.filled(text, said) == text, f"{page.name}: run scripts/makers/measure_documents.py"
+        # a line that begins with a comment ends the paragraph, and what follows it is shown as it is written
+        assert "\n<!--=" not in text, f"{page.name}: a mark begins a line"
     assert quoted > 5
 
 
