@@ -20,7 +20,10 @@ version = release = __version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "mathml", "reference"]
 exclude_patterns = ["_ext", "_build", "**/.ipynb_checkpoints"]
 
-# dollar signs are mathematics; tables of sentences need no more
+# what is public is mdnum.NAME, wherever it is defined
+add_module_names = False
+
+# dollar signs are mathematics
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
 nb_execution_mode = os.environ.get("MDNUM_DOCS_EXECUTE", "off")
@@ -42,7 +45,7 @@ html_theme_options = {
     "navbar_end": ["theme-switcher"],
     "header_links_before_dropdown": 7,
     "navigation_with_keys": False,
-    "show_toc_level": 2,
+    "show_toc_level": 1,
     "footer_start": ["copyright"],
     "footer_end": [],
 }
