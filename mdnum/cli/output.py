@@ -172,12 +172,14 @@ def show(cell: Any) -> str:
 
 
 def print_findings(findings: Iterable[Finding]) -> None:
-    """Each finding as a title line, what was seen, and what to do."""
+    """Each finding as a title line with its code, what was seen, and what to do."""
     from rich.text import Text
 
     for finding in findings:
         line = Text(finding.severity, style=_STYLE.get(finding.severity, ""))
         line.append(f": {finding.title}", style="bold")
+        # the reference has an entry for each code
+        line.append(f" [{finding.code}]", style="dim")
         console().print(line)
         for text in filter(None, (finding.text, finding.remedy)):
             print_prose(text)

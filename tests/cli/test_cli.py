@@ -93,7 +93,7 @@ def test_findings_decide_the_exit_code(rollout: Recorder, capsys, severity: str,
     rollout.summary = {**SUMMARY, "findings": [finding]}
     assert call("run", "argon/crystal-108") == expected
     lines = printed(capsys)
-    assert f"{severity}: A title" in lines and "Do this." in lines
+    assert f"{severity}: A title [x]" in lines and "Do this." in lines
     # a run that did not end is one, too
     rollout.summary = {**SUMMARY, "status": "stopped"}
     assert call("run", "argon/crystal-108") == 1
