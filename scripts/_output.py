@@ -37,19 +37,20 @@ _STYLE: Any = {
 }
 
 
-def parser(script: str, about: str | None) -> argparse.ArgumentParser:
-    """A command line with the script's docstring as its help and -o for the figure.
+def parser(about: str | None, script: str | None = None) -> argparse.ArgumentParser:
+    """A command line with the script's docstring as its help, and -o for the figure of one that draws.
 
     Args:
-        script: the script's __file__; the figure is called after it by default.
         about: the script's docstring.
+        script: its __file__ where it draws a figure, which is called after it by default.
     """
     made = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    default = Path(f"{Path(script).stem}.png")
-    made.add_argument(
-        "-o", "--output", type=Path, default=default, metavar="FILE",
-        help=f"the figure, PNG, SVG or PDF (default {default})",
-    )  # fmt: skip
+    if script is not None:
+        default = Path(f"{Path(script).stem}.png")
+        made.add_argument(
+            "-o", "--output", type=Path, default=default, metavar="FILE",
+            help=f"the figure, PNG, SVG or PDF (default {default})",
+        )  # fmt: skip
     return made
 
 

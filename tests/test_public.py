@@ -29,7 +29,6 @@ INSIDE = {
     "lost_flips.py": {"mdnum.plain"},
     "make_systems.py": {"mdnum.systems.load", "mdnum.systems.structures"},
     "scaling.py": {"mdnum.safe_path"},
-    "topology_flip_report.py": {"mdnum.verbs", "mdnum.verbs.run_page"},
 }
 PROGRAMS = sorted([*(ROOT / "scripts").rglob("*.py"), *(ROOT / "examples").glob("*.py")])
 

@@ -13,15 +13,12 @@ How to read it. The ratio travels to other machines, seconds do not.
 
 from __future__ import annotations
 
-import argparse
-import time
-from collections.abc import Callable
-from statistics import median
-from typing import Any
+from functools import partial
 
 import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
-from _output import start, table
+from _output import parser, start, table
+from _turns import in_turn
 
 from mdnum import ball
 
@@ -32,33 +29,22 @@ WORLDS = {
 }
 
 
-def seconds(call: Callable[[], Any]) -> float:
-    """How long a call takes."""
-    begin = time.perf_counter()
-    call()
-    return time.perf_counter() - begin
-
-
 def main() -> None:
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("--balls", type=int, default=10_000, help="balls of a batch")
-    words.add_argument("--steps", type=int, default=1000, help="steps of 1 ms")
-    words.add_argument("--turns", type=int, default=3, help="turns, of which medians are taken")
-    asked = words.parse_args()
+    """Turns, and their table."""
+    options = parser(__doc__)
+    options.add_argument("--balls", type=int, default=10_000, help="balls of a batch")
+    options.add_argument("--steps", type=int, default=1000, help="steps of 1 ms")
+    options.add_argument("--turns", type=int, default=3, help="turns, of which medians are taken")
+    chosen = options.parse_args()
     rows = []
     for name, (contact, scheme, parameter) in WORLDS.items():
         world = ball.World.create(contact, scheme)
-        problem = ball.BallProblem(world, np.linspace(0.5, 1.5, asked.balls), 0.0, asked.steps)
-
-        def gradient(problem=problem, parameter=parameter):
-            return problem.value_and_grad([parameter, "y0"])
-
-        problem.run()
-        gradient()
-        turns = [(seconds(problem.run), seconds(gradient)) for _ in range(asked.turns)]
-        run, both = (median(column) for column in zip(*turns, strict=True))
+        problem = ball.BallProblem(world, np.linspace(0.5, 1.5, chosen.balls), 0.0, chosen.steps)
+        works = {"run": problem.run, "gradient": partial(problem.value_and_grad, [parameter, "y0"])}
+        taken = in_turn(works, chosen.turns, name)
+        run, both = (float(np.median(spent[1:, 0])) for spent in taken.values())
         rows.append((name, parameter, f"{run:.4f}", f"{both:.4f}", f"{both / run:.2f}"))
-    title = f"{asked.balls:,} balls, {asked.steps:,} steps"
+    title = f"{chosen.balls:,} balls, {chosen.steps:,} steps"
     table(title, ("world", "parameter", "run, s", "gradient, s", "ratio"), rows)
 
 

@@ -16,15 +16,16 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import _shared  # noqa: F401  what scripts share is found by it
 import jax
 import jax.numpy as jnp
+import numpy as np
 from _liquid import liquid
 from _output import parser, say, start, table
 from _peers import float64, jax_md_loop, orthorhombic
+from _turns import in_turn, ratios
 
 import mdnum
 from mdnum.md.jaxmd import upstream
@@ -54,21 +55,15 @@ def measured(atoms: int, form: str, steps: int, turns: int) -> dict[str, Any]:
     theirs, begin = jax_md_loop(pairs, form), time.process_time()
     simulation = of_jax_md(pairs, form)
     door = time.process_time() - begin
-    loops = {"jax-md": theirs, "mdnum": lambda n: list(Engine(simulation, n).segments())}
-    spent: dict[str, list[float]] = {name: [] for name in loops}
-    for turn in range(turns + 1):
-        for name, loop in loops.items():
-            begin = time.process_time()
-            jax.block_until_ready(loop(steps))
-            if turn:
-                spent[name].append((time.process_time() - begin) / steps * 1e3)
-    ratio = median(b / a for a, b in zip(*spent.values(), strict=True))
-    each = {f"{name} ms": median(values) for name, values in spent.items()}
+    loops = {"jax-md": lambda: theirs(steps), "mdnum": lambda: list(Engine(simulation, steps).segments())}
+    taken = in_turn(loops, turns, f"{pairs.atoms} atoms, {form}")
+    each = {f"{name} ms": float(np.median(1e3 * rows[1:, 1] / steps)) for name, rows in taken.items()}
+    ratio = float(np.median(ratios(taken, "mdnum", "jax-md")[:, 1]))
     return {"atoms": pairs.atoms, "list": form, "steps": steps, **each, "ratio": ratio, "door s": door}
 
 
 def main() -> None:
-    options = parser(__file__, __doc__)
+    options = parser(__doc__)
     options.add_argument("--atoms", type=int, nargs="+", default=[500, 4000])
     options.add_argument("--steps", type=int, default=200)
     options.add_argument("--turns", type=int, default=3)

@@ -27,46 +27,32 @@ last table holds what should be; "no" on a machine that is busy with other thing
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
 from _liquid import R_CUT, liquid
-from _output import figure, parser, save, say, start, table
-from _processes import children_seconds, machine
+from _output import parser, say, start, table
+from _turns import Claim, bars, claim, finish, in_turn, on_cores, seconds
 
 OURS, SETS, MERGE = "mdnum", "MDAnalysis, sets", "vesin, sorted merge"
 EVERY, FAR = "every step", "every 100th step"
-ASKED_MS = {EVERY: 1.3, FAR: 9.0}
-ASKED_MILLION, ASKED_OVER_SETS, ASKED_OVER_READING, ASKED_TWO_CORES = 5.0, 10.0, 2.0, 1.8
+#: CPU time of a frame; of one of a million atoms; ratios to other ways.
+MOST_MS, MOST_SECONDS = {EVERY: 1.3, FAR: 9.0}, 5.0
+LEAST_OVER_SETS, MOST_OVER_READING, LEAST_BY_TWO = 10.0, 2.0, 1.8
 # Å of a unit of length, so that the file resolves what flips
 ANGSTROM = 3.4
 # frames that are not timed: compilation, and those before mdnum has made a list
 WARM = 3
-
-
-@dataclass(frozen=True)
-class Speed:
-    """What a contender took for a frame, and what it found."""
-
-    code: str
-    frames: str
-    atoms: int
-    flips: float
-    ms: float
-    cpu_ms: float
-    count: int
 
 
 @dataclass(frozen=True)
@@ -153,34 +139,49 @@ def merge_flips(length: float) -> Callable[[np.ndarray], int]:
 MAKERS = {OURS: mdnum_flips, SETS: set_flips, MERGE: merge_flips}
 
 
-def turn(make: Callable[[float], Callable[[np.ndarray], int]], length: float, frames: list[np.ndarray]):
-    """(ms, CPU ms, flips) of a frame, once a contender is warm."""
-    step, begin, flips = make(length), (0.0, 0.0), 0
-    for at, x in enumerate(frames):
-        if at == WARM:
-            begin, flips = (time.perf_counter(), time.process_time()), 0
-        flips += step(x)
-    count = len(frames) - WARM
-    wall, busy = time.perf_counter() - begin[0], time.process_time() - begin[1]
-    return 1e3 * wall / count, 1e3 * busy / count, flips / count
+class Turn:
+    """One contender through its frames, timed once it is warm."""
+
+    def __init__(self, make: Callable[[float], Callable[[np.ndarray], int]], length: float, frames: list):
+        self.make, self.length, self.frames = make, length, frames
+        self.taken: list[tuple[float, float, float]] = []  # ms, CPU ms and flips of a frame, for each turn
+
+    def __call__(self) -> None:
+        """One turn."""
+        step, flips = self.make(self.length), 0
+        for x in self.frames[:WARM]:
+            step(x)
+
+        def rest() -> None:
+            nonlocal flips
+            flips = sum(step(x) for x in self.frames[WARM:])
+
+        wall, busy = 1e3 * seconds(rest) / self.count
+        self.taken.append((wall, busy, flips / self.count))
+
+    @property
+    def count(self) -> int:
+        """Frames that are timed."""
+        return len(self.frames) - WARM
 
 
-def race(length: float, name: str, frames: list[np.ndarray], slow: int, turns: int) -> list[Speed]:
-    """Let the contenders take turns."""
-    taken: dict[str, list[tuple[float, float, float]]] = {code: [] for code in MAKERS}
-    short = frames[: WARM + slow]
-    for code, make in MAKERS.items():
-        say(f"{name}: {code}")
-        turn(make, length, short[: WARM + 2])
-    for _ in range(turns):
-        for code, make in MAKERS.items():
-            taken[code].append(turn(make, length, short if code == SETS else frames))
+def race(length: float, name: str, frames: list[np.ndarray], slow: int, turns: int) -> list[dict[str, Any]]:
+    """Let the contenders take turns; the best turn of each by CPU time."""
+    contenders = {
+        code: Turn(make, length, frames[: WARM + slow] if code == SETS else frames)
+        for code, make in MAKERS.items()
+    }
+    in_turn(contenders, turns, name)
     made = []
-    for code, rows in taken.items():
-        ms, cpu_ms, flips = min(rows, key=lambda row: row[1])
-        count = len(short if code == SETS else frames) - WARM
-        made.append(Speed(code, name, len(frames[0]), flips, ms, cpu_ms, count))
-    ours, merged = (next(one.flips for one in made if one.code == code) for code in (OURS, MERGE))
+    for code, one in contenders.items():
+        ms, cpu_ms, flips = min(one.taken[1:], key=lambda row: row[1])
+        made.append(
+            {
+                "code": code, "frames": name, "atoms": len(frames[0]), "flips": flips, "ms": ms,
+                "cpu_ms": cpu_ms, "count": one.count,
+            }
+        )  # fmt: skip
+    ours, merged = (next(one["flips"] for one in made if one["code"] == code) for code in (OURS, MERGE))
     if abs(ours - merged) > 1e-3 * merged:
         raise RuntimeError(f"mdnum finds {ours:g} flips a frame, vesin's lists differ by {merged:g}")
     return made
@@ -219,43 +220,21 @@ def written(path: Path, length: float, frames: list[np.ndarray], total: int) -> 
             file.write(universe.atoms)
 
 
-def taken(work: Callable[[], object]) -> tuple[float, float]:
-    """(CPU seconds, children included; seconds by the clock), the smallest of two times."""
-    found = []
-    for _ in range(2):
-        busy, wall = time.process_time() + children_seconds(), time.perf_counter()
-        work()
-        found.append((time.process_time() + children_seconds() - busy, time.perf_counter() - wall))
-    return min(one[0] for one in found), min(one[1] for one in found)
-
-
 def file_costs(
-    length: float, frames: list[np.ndarray], totals: tuple[int, int], cores: set[int]
-) -> list[Any]:
-    """What reading a file, the command on it, and `NeighborFlips` in one process and two take."""
+    length: float, frames: list[np.ndarray], totals: tuple[int, int], cores: list[int]
+) -> list[dict[str, Any]]:
+    """What reading a file, the command on it, and `NeighborFlips` in one process and two take.
+
+    The least of two times.
+    """
     import MDAnalysis
 
     from mdnum.trajectories import NeighborFlips, open_trajectory
 
     radius, made = R_CUT * ANGSTROM, []
-
-    def add(what: str, work: Callable[[], object]) -> None:
-        cpu_seconds, seconds = taken(work)
-        made.append({"frames": total, "what": what, "cpu_seconds": cpu_seconds, "seconds": seconds})
-
     with tempfile.TemporaryDirectory() as folder:
         path, out = Path(folder) / "liquid.xtc", Path(folder) / "out"
-        command = [
-            sys.executable,
-            "-m",
-            "mdnum",
-            "flips",
-            str(path),
-            "--cutoff",
-            str(radius),
-            "--out",
-            str(out),
-        ]
+        command = [sys.executable, "-m", "mdnum", "flips", str(path), "--cutoff", str(radius), "-o", str(out)]
 
         def whole() -> None:
             shutil.rmtree(out, ignore_errors=True)
@@ -264,18 +243,22 @@ def file_costs(
             if done.returncode > 1:
                 raise RuntimeError(done.stderr)
 
+        works: dict[str, Callable[[], object]] = {
+            "reading": lambda: deque(open_trajectory(path).frames(), 0), "command": whole
+        }  # fmt: skip
         if len(cores) > 1:
-            os.sched_setaffinity(0, set(sorted(cores)[:2]))
+            os.sched_setaffinity(0, set(cores[:2]))
+            for name, how in (("one", {}), ("two", {"backend": "multiprocessing", "n_workers": 2})):
+                works[name] = lambda how=how: NeighborFlips(
+                    MDAnalysis.Universe(str(path), to_guess=()), radius
+                ).run(**how)
         for total in totals:
             written(path, length, frames, total)
-            add("reading", lambda: deque(open_trajectory(path).frames(), 0))
-            add("command", whole)
-            for name, how in (("one", {}), ("two", {"backend": "multiprocessing", "n_workers": 2})):
-                if len(cores) > 1:
-                    universe = MDAnalysis.Universe(str(path), to_guess=())
-                    add(name, lambda how=how, of=universe: NeighborFlips(of, radius).run(**how))
-        if len(cores) > 1:
-            os.sched_setaffinity(0, set(sorted(cores)[:1]))
+            for what, work in works.items():
+                say(f"{total:,} frames of a file: {what}")
+                wall, busy = np.min([seconds(work) for _ in range(2)], axis=0).tolist()
+                made.append({"frames": total, "what": what, "cpu_seconds": busy, "seconds": wall})
+        on_cores(1)
     return made
 
 
@@ -286,63 +269,53 @@ def many(moved: Motion, name: str, chosen: list[np.ndarray], copies: tuple[int, 
     edges = moved.length * np.array(copies)
     places = np.stack(np.meshgrid(*[np.arange(n) for n in copies], indexing="ij"), -1).reshape(-1, 1, 3)
     order = np.random.default_rng(1).permutation(len(places) * len(chosen[0]))
-    tracker, seconds, busy, flips = Tracker(CutoffRule(R_CUT)), [], [], 0
+    tracker, taken = Tracker(CutoffRule(R_CUT)), []
+    flips: list[int] = []
     for at, x in enumerate(chosen):
         # as if there were no faces: a copy must not jump back by its own edge in the middle of the large box
         large = np.mod((x + places * moved.length).reshape(-1, 3)[order], edges)
-        wall, cpu = time.perf_counter(), time.process_time()
-        flips += len(tracker.step(Frame(at, 0.0, large, Box(np.diag(edges), np.ones(3, bool)))))
-        seconds.append(time.perf_counter() - wall)
-        busy.append(time.process_time() - cpu)
+        frame = Frame(at, 0.0, large, Box(np.diag(edges), np.ones(3, bool)))
+        taken.append(seconds(lambda frame=frame: flips.append(len(tracker.step(frame)))).tolist())
+    walls, busy = zip(*taken, strict=True)
     return {
-        "frames": name, "atoms": len(order), "pairs": tracker.pairs, "flips": flips / (len(chosen) - 1),
-        "seconds": seconds, "cpu_seconds": busy, "resident_mb": resident_mb(),
+        "frames": name, "atoms": len(order), "pairs": tracker.pairs, "flips": sum(flips) / (len(chosen) - 1),
+        "seconds": walls, "cpu_seconds": busy, "resident_mb": resident_mb(),
     }  # fmt: skip
 
 
-def verdicts(result: dict[str, Any]) -> Iterator[tuple[str, str, str, bool]]:
-    """(what, measured, asked, holds)."""
-    speeds = [Speed(**row) for row in result["speeds"]]
+def claims(result: dict[str, Any]) -> Iterator[Claim]:
+    """What was measured beside what is required."""
     for name in (EVERY, FAR):
-        by_code = {row.code: row for row in speeds if row.frames == name}
-        ours = by_code[OURS].cpu_ms
-        yield f"mdnum, {name}", f"{ours:.2f} ms", f"<= {ASKED_MS[name]:g} ms", ours <= ASKED_MS[name]
-        ratio = by_code[SETS].cpu_ms / ours
-        yield (
-            f"{SETS} / mdnum, {name}", f"{ratio:.0f}", f">= {ASKED_OVER_SETS:g}", ratio >= ASKED_OVER_SETS
-        )  # fmt: skip
-        ratio = by_code[MERGE].cpu_ms / ours
-        yield f"{MERGE} / mdnum, {name}", f"{ratio:.1f}", "> 1", ratio > 1
+        ms = {row["code"]: row["cpu_ms"] for row in result["speeds"] if row["frames"] == name}
+        yield claim(f"mdnum, {name}", ms[OURS], "<=", MOST_MS[name], "ms")
+        yield claim(f"{SETS} / mdnum, {name}", ms[SETS] / ms[OURS], ">=", LEAST_OVER_SETS)
+        yield claim(f"{MERGE} / mdnum, {name}", ms[MERGE] / ms[OURS], ">", 1)
     files = {(row["what"], row["frames"]): row for row in result["file"]}
     short, long = sorted({row["frames"] for row in result["file"]})
     for clock, name in (("cpu_seconds", "by CPU time"), ("seconds", "by the clock")):
         command, reading = ([files[what, n][clock] for n in (short, long)] for what in ("command", "reading"))
-        of = {
+        over = {
             f"{short:,} frames": command[0] / reading[0],
             f"{long:,} frames": command[1] / reading[1],
             "a further frame": (command[1] - command[0]) / (reading[1] - reading[0]),
         }
-        for what, ratio in of.items():
-            holds = ratio <= ASKED_OVER_READING
-            yield f"command / reading, {what}, {name}", f"{ratio:.1f}", f"<= {ASKED_OVER_READING:g}", holds
+        for what, ratio in over.items():
+            yield claim(f"command / reading, {what}, {name}", ratio, "<=", MOST_OVER_READING)
     for frames in (short, long):
         if ("two", frames) in files:
             ratio = files["one", frames]["seconds"] / files["two", frames]["seconds"]
-            what, holds = f"one process / two, {frames:,} frames, by the clock", ratio >= ASKED_TWO_CORES
-            yield what, f"{ratio:.2f}", f">= {ASKED_TWO_CORES:g}", holds
+            yield claim(f"one process / two, {frames:,} frames, by the clock", ratio, ">=", LEAST_BY_TWO)
     for row in result["many"]:
-        worst = max(row["cpu_seconds"][1:])
         what = f"{row['atoms']:,} atoms, {row['frames']}, slowest frame"
-        yield what, f"{worst:.1f} s", f"< {ASKED_MILLION:g} s", worst < ASKED_MILLION
-    if len(result["memory"]) > 1:
-        first, last = (result["memory"][k]["resident_mb"] for k in (0, -1))
-        yield "memory, last quarter over first", f"{last / first:.2f}", "<= 1.05", last <= 1.05 * first
+        yield claim(what, max(row["cpu_seconds"][1:]), "<", MOST_SECONDS, "s")
+    first, last = (result["memory"][k]["resident_mb"] for k in (0, -1))
+    yield claim("memory, last quarter over first", last / first, "<=", 1.05)
 
 
 def show(result: dict[str, Any]) -> None:
     """Print the tables."""
     table(
-        result["machine"],
+        "flips between frames",
         ("frames", "code", "N", "flips", "ms/frame", "CPU ms/frame", "frames timed"),
         (
             (
@@ -378,25 +351,10 @@ def show(result: dict[str, Any]) -> None:
             for row in result["file"]
         ),
     )
-    table("\nratios", ("what", "measured", "asked", "holds"), verdicts(result))
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
-    """CPU time of a frame, by code, a panel for each spacing of frames."""
-    drawn = figure(8.0, 2.8)
-    panels = drawn.subplots(1, 2, sharex=True, sharey=True)
-    for axes, name in zip(panels, (EVERY, FAR), strict=True):
-        rows = [row for row in result["speeds"] if row["frames"] == name]
-        axes.barh([row["code"] for row in rows], [row["cpu_ms"] for row in rows])
-        axes.set_xscale("log")
-        axes.set_title(f"{name}: {rows[0]['flips']:,.0f} flips a frame, N = {rows[0]['atoms']:,}")
-        axes.set_xlabel("CPU ms a frame")
-    panels[0].invert_yaxis()
-    save(drawn, path)
 
 
 def _options() -> argparse.Namespace:
-    made = parser(__file__, __doc__)
+    made = parser(__doc__, __file__)
     made.add_argument("--quick", action="store_true", help="500 atoms and few frames: does it work?")
     made.add_argument("--atoms", type=int, help="about so many (default 10000)")
     made.add_argument("--turns", type=int, help="turns of each contender (default 2)")
@@ -408,11 +366,7 @@ def _options() -> argparse.Namespace:
 def main() -> None:
     """Parse, measure, print and draw."""
     chosen = _options()
-    cores: set[int] = set()
-    if hasattr(os, "sched_setaffinity"):
-        cores = os.sched_getaffinity(0)
-        # before anything is imported that makes threads
-        os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:1]))
+    cores = on_cores(1)
     os.environ["OMP_NUM_THREADS"] = "1"
     atoms = chosen.atoms or (500 if chosen.quick else 10_000)
     whole, strides = (20, 8) if chosen.quick else (70, 10)
@@ -422,7 +376,7 @@ def main() -> None:
     turns, slow = chosen.turns or (1 if chosen.quick else 2), 4
     result: dict[str, Any] = {"speeds": []}
     for name, frames in ((EVERY, near), (FAR, far)):
-        result["speeds"] += [asdict(row) for row in race(moved.length, name, frames, slow, turns)]
+        result["speeds"] += race(moved.length, name, frames, slow, turns)
     say("file")
     result["file"] = file_costs(moved.length, near, (60, 240) if chosen.quick else (800, 4_000), cores)
     say("memory")
@@ -435,12 +389,12 @@ def main() -> None:
         many(moved, EVERY, [kept[step] for step in range(6)], copies),
         many(moved, FAR, [kept[100 * step] for step in range(1, 4)], copies),
     ]
-    result["machine"] = machine()
-    if chosen.json:
-        print(json.dumps(result, indent=2))
-    else:
-        show(result)
-    draw(result, chosen.output)
+    finish(chosen, result, show, claims)
+    panels: dict[str, list[tuple[str, float]]] = {}
+    for row in result["speeds"]:
+        title = f"{row['frames']}: {row['flips']:,.0f} flips a frame, N = {row['atoms']:,}"
+        panels.setdefault(title, []).append((row["code"], row["cpu_ms"]))
+    bars(chosen.output, "CPU ms a frame", panels)
 
 
 if __name__ == "__main__":

@@ -28,17 +28,15 @@ import json
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
 from _output import figure, parser, save, say, start, table
-from _processes import children_seconds, machine
+from _turns import Claim, claim, finish, in_turn, ratios, seconds
 
 if TYPE_CHECKING:
     from mdnum.systems import System
@@ -46,24 +44,6 @@ if TYPE_CHECKING:
 SINGLE, TRIPLE = "recorded run", "A, B and B|A"
 MOST_RATIO, MOST_SECONDS, MOST_MAP_SECONDS = 3.5, 60.0, 120.0
 BOUNDARIES = 20
-
-
-@dataclass(frozen=True)
-class Row:
-    """One system's medians."""
-
-    system: str
-    atoms: int
-    steps: int
-    turns: int
-    single_ms: float
-    triple_ms: float
-    single_cpu_ms: float
-    triple_cpu_ms: float
-    ratio: float
-    cpu_ratio: float
-    single_compile: float
-    triple_compile: float
 
 
 def system_of(word: str) -> System:
@@ -104,57 +84,44 @@ def triple(system: System) -> Callable[[int], None]:
     return run
 
 
-def timed(loop: Callable[[int], None], steps: int) -> tuple[float, float]:
-    """Clock and CPU seconds."""
-    wall, busy = time.perf_counter(), time.process_time()
-    loop(steps)
-    return time.perf_counter() - wall, time.process_time() - busy
-
-
-def race(word: str, steps: int, turns: int) -> Row:
-    """Let the two take turns on one system."""
-    system = system_of(word)
-    loops = {SINGLE: single(system), TRIPLE: triple(system)}
-    first, taken = {}, {name: [] for name in loops}
-    for name, loop in loops.items():
-        say(f"{system.name}: compiling {name}")
-        first[name] = timed(loop, steps)[1]
-    for turn in range(turns):
-        say(f"{system.name}: turn {turn + 1} of {turns}")
-        for name, loop in loops.items():
-            taken[name].append(timed(loop, steps))
-    one, three = np.array(taken[SINGLE]), np.array(taken[TRIPLE])
-    walls, cpus = (1e3 * np.median(np.stack([one[:, k], three[:, k]]), axis=1) / steps for k in (0, 1))
-    ratios = np.median(three / one, axis=0)
-    return Row(
-        system.name, len(system.atoms), steps, turns, float(walls[0]), float(walls[1]), float(cpus[0]),
-        float(cpus[1]), float(ratios[0]), float(ratios[1]),
-        first[SINGLE] - float(np.median(one[:, 1])), first[TRIPLE] - float(np.median(three[:, 1])),
-    )  # fmt: skip
+def race(system: System, steps: int, turns: int) -> dict[str, Any]:
+    """Let the two take turns on one system; medians."""
+    loops = {SINGLE: partial(single(system), steps), TRIPLE: partial(triple(system), steps)}
+    taken = in_turn(loops, turns, system.name)
+    row: dict[str, Any] = {"system": system.name, "atoms": len(system.atoms), "steps": steps, "turns": turns}
+    for name, loop in (("single", SINGLE), ("triple", TRIPLE)):
+        wall, busy = np.median(taken[loop][1:], axis=0)
+        row |= {f"{name}_ms": float(1e3 * wall / steps), f"{name}_cpu_ms": float(1e3 * busy / steps)}
+        row[f"{name}_compile"] = float(taken[loop][0, 1] - busy)
+    row["ratio"], row["cpu_ratio"] = np.median(ratios(taken, TRIPLE, SINGLE), axis=0).tolist()
+    return row
 
 
 def answered(words: list[str], turns: int) -> dict[str, Any]:
     """Seconds of `mdnum fork` in a fresh process, from the question to the report."""
     taken = []
-    for turn in range(turns):
-        say(f"mdnum fork {' '.join(words)}: turn {turn + 1} of {turns}")
-        with tempfile.TemporaryDirectory() as scratch:
-            busy, wall = children_seconds(), time.perf_counter()
-            subprocess.run(
-                [sys.executable, "-m", "mdnum", "fork", *words, "-o", f"{scratch}/fork"],
-                check=True,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
+    with tempfile.TemporaryDirectory() as scratch:
+        for turn in range(turns):
+            say(f"mdnum fork {' '.join(words)}: turn {turn + 1} of {turns}")
+            out = Path(scratch, f"{turn}")
+            command = [sys.executable, "-m", "mdnum", "fork", *words, "-o", str(out)]
+            taken.append(
+                seconds(
+                    partial(
+                        subprocess.run,
+                        command,
+                        check=True,
+                        stdout=subprocess.DEVNULL,
+                        stderr=subprocess.DEVNULL,
+                    )
+                )
             )
-            taken.append((time.perf_counter() - wall, children_seconds() - busy))
-            summary = json.loads(Path(scratch, "fork", "summary.json").read_text())
+        summary = json.loads(Path(scratch, "0", "summary.json").read_text())
+    wall, busy = np.median(taken, axis=0).tolist()
     return {
-        "words": words,
-        "seconds": median(wall for wall, _ in taken),
-        "cpu_seconds": median(busy for _, busy in taken),
-        "verdict": summary["effect"],
+        "words": words, "seconds": wall, "cpu_seconds": busy, "verdict": summary["effect"],
         "steps": summary["steps"],
-    }
+    }  # fmt: skip
 
 
 def mapped(low: float, high: float, steps: int, most: int) -> dict[str, Any]:
@@ -163,72 +130,63 @@ def mapped(low: float, high: float, steps: int, most: int) -> dict[str, Any]:
     from mdnum.systems import load
 
     say(f"{most} boundaries along sigma")
-    busy, wall, beside = time.process_time(), time.perf_counter(), children_seconds()
-    found = boundaries(load("argon/crystal-108"), "potential.sigma", low, high, steps, most=most)
+    found: list[Any] = []
+
+    def made() -> None:
+        system = load("argon/crystal-108")
+        found.append(boundaries(system, "potential.sigma", low, high, steps, most=most))
+
+    wall, busy = seconds(made).tolist()
     return {
-        "boundaries": len(found.boundaries),
-        "runs": found.evaluations,
-        "steps": steps,
-        "confirmed": sum(one.confirmed is True for one in found.boundaries),
-        "seconds": time.perf_counter() - wall,
-        "cpu_seconds": time.process_time() - busy + children_seconds() - beside,
-    }
+        "boundaries": len(found[0].boundaries), "runs": found[0].evaluations, "steps": steps,
+        "confirmed": sum(one.confirmed is True for one in found[0].boundaries),
+        "seconds": wall, "cpu_seconds": busy,
+    }  # fmt: skip
 
 
-def verdicts(result: dict[str, Any]) -> list[tuple[str, float, str, bool]]:
-    """What was measured against what it should be: (claim, measured, wanted, holds)."""
-    rows = []
+def claims(result: dict[str, Any]) -> Iterator[Claim]:
+    """What was measured beside what is required."""
     for row in result["ratios"]:
         for name, value in (("CPU time", row["cpu_ratio"]), ("clock", row["ratio"])):
-            claim = f"{TRIPLE} over one recorded run, {row['system']}, {name}"
-            rows.append((claim, value, f"<= {MOST_RATIO}", value <= MOST_RATIO))
-    for key, most in (("answer", MOST_SECONDS), ("map", MOST_MAP_SECONDS)):
-        if found := result.get(key):
-            name = "mdnum fork " + " ".join(found["words"]) if key == "answer" else "a map, "
-            name += "" if key == "answer" else f"{found['boundaries']} boundaries of {found['steps']} steps"
-            rows.append((f"seconds: {name}", found["seconds"], f"< {most:g}", found["seconds"] < most))
-    return rows
+            yield claim(f"{TRIPLE} over one recorded run, {row['system']}, {name}", value, "<=", MOST_RATIO)
+    if found := result.get("answer"):
+        yield claim(f"mdnum fork {' '.join(found['words'])}", found["seconds"], "<", MOST_SECONDS, "s")
+    if found := result.get("map"):
+        what = f"a map, {found['boundaries']} boundaries of {found['steps']} steps"
+        yield claim(what, found["seconds"], "<", MOST_MAP_SECONDS, "s")
 
 
 def show(result: dict[str, Any]) -> None:
     """All of it as tables."""
-    print("on " + result["machine"])
     table(
         f"{TRIPLE} beside one recorded run",
         ("system", "N", "steps x turns", "one ms/step", "three", "one CPU", "three", "ratio", "CPU ratio",
          "one compile s", "three"),
         (
             (
-                row.system, f"{row.atoms:,}", f"{row.steps} x {row.turns}", f"{row.single_ms:.3f}",
-                f"{row.triple_ms:.3f}", f"{row.single_cpu_ms:.3f}", f"{row.triple_cpu_ms:.3f}",
-                f"{row.ratio:.2f}", f"{row.cpu_ratio:.2f}", f"{row.single_compile:.1f}",
-                f"{row.triple_compile:.1f}",
+                row["system"], f"{row['atoms']:,}", f"{row['steps']} x {row['turns']}",
+                *(f"{row[f'{name}_ms']:.3f}" for name in ("single", "triple", "single_cpu", "triple_cpu")),
+                *(f"{row[name]:.2f}" for name in ("ratio", "cpu_ratio")),
+                *(f"{row[f'{name}_compile']:.1f}" for name in ("single", "triple")),
             )
-            for row in (Row(**one) for one in result["ratios"])
+            for row in result["ratios"]
         ),
     )  # fmt: skip
     for key in ("answer", "map"):
         if found := result.get(key):
-            print(f"\n{key}: " + ", ".join(f"{name} {_plain(value)}" for name, value in found.items()))
-    table("\nwanted", ("what", "measured", "wanted", "holds"), verdicts(result))
+            table(f"\n{key}", list(found), [[" ".join(one) if isinstance(one, list) else one
+                                              for one in found.values()]])  # fmt: skip
 
 
-def _plain(value: Any) -> str:
-    if isinstance(value, list):
-        return " ".join(value)
-    return f"{value:.1f}" if isinstance(value, float) else str(value)
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Ratios by system, beside what they should not pass."""
-    rows = [Row(**one) for one in result["ratios"]]
     drawn = figure(6.0, 1.4 + 0.6 * len(rows))
     axes = drawn.subplots()
     at = np.arange(len(rows))
-    axes.barh(at - 0.2, [row.cpu_ratio for row in rows], 0.38, label="CPU time")
-    axes.barh(at + 0.2, [row.ratio for row in rows], 0.38, label="clock")
+    axes.barh(at - 0.2, [row["cpu_ratio"] for row in rows], 0.38, label="CPU time")
+    axes.barh(at + 0.2, [row["ratio"] for row in rows], 0.38, label="clock")
     axes.axvline(MOST_RATIO, color="black", lw=0.8, label=f"{MOST_RATIO}")
-    axes.set_yticks(at, [f"{row.system} ({row.atoms:,})" for row in rows])
+    axes.set_yticks(at, [f"{row['system']} ({row['atoms']:,})" for row in rows])
     axes.invert_yaxis()
     axes.set_title(f"{TRIPLE} over one recorded run")
     drawn.legend(loc="outside lower center", ncols=3)
@@ -236,7 +194,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 def _options() -> argparse.Namespace:
-    made = parser(__file__, __doc__)
+    made = parser(__doc__, __file__)
     made.add_argument("--quick", action="store_true", help="the crystal alone, a short turn: does it work?")
     made.add_argument(
         "--systems", nargs="+", metavar="NAME",
@@ -268,17 +226,13 @@ def main() -> None:
         # before this process holds memory of its own
         result["answer"] = answered(["argon/liquid-864", "--vary", "precision"], min(turns, 3))
     for name in names:
-        atoms = len(system_of(name).atoms)
-        result["ratios"].append(asdict(race(name, max(100, round(steps * 864 / atoms)), turns)))
+        system = system_of(name)
+        result["ratios"].append(race(system, max(100, round(steps * 864 / len(system.atoms))), turns))
     if not chosen.no_answers:
         low, high = chosen.along
         result["map"] = mapped(low, high, *((60, 1) if chosen.quick else (500, BOUNDARIES)))
-    result["machine"] = machine()
-    if chosen.json:
-        print(json.dumps(result, indent=2))
-    else:
-        show(result)
-    draw(result, chosen.output)
+    finish(chosen, result, show, claims)
+    draw(result["ratios"], chosen.output)
 
 
 if __name__ == "__main__":

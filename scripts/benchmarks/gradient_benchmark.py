@@ -29,18 +29,16 @@ import argparse
 import json
 import subprocess
 import sys
-import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from statistics import median
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
 from _liquid import liquid
-from _output import figure, parser, save, say, start, table
-from _processes import machine, peak_mb
+from _output import parser, say, start, table
+from _processes import peak_mb
+from _turns import Claim, bars, claim, finish, in_turn, ratios
 
 if TYPE_CHECKING:
     from mdnum.systems import System
@@ -50,32 +48,14 @@ FORWARD, SYMMETRIC, AWARE, LATTICE, REVERSIBLE, JAX_GRAD = (
     "forward", "symmetric", "event-aware", "lattice forward", "reversible", "jax.grad",
 )  # fmt: skip
 NETWORK, BY_WEIGHTS, BY_WEIGHTS_AWARE = "network forward", "network symmetric", "network event-aware"
-#: What each is measured against, and the most that it may cost beside it.
+#: What each is measured against.
 _BESIDE = {
     SYMMETRIC: FORWARD, AWARE: FORWARD, REVERSIBLE: LATTICE, BY_WEIGHTS: NETWORK, BY_WEIGHTS_AWARE: NETWORK,
+    JAX_GRAD: SYMMETRIC,
 }  # fmt: skip
 MOST_RATIO, LEAST_GAIN, MOST_GROWTH, MOST_MB, MOST_BY_WEIGHTS = 3.0, 4.0, 1.1, 2048.0, 5.0
 #: Width of both layers of the network, which has 9,996 weights, and steps of its rollout.
 WIDTH, FEW = 98, 20
-
-
-@dataclass(frozen=True)
-class Row:
-    """A contender's medians at one size.
-
-    Attributes:
-        steps: of one turn; those of jax.grad are as many as fit.
-        ms, cpu_ms: clock and CPU time of a step.
-        ratio, cpu_ratio: over what it stands beside, median over the turns; None where nothing does.
-    """
-
-    name: str
-    atoms: int
-    steps: int
-    ms: float
-    cpu_ms: float
-    ratio: float | None
-    cpu_ratio: float | None
 
 
 def on_the_lattice(system: System) -> System:
@@ -148,24 +128,15 @@ def jax_grad(system: System, most_mb: float) -> tuple[Callable[[int], None], int
     """jax.value_and_grad through jax-md's loop, and how many steps of it fit."""
     import jax
     import jax.numpy as jnp
-    from _peers import float64, orthorhombic
+    from _peers import float64, jax_md_neighbors
     from jax import lax
-    from jax_md import energy, partition, simulate, space
+    from jax_md import simulate
 
     from mdnum.systems import build
 
     simulation = build(system)
-    box = jnp.asarray(orthorhombic(simulation))
-    positions = jnp.mod(jnp.asarray(simulation.positions), box)
+    energy_fn, shift, listed, positions = jax_md_neighbors(simulation)
     velocities = jnp.asarray(simulation.velocities)
-    displacement, shift = space.periodic(box)
-    pair: Any = energy.lennard_jones_neighbor_list(
-        displacement, box, sigma=float64(1.0), epsilon=float64(1.0),
-        r_onset=float64(0.8 * simulation.r_cut), r_cutoff=float64(simulation.r_cut),
-        dr_threshold=float64(simulation.rule.skin), format=partition.OrderedSparse,
-    )  # fmt: skip
-    neighbor_fn, energy_fn = pair
-    listed = neighbor_fn.allocate(positions)
 
     def compiled(steps: int):
         def loss(parameters):
@@ -207,8 +178,10 @@ def jax_grad(system: System, most_mb: float) -> tuple[Callable[[int], None], int
     return run, fit
 
 
-def race(atoms: int, steps: int, turns: int, most_mb: float, without: tuple[str, ...]) -> list[Row]:
-    """Let all take turns at one size."""
+def race(
+    atoms: int, steps: int, turns: int, most_mb: float, without: tuple[str, ...]
+) -> list[dict[str, Any]]:
+    """Let all take turns at one size; medians of a step."""
     system = liquid(atoms)
     loops: dict[str, tuple[Callable[[int], None], int]] = {FORWARD: (forward(system), steps)}
     for name in (SYMMETRIC, AWARE):
@@ -226,27 +199,23 @@ def race(atoms: int, steps: int, turns: int, most_mb: float, without: tuple[str,
         say(f"{atoms} atoms: how many steps of jax.grad fit {most_mb:g} MB")
         run, fit = jax_grad(system, most_mb)
         loops[JAX_GRAD] = (run, min(steps, fit))
-    taken: dict[str, list[tuple[float, float]]] = {name: [] for name in loops}
-    for turn in range(turns + 1):
-        for name, (loop, count) in loops.items():
-            say(f"{atoms} atoms: {f'turn {turn} of {turns}' if turn else 'compiling'}, {name}, {count} steps")
-            wall, busy = time.perf_counter(), time.process_time()
-            loop(count)
-            now = (time.perf_counter() - wall) / count, (time.process_time() - busy) / count
-            if turn:
-                taken[name].append(now)
+    taken = in_turn(
+        {name: partial(loop, count) for name, (loop, count) in loops.items()}, turns, f"{atoms} atoms"
+    )
+    for name, rows in taken.items():
+        # of a step: those of jax.grad are as many as fit
+        taken[name] = rows / loops[name][1]
     rows = []
     for name, (_, count) in loops.items():
-        mine = np.array(taken[name])
-        beside = _BESIDE.get(name)
-        over = None if beside is None else np.median(mine / np.array(taken[beside]), axis=0)
-        if name == JAX_GRAD:
-            over = np.median(mine / np.array(taken[SYMMETRIC]), axis=0)
+        ms, cpu_ms = (1e3 * np.median(taken[name][1:], axis=0)).tolist()
+        over = [None, None]
+        if name in _BESIDE:
+            over = np.median(ratios(taken, name, _BESIDE[name]), axis=0).tolist()
         rows.append(
-            Row(
-                name, len(system.atoms), count, 1e3 * median(mine[:, 0]), 1e3 * median(mine[:, 1]),
-                None if over is None else float(over[0]), None if over is None else float(over[1]),
-            )
+            {
+                "name": name, "atoms": len(system.atoms), "steps": count, "ms": ms, "cpu_ms": cpu_ms,
+                "ratio": over[0], "cpu_ratio": over[1],
+            }
         )  # fmt: skip
     return rows
 
@@ -265,73 +234,49 @@ def _peak_of(method: str, atoms: int, steps: int) -> None:
     print(json.dumps({"peak_mb": peak_mb()}))
 
 
-def verdicts(result: dict[str, Any]) -> list[tuple[str, float, str, bool]]:
-    """What was measured against what it should be: (claim, measured, asked, holds)."""
-    rows = []
-    for row in (Row(**one) for one in result["rows"]):
-        if row.name in _BESIDE:
-            assert row.cpu_ratio is not None
-            claim = f"{row.name} over {_BESIDE[row.name]}, N = {row.atoms:,}, CPU time"
-            most = MOST_BY_WEIGHTS if _BESIDE[row.name] == NETWORK else MOST_RATIO
-            rows.append((claim, row.cpu_ratio, f"<= {most:g}", row.cpu_ratio <= most))
-        elif row.name == JAX_GRAD:
-            assert row.cpu_ratio is not None
-            claim = f"jax.grad over symmetric, N = {row.atoms:,}, {row.steps} steps, CPU time"
-            rows.append((claim, row.cpu_ratio, f">= {LEAST_GAIN:g}", row.cpu_ratio >= LEAST_GAIN))
+def claims(result: dict[str, Any]) -> Iterator[Claim]:
+    """What was measured beside what is required."""
+    for row in result["rows"]:
+        beside = _BESIDE.get(row["name"])
+        if beside is None:
+            continue
+        what = f"{row['name']} over {beside}, N = {row['atoms']:,}, {row['steps']:,} steps, CPU time"
+        if row["name"] == JAX_GRAD:
+            yield claim(what, row["cpu_ratio"], ">=", LEAST_GAIN)
+        else:
+            yield claim(what, row["cpu_ratio"], "<=", MOST_BY_WEIGHTS if beside == NETWORK else MOST_RATIO)
     peaks = result["peaks"]
     back = sorted((one for one in peaks if one["method"] == REVERSIBLE), key=lambda one: one["steps"])
     if len(back) > 1:
         growth = back[-1]["peak_mb"] / back[0]["peak_mb"]
-        claim = f"reversible, peak memory at {back[-1]['steps']:,} over {back[0]['steps']:,} steps"
-        rows.append((claim, growth, f"<= {MOST_GROWTH:g}", growth <= MOST_GROWTH))
+        what = f"reversible, peak memory at {back[-1]['steps']:,} over {back[0]['steps']:,} steps"
+        yield claim(what, growth, "<=", MOST_GROWTH)
     for one in peaks:
         if one["method"] != REVERSIBLE:
-            claim = f"{one['method']}, N = {one['atoms']:,}, {one['steps']:,} steps, peak MB"
-            rows.append((claim, one["peak_mb"], f"<= {MOST_MB:g}", one["peak_mb"] <= MOST_MB))
-    return rows
+            what = f"{one['method']}, N = {one['atoms']:,}, {one['steps']:,} steps, peak"
+            yield claim(what, one["peak_mb"], "<=", MOST_MB, "MB")
 
 
 def show(result: dict[str, Any]) -> None:
     """All of it as tables."""
-    print("on " + result["machine"])
     table(
         "a step of value and gradient (ratio: over the forward run, for jax.grad over symmetric)",
         ("contender", "N", "steps", "ms", "CPU ms", "ratio", "CPU ratio"),
-        [
-            (row.name, f"{row.atoms:,}", f"{row.steps:,}", row.ms, row.cpu_ms, row.ratio, row.cpu_ratio)
-            for row in (Row(**one) for one in result["rows"])
-        ],
+        ([f"{one:,}" if isinstance(one, int) else one for one in row.values()] for row in result["rows"]),
     )
     if result["peaks"]:
         table(
             "\npeak memory of a process",
             ("method", "N", "steps", "MB"),
-            [
-                (p["method"], f"{p['atoms']:,}", f"{p['steps']:,}", f"{p['peak_mb']:.0f}")
-                for p in result["peaks"]
-            ],
+            (
+                (one["method"], f"{one['atoms']:,}", f"{one['steps']:,}", f"{one['peak_mb']:.0f}")
+                for one in result["peaks"]
+            ),
         )
-    table("\nasked", ("what", "measured", "asked", "holds"), verdicts(result))
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
-    """CPU time of a step, by contender and size."""
-    rows = [Row(**one) for one in result["rows"]]
-    sizes = sorted({row.atoms for row in rows})
-    drawn = figure(3.6 * len(sizes) + 1.4, 3.2)
-    for axes, atoms in zip(np.atleast_1d(drawn.subplots(1, len(sizes))), sizes, strict=True):
-        mine = [row for row in rows if row.atoms == atoms]
-        axes.barh(range(len(mine)), [row.cpu_ms for row in mine])
-        axes.set_yticks(range(len(mine)), [row.name for row in mine])
-        axes.set_xscale("log")
-        axes.invert_yaxis()
-        axes.set_xlabel("CPU ms of a step")
-        axes.set_title(f"N = {atoms:,}")
-    save(drawn, path)
 
 
 def _options() -> argparse.Namespace:
-    made = parser(__file__, __doc__)
+    made = parser(__doc__, __file__)
     made.add_argument("--quick", action="store_true", help="256 atoms, a short turn: does it work?")
     made.add_argument("--sizes", type=int, nargs="+", metavar="N", help="atoms (default 500 4000)")
     made.add_argument("--steps", type=int, help="of a rollout (default 1000)")
@@ -368,14 +313,12 @@ def main() -> None:
         if REVERSIBLE not in chosen.without:
             result["peaks"] += [peak(REVERSIBLE, 256, count) for count in (1_000, 100_000)]
     for atoms in sizes:
-        rows = race(atoms, steps, turns, chosen.memory, tuple(chosen.without))
-        result["rows"] += [asdict(row) for row in rows]
-    result["machine"] = machine()
-    if chosen.json:
-        print(json.dumps(result, indent=2))
-    else:
-        show(result)
-    draw(result, chosen.output)
+        result["rows"] += race(atoms, steps, turns, chosen.memory, tuple(chosen.without))
+    finish(chosen, result, show, claims)
+    panels: dict[str, list[tuple[str, float]]] = {}
+    for row in result["rows"]:
+        panels.setdefault(f"N = {row['atoms']:,}", []).append((row["name"], row["cpu_ms"]))
+    bars(chosen.output, "CPU ms of a step", panels)
 
 
 if __name__ == "__main__":

@@ -10,20 +10,20 @@ steps as the others in turn, from the same start. Ratios are medians over the tu
 
 from __future__ import annotations
 
-import argparse
-import os
-import time
-from statistics import median
+from functools import partial
 
 import _shared  # noqa: F401  what scripts share is found by it
+import numpy as np
 from _liquid import R_CUT, SKIN, liquid
-from _output import table
+from _output import parser, start, table
+from _turns import in_turn, on_cores, ratios
 from jax.numpy import exp
 from jax.scipy.special import erfc
 
 import mdnum
 from mdnum.numerics import elementary
 from mdnum.rollout import Engine
+from mdnum.systems import Simulation
 
 
 def morse(r, depth, alpha, r0):
@@ -32,9 +32,9 @@ def morse(r, depth, alpha, r0):
     return depth * (e * e - 2 * e)
 
 
-OWN = mdnum.PairFunction
+FIRST, OWN = "built-in Lennard-Jones", mdnum.PairFunction
 POTENTIALS = {
-    "built-in Lennard-Jones": mdnum.LennardJones(sigma=1.0, epsilon=1.0),
+    FIRST: mdnum.LennardJones(sigma=1.0, epsilon=1.0),
     "the same, u(r2)": OWN(lambda r2, e, s: 4 * e * ((s * s / r2) ** 6 - (s * s / r2) ** 3), e=1.0, s=1.0),
     "the same, u(r)": OWN(lambda r, e, s: 4 * e * ((s / r) ** 12 - (s / r) ** 6), e=1.0, s=1.0),
     "built-in Morse": mdnum.Morse(depth=1.0, alpha=6.0, r0=1.12),
@@ -46,35 +46,36 @@ POTENTIALS = {
 }
 
 
+def steps_of(simulation: Simulation, steps: int) -> None:
+    """So many recorded steps."""
+    for _ in Engine(simulation, steps, rows=False).segments():
+        pass
+
+
 def main() -> None:
     """Turns, and their table."""
-    ask = argparse.ArgumentParser(description="own pair functions beside Lennard-Jones")
-    ask.add_argument("--turns", type=int, default=9)
-    ask.add_argument("--steps", type=int, default=150)
-    ask.add_argument("--xla", action="store_true", help="leave elementary functions to XLA's loop")
-    asked = ask.parse_args()
-    # one core, before XLA starts threads
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    if asked.xla:
+    options = parser(__doc__)
+    options.add_argument("--turns", type=int, default=9)
+    options.add_argument("--steps", type=int, default=150)
+    options.add_argument("--xla", action="store_true", help="leave elementary functions to XLA's loop")
+    chosen = options.parse_args()
+    on_cores(1)
+    if chosen.xla:
         elementary.FUNCTIONS.clear()
-    atoms, spent = liquid(4000).atoms, {name: [] for name in POTENTIALS}
+    atoms = liquid(4000).atoms
     rest = {"timestep": 0.002, "temperature": 0.72, "units": "lj", "skin": SKIN}
-    made = {
-        name: mdnum.simulation(atoms, u, mdnum.Cut("hard", R_CUT), **rest) for name, u in POTENTIALS.items()
+    runs = {
+        name: partial(steps_of, mdnum.simulation(atoms, u, mdnum.Cut("hard", R_CUT), **rest), chosen.steps)
+        for name, u in POTENTIALS.items()
     }
-    for turn in range(asked.turns + 1):
-        for name, simulation in made.items():
-            start = time.process_time()
-            for _ in Engine(simulation, asked.steps, rows=False).segments():
-                pass
-            # the first one compiles
-            spent[name] += [time.process_time() - start] if turn else []
-    first, rows = spent["built-in Lennard-Jones"], []
-    for name, times in spent.items():
-        ratio = median(a / b for a, b in zip(times, first, strict=True))
-        rows.append([name, f"{asked.steps / median(times):.0f}", f"{ratio:.2f}"])
-    table(f"{len(atoms)} atoms", ["potential", "steps/s", "over Lennard-Jones"], rows)
+    taken = in_turn(runs, chosen.turns, f"{len(atoms)} atoms")
+    rows = [
+        (name, f"{chosen.steps / np.median(spent[1:, 1]):.0f}",
+         f"{np.median(ratios(taken, name, FIRST)[:, 1]):.2f}")
+        for name, spent in taken.items()
+    ]  # fmt: skip
+    table(f"{len(atoms)} atoms", ("potential", "steps/s", "over Lennard-Jones"), rows)
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -38,7 +38,8 @@ import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
 from _liquid import liquid
 from _output import figure, parser, save, say, start, table
-from _processes import machine, peak_mb
+from _processes import peak_mb
+from _turns import Claim, claim, finish
 
 from mdnum.safe_path import environment, python
 
@@ -129,31 +130,28 @@ def commands(sizes: list[int]) -> list[dict[str, Any]]:
     return rows
 
 
-def verdicts(result: dict[str, Any]) -> Iterator[tuple[str, float, str, bool]]:
-    """What was measured beside what is asked for: (claim, measured, asked, holds)."""
-
-    def most(what: str, measured: float, asked: float) -> tuple[str, float, str, bool]:
-        return what, measured, f"<= {asked:g}", measured <= asked
-
+def claims(result: dict[str, Any]) -> Iterator[Claim]:
+    """What was measured beside what is required."""
     if "flat" in result:
-        yield most("cost of an atom's step, largest over smallest", result["flat"], 1.3)
+        yield claim("cost of an atom's step, largest over smallest", result["flat"], "<=", 1.3)
     for row in result["sizes"]:
         name = f"{row['atoms']:,.0f} atoms"
-        yield most(f"time added by recording, {name}", row["recording"], 0.07)
+        yield claim(f"time added by recording, {name}", row["recording"], "<=", 0.07)
         if "two_cores" in row:
-            yield f"two cores over one, {name}", row["two_cores"], ">= 1.7", row["two_cores"] >= 1.7
+            yield claim(f"two cores over one, {name}", row["two_cores"], ">=", 1.7)
         if row["atoms"] > 500_000:
-            yield most(f"one search, {name}, CPU s", 1e-6 * row["search_us_per_atom"] * row["atoms"], 0.6)
+            yield claim(
+                f"one search, {name}, CPU s", 1e-6 * row["search_us_per_atom"] * row["atoms"], "<=", 0.6
+            )
     for row in result.get("commands", []):
+        what = f"`mdnum run` of {row['what']}"
         if row["atoms"] < 100_000:
-            yield most(f"`mdnum run` {row['what']}, s", row["seconds"], 7 if "first" in row["what"] else 5)
-            continue
-        if "again" not in row["what"]:
-            continue
-        yield most(f"`mdnum run` of {row['what']}, over its loop", row["seconds"] / row["loop"], 1.5)
-        if row["atoms"] > 500_000:
-            yield most(f"`mdnum run` of {row['what']}, s a step", row["seconds"] / row["steps"], 2.5)
-            yield most(f"`mdnum run` of {row['what']}, peak MB", row["mb"], 4096)
+            yield claim(what, row["seconds"], "<=", 7 if "first" in row["what"] else 5, "s")
+        elif "again" in row["what"]:
+            yield claim(f"{what}, over its loop", row["seconds"] / row["loop"], "<=", 1.5)
+            if row["atoms"] > 500_000:
+                yield claim(f"{what}, s a step", row["seconds"] / row["steps"], "<=", 2.5)
+                yield claim(f"{what}, peak", row["mb"], "<=", 4096, "MB")
 
 
 def children(sizes: list[int], seconds: float, cores: list[list[int]]) -> list[dict[str, float]]:
@@ -175,6 +173,26 @@ def slope(rows: list[dict[str, float]], name: str) -> float:
     atoms = np.log([row["atoms"] for row in rows])
     each = 0.0 if name == "peak_mb" else atoms
     return float(np.polyfit(atoms, np.log([row[name] for row in rows]) + each, 1)[0])
+
+
+def show(result: dict[str, Any]) -> None:
+    """All of it as tables."""
+    names = ("recording", *_COLUMNS, "two_cores", "together")
+    columns = (
+        "N", "steps", "recording adds", "µs/atom/step", "µs/flip", "search µs/atom", "peak MB", "two cores",
+        "together",
+    )  # fmt: skip
+    rows = [
+        [f"{row['atoms']:,.0f}", row["steps"], *(float(row.get(name, np.nan)) for name in names)]
+        for row in result["sizes"]
+    ]
+    table("growth", columns, rows)
+    if powers := result.get("slopes"):
+        said = ", ".join(f"{name} N^{power:.2f}" for name, power in powers.items())
+        print(f"\nslopes, all atoms and flips together: {said}")
+    if whole := result.get("commands"):
+        cells = [[row[name] for name in ("what", "steps", "seconds", "loop", "mb")] for row in whole]
+        table("\n`mdnum run` from a shell", ("what", "steps", "s", "loop s", "peak MB"), cells)
 
 
 def draw(rows: list[dict[str, float]], path: Path) -> None:
@@ -200,7 +218,7 @@ def draw(rows: list[dict[str, float]], path: Path) -> None:
 
 
 def _options() -> argparse.Namespace:
-    made = parser(__file__, __doc__)
+    made = parser(__doc__, __file__)
     made.add_argument("--sizes", nargs="+", type=int, metavar="N", default=list(SIZES), help="atoms, about")
     made.add_argument("--seconds", type=float, default=SECONDS, help="CPU time of a size's steps, about")
     made.add_argument("--no-commands", action="store_true", help="only the loop")
@@ -231,31 +249,7 @@ def main() -> None:
         result["flat"] = rows[-1]["us_per_atom_step"] / rows[0]["us_per_atom_step"]
     if not chosen.no_commands:
         result["commands"] = commands(chosen.sizes)
-    result["machine"] = machine()
-    if chosen.json:
-        print(json.dumps(result, indent=2))
-    else:
-        print("on " + result["machine"])
-        names = ("recording", *_COLUMNS, "two_cores", "together")
-        cells = [
-            [f"{row['atoms']:,.0f}", row["steps"], *(float(row.get(name, np.nan)) for name in names)]
-            for row in rows
-        ]
-        columns = (
-            "N", "steps", "recording adds", "µs/atom/step", "µs/flip", "search µs/atom", "peak MB",
-            "two cores", "together",
-        )  # fmt: skip
-        table("growth", columns, cells)
-        if powers := result.get("slopes"):
-            said = ", ".join(f"{name} N^{power:.2f}" for name, power in powers.items())
-            print(f"\nslopes, all atoms and flips together: {said}")
-        if whole := result.get("commands"):
-            cells = [[row["what"], row["steps"], row["seconds"], row["loop"], row["mb"]] for row in whole]
-            table("\n`mdnum run` from a shell", ("what", "steps", "s", "loop s", "peak MB"), cells)
-        table("\nasked", ("what", "measured", "asked", "holds"), (
-            (what, f"{measured:.3g}", asked, "yes" if holds else "no")
-            for what, measured, asked, holds in verdicts(result)
-        ))  # fmt: skip
+    finish(chosen, result, show, claims)
     if len(rows) > 1:
         draw(rows, chosen.output)
 

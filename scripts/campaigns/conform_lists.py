@@ -28,7 +28,7 @@ _SLOW = ("jax-md", "jax-md-kept")
 
 def main() -> None:
     """Examine, tabulate, draw."""
-    made = parser(__file__, __doc__)
+    made = parser(__doc__, __file__)
     made.add_argument("lists", nargs="*", metavar="LIST", help="names, or package.module:function")
     made.add_argument("--all", action="store_true", help="the slow ones, too")
     made.add_argument("--large", action="store_true", help="ask about 5,000 and 100,000 atoms, too")

@@ -475,13 +475,15 @@ def _rows(made: Campaign, damages: int, seed: int) -> list[dict[str, object]]:
 
 def main() -> None:
     """The campaign from the command line."""
-    command_line = parser(__file__, __doc__)
+    command_line = parser(__doc__)
     command_line.add_argument("--damages", type=int, default=300, metavar="N", help="how many (default 300)")
     command_line.add_argument("--seed", type=int, default=0, help="what they are drawn with (default 0)")
     command_line.add_argument(
         "--kinds", default=",".join(KINDS), metavar="K,K", help=f"of {', '.join(KINDS)} (default all)"
     )
-    command_line.set_defaults(output=None)
+    command_line.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help="every damage as JSON, a line each"
+    )
     asked = command_line.parse_args()
     with tempfile.TemporaryDirectory() as root:
         rows = campaign(Path(root), tuple(asked.kinds.split(",")), asked.damages, asked.seed)

@@ -24,134 +24,64 @@ float32.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
-
 import _shared  # noqa: F401  what scripts share is found by it
-import numpy as np
-from _output import figure, parser, save, say, start, table
+from _output import parser, say, start, table
 
 from mdnum.md.cutoffs import CUTOFFS
 from mdnum.references import check_energy, check_pairs
-from mdnum.systems import System, load, names
-
-KINDS = tuple(CUTOFFS)
+from mdnum.systems import load, names
 
 
-@dataclass(frozen=True)
-class Row:
-    """The worse of two frames of a system: relative differences."""
+def compared(name: str, kind: str | None) -> tuple[object, ...]:
+    """A row: the worse of two frames of a system, as it is and displaced.
 
-    system: str
-    cutoff: str
-    reference: str
-    energy: float
-    force: float
-    stress: float | None
-    third: float | None
-    ok: bool
-
-
-def subjects(chosen: list[str], every_kind: list[str]) -> Iterator[tuple[str, str]]:
-    """Names of systems with kinds of cutoff; "" is the system's own."""
-    for name in chosen:
-        system = load(name)
-        own = system.spec.cutoff
-        yield name, ""
-        if own is not None and name in every_kind:
-            yield from ((name, kind) for kind in KINDS if kind != own.kind)
-
-
-def compare(name: str, kind: str) -> Row:
-    """Energies, forces and stresses of one system, as it is and displaced."""
+    Args:
+        kind: of its cutoff; None for the system's own.
+    """
     system = load(name, {"cutoff.kind": kind} if kind else None)
     displaced = system.atoms.copy()
     displaced.rattle(stdev=0.01 * system.r_cut, seed=1)
-    made = check_energy(system, {"as it is": system.atoms, "displaced": displaced})
-    stress = [frame.stress_rel for frame in made.frames if frame.stress_rel is not None]
-    third = [frame.energy_third for frame in made.frames if frame.energy_third is not None]
+    report = check_energy(system, {"as it is": system.atoms, "displaced": displaced})
+    worst: list[str | None] = []
+    for quantity in ("energy_rel", "force_rel", "stress_rel", "energy_third"):
+        values = [getattr(frame, quantity) for frame in report.frames]
+        largest = max((value for value in values if value is not None), default=None)
+        worst.append(None if largest is None else f"{largest:.1e}")
     cutoff = system.spec.cutoff
-    return Row(
-        name,
-        cutoff.kind if cutoff is not None else "its own",
-        made.reference,
-        max(frame.energy_rel for frame in made.frames),
-        max(frame.force_rel for frame in made.frames),
-        max(stress, default=None),
-        max(third, default=None),
-        made.ok,
-    )
-
-
-def draw(rows: list[Row], path: Path) -> None:
-    """Relative differences on a logarithmic axis, with the tolerances."""
-    drawn = figure(9.0, 1.5 + 0.24 * len(rows))
-    axes = drawn.subplots()
-    floor = 2.0**-54
-    at = np.arange(len(rows))[::-1]
-    for name, marker, values in (
-        ("energy", "o", [row.energy for row in rows]),
-        ("force", "s", [row.force for row in rows]),
-        ("stress", "^", [np.nan if row.stress is None else row.stress for row in rows]),
-    ):
-        # equal to the last bit has no logarithm: drawn at half an ulp
-        axes.plot(np.maximum(values, floor), at, marker, ms=5, label=name)
-    axes.axvline(1e-12, color="#999999", lw=1, ls="--", label="tolerance of pair energies")
-    axes.axvline(1e-10, color="#333333", lw=1, ls="--", label="tolerance of forces")
-    axes.set_xscale("log")
-    axes.set_yticks(at, [f"{row.system}, {row.cutoff}" for row in rows])
-    axes.set_xlabel("relative difference (at the left edge: none)")
-    drawn.legend(loc="outside lower center", ncols=5)
-    save(drawn, path)
-
-
-def print_pairs(system: System) -> None:
-    """The pair sets of every search as a table."""
-    made = check_pairs(system)
-    columns = ("search", "version", "pairs", "missing", "extra", "borderline", "stops counting", "verdict")
-    table(
-        f"\n{system.name}: {made.pairs:,} pairs with {made.compare} {made.r_cut:.6g} {system.units.length}",
-        columns,
-        ([row[column] for column in columns] for row in made.rows()),
-    )
+    return name, cutoff.kind if cutoff is not None else "its own", report.reference, *worst, report.ok
 
 
 def main() -> None:
-    """Parse, compare, print and draw."""
-    made = parser(__file__, __doc__)
-    made.add_argument("systems", nargs="*", metavar="SYSTEM", help="default: all that are shipped")
-    made.add_argument(
+    """Parse, compare and print."""
+    options = parser(__doc__)
+    options.add_argument("systems", nargs="*", metavar="SYSTEM", help="default: all that are shipped")
+    options.add_argument(
         "--every-kind", nargs="*", default=["argon/liquid-864"], metavar="SYSTEM",
         help="systems to compare with every kind of cutoff (default argon/liquid-864); "
         "without a name: all, which takes minutes",
     )  # fmt: skip
-    made.add_argument(
+    options.add_argument(
         "--pairs", default="argon/crystal-500", metavar="SYSTEM",
         help="system whose pairs are compared (default argon/crystal-500)",
     )  # fmt: skip
-    chosen = made.parse_args()
+    chosen = options.parse_args()
     wanted = chosen.systems or names("md")
     rows = []
-    for name, kind in subjects(wanted, chosen.every_kind or wanted):
-        say(f"{name} {kind}")
-        rows.append(compare(name, kind))
-    table(
-        "against ASE, relative",
-        ("system", "cutoff", "reference", "energy", "force", "stress", "numpy energy", "agrees"),
-        (
-            (
-                row.system, row.cutoff, row.reference, f"{row.energy:.1e}", f"{row.force:.1e}",
-                None if row.stress is None else f"{row.stress:.1e}",
-                None if row.third is None else f"{row.third:.1e}", row.ok,
-            )
-            for row in rows
-        ),
-        words=3,
-    )  # fmt: skip
+    for name in wanted:
+        own = load(name).spec.cutoff
+        others = () if own is None or name not in (chosen.every_kind or wanted) else set(CUTOFFS) - {own.kind}
+        for kind in (None, *sorted(others)):
+            say(f"{name} {kind or ''}")
+            rows.append(compared(name, kind))
+    columns = ("system", "cutoff", "reference", "energy", "force", "stress", "numpy energy", "agrees")
+    table("against ASE, relative", columns, rows, words=3)
     say(f"pairs of {chosen.pairs}")
-    print_pairs(load(chosen.pairs))
-    draw(rows, chosen.output)
+    system = load(chosen.pairs)
+    report = check_pairs(system)
+    columns = ("search", "version", "pairs", "missing", "extra", "borderline", "stops counting", "verdict")
+    limit = f"{report.compare} {report.r_cut:.6g} {system.units.length}"
+    title = f"\n{system.name}: {report.pairs:,} pairs with {limit}"
+    table(title, columns, ([row[column] for column in columns] for row in report.rows()))
 
 
 if __name__ == "__main__":

@@ -141,7 +141,7 @@ def draw(fine: dict[tuple[str, str], list[Row]], own: dict[tuple[str, str], floa
 
 def main() -> None:
     """Parse, turn every knob, print and draw."""
-    made = parser(__file__, __doc__)
+    made = parser(__doc__, __file__)
     made.add_argument("--height", type=float, default=1.0, help="height at the start, m (default 1)")
     made.add_argument("--time", type=float, default=2.0, help="time at the end, s (default 2)")
     made.add_argument("--h", type=float, default=0.01, help="time step, s (default 0.01)")

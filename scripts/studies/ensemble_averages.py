@@ -222,7 +222,7 @@ def mean(a: np.ndarray, blocks: int = 16) -> tuple[float, float]:
 
 def main() -> None:
     """Run and print the table."""
-    made = parser(__file__, __doc__)
+    made = parser(__doc__)
     made.add_argument("--steps", type=int, default=100_000, help="of LAMMPS and mdnum (default %(default)s)")
     made.add_argument("--ase-steps", type=int, default=50_000, help="of ASE (default %(default)s)")
     made.add_argument("--only", nargs="*", metavar="WORD", help="rows with one of these words")

@@ -232,7 +232,7 @@ def draw(paths: list[Descent], target: Target, centers: np.ndarray, path: Path) 
 
 def main() -> None:
     """Parse, make the target, descend with each gradient, print and draw."""
-    made = parser(__file__, __doc__)
+    made = parser(__doc__, __file__)
     made.add_argument("--cells", type=int, default=3, help="fcc cells along an edge (default 3: 108 atoms)")
     made.add_argument("--radius", type=float, default=5.45, help="hard cutoff, Å (default 5.45, 1.6 sigma)")
     made.add_argument("--steps", type=int, default=200, help="of each rollout (default 200)")

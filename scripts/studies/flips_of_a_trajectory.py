@@ -136,7 +136,7 @@ def whole_numbers(text: str) -> list[int]:
 
 def main() -> None:
     """Parse, look, print and draw."""
-    given = parser(__file__, __doc__)
+    given = parser(__doc__, __file__)
     given.add_argument("trajectory", nargs="?", help="a file, or a run of mdnum (default: one is made)")
     given.add_argument("-s", "--topology", help="what its atoms are, where it does not say")
     given.add_argument("--cutoff", type=float, help="length (default that of the mdnum run)")

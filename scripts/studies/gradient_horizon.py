@@ -131,7 +131,7 @@ def draw(found: dict[str, Found], tolerance: float, path: Path) -> None:
 
 def main() -> None:
     """Parse, follow, print, draw."""
-    line = parser(__file__, __doc__)
+    line = parser(__doc__, __file__)
     line.add_argument("--cutoffs", nargs="+", default=list(CUTOFFS), choices=CUTOFFS, help="of these")
     line.add_argument("--atoms", type=int, default=256, help="about so many (default 256)")
     line.add_argument("--steps", type=int, default=2400, help="the longest horizon (default 2400)")

@@ -220,7 +220,7 @@ def draw(rows: list[Row], found: list[Slope], path: Path) -> None:
 
 def main() -> None:
     """Parse, differentiate, print and draw."""
-    made = parser(__file__, __doc__)
+    made = parser(__doc__, __file__)
     made.add_argument("--atoms", nargs="+", type=int, default=[125, 500], metavar="N")
     made.add_argument("--starts", nargs="+", choices=STARTS, default=list(STARTS), metavar="START")
     made.add_argument("--radius", type=float, default=1.6, help="hard cutoff, sigma (default 1.6)")

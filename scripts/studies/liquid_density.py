@@ -80,7 +80,7 @@ def density(time: float, given: dict[str, Any]) -> tuple[float, float, int]:
 
 def main() -> None:
     """Run and print the table."""
-    made = parser(__file__, __doc__)
+    made = parser(__doc__)
     made.add_argument("--time", type=float, default=40.0, help="of each run, τ (default %(default)s)")
     made.add_argument("--only", nargs="*", metavar="WORD", help="rows with one of these words, and the first")
     arguments = made.parse_args()

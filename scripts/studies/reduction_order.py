@@ -87,7 +87,7 @@ def draw(rows: list[Row], system: System, path: Path) -> None:
 
 def main() -> None:
     """Parse, run every reduction, print and draw."""
-    made = parser(__file__, __doc__)
+    made = parser(__doc__, __file__)
     made.add_argument("system", nargs="?", help="a system (default argon/crystal-108, melted)")
     made.add_argument("--steps", type=int, default=3000, help="steps at most (default 3000)")
     made.add_argument(

@@ -93,7 +93,7 @@ def draw(rows: list[Row], path: Path) -> None:
 
 def main() -> None:
     """Parse, run, print."""
-    words = parser(__file__, __doc__)
+    words = parser(__doc__, __file__)
     words.add_argument("--state", default="float32", choices=list(ALL), help="dtype of the state")
     words.add_argument("--sums", nargs="+", default=["float32", "bfloat16", "float16"], choices=list(ALL))
     words.add_argument("--orders", nargs="+", default=list(ORDERS), help="orders of the sum")

@@ -97,7 +97,7 @@ def compared(row: Row, half: Row) -> tuple[float, float, bool]:
 
 def main() -> None:
     """Run the study."""
-    options = parser(__file__, __doc__)
+    options = parser(__doc__)
     options.add_argument("systems", nargs="*", help="names or paths (default: every shipped one)")
     options.add_argument("--steps", type=int, default=4_000, help="steps at the system's own time step")
     asked = options.parse_args()
