@@ -7,117 +7,152 @@ computed is asked of its folder, so that a worker that dies takes nothing with i
 from __future__ import annotations
 
 import os
+import pickle
+import socket
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
-from contextlib import ExitStack, contextmanager, suppress
-from tempfile import TemporaryDirectory
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
 from time import sleep
 from typing import Any
 
 from mdnum.errors import InputError
 from mdnum.provenance import cores
+from mdnum.safe_path import guard
 
-#: Times that a point may take its process with it before it counts as failed.
-_TRIES = 2
+#: Times that a task may take its process with it before it counts as failed; the last time it is alone.
+_TRIES = 3
 #: Times in a row that an engine may fail without an answer before it is given up.
 _IDLE = 10
 #: Tasks that an executor is given at a time, for each worker: a scheduler need not hold all of a sweep.
 _AHEAD = 3
 
 
-def _pinned(turns: str, width: int) -> None:
-    """Gives a worker cores of its own: XLA takes all that it sees, and heeds no OMP_NUM_THREADS.
+@cache
+def _pinned(width: int) -> None:
+    """Gives this process cores of its own: XLA takes all that it sees, and heeds no OMP_NUM_THREADS.
 
-    Args:
-        turns: a folder in which each worker takes the next number.
+    A core is taken by a lock that ends with its process, so that sweeps of one machine share the cores; where
+    none is left, one is used twice.
     """
-    own = 0
-    while True:
-        try:
-            os.close(os.open(f"{turns}/{own}", os.O_CREAT | os.O_EXCL))
-            break
-        except FileExistsError:
-            own += 1
-    with suppress(AttributeError, OSError):
-        all_of_them = sorted(os.sched_getaffinity(0))
-        first = own * width % len(all_of_them)
-        os.sched_setaffinity(0, (all_of_them * 2)[first : first + width])
+    with suppress(ImportError, AttributeError, OSError):
+        import fcntl
+
+        locks = Path(tempfile.gettempdir(), f"mdnum-cores-{os.getuid()}")
+        locks.mkdir(mode=0o700, exist_ok=True)
+        seen, mine = sorted(os.sched_getaffinity(0)), []
+        for core in seen:
+            lock = os.open(locks / str(core), os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                mine.append(core)
+            except BlockingIOError:
+                os.close(lock)
+            if len(mine) == width:
+                break
+        for thread in os.listdir("/proc/self/task"):
+            os.sched_setaffinity(int(thread), mine or [seen[os.getpid() % len(seen)]])
 
 
-@contextmanager
-def local(workers: int | None = None) -> Iterator[Callable[[], Executor]]:
-    """Processes of this machine, which import no main program: a script needs no guard, a notebook nothing.
+def _answered(
+    work: Callable[[Any], Any], task: Any, caller: tuple[str, int], width: int
+) -> tuple[Any, Exception | None]:
+    """The answer to a task, or the exception it ended with: what a future raises is then its engine's."""
+    if (socket.gethostname(), os.getpid()) != caller:
+        _pinned(width)
+    try:
+        return work(task), None
+    except Exception as error:
+        with suppress(Exception):
+            pickle.loads(pickle.dumps(error))
+            return None, error
+        return None, RuntimeError(f"{type(error).__name__}: {error}")
 
-    Args:
-        workers: default one for each core.
 
-    Yields:
-        what makes a pool, once more after one has broken.
-    """
+class _Engine:
+    """Where tasks are sent: an executor, made again after it has broken unless it is the caller's."""
+
+    def __init__(
+        self, make: Callable[[], Executor], width: int, threads: int,
+        end: Callable[[Executor], Any] | None = None,
+    ):  # fmt: skip
+        self.make, self.end = make, end
+        self.width = width  # tasks at a time
+        self.threads = threads  # cores of each
+        self.executor = make()
+
+    def again(self) -> None:
+        """Makes a new executor where it can; every task of the old one is then forgotten."""
+        self.close()
+        with suppress(Exception):
+            self.executor = self.make()
+
+    def close(self) -> None:
+        if self.end is not None:
+            with suppress(Exception):
+                self.end(self.executor)
+
+
+def _local(workers: int | None) -> _Engine:
+    """Processes of this machine, which import no main program: scripts need no guard, notebooks nothing."""
     from loky import get_reusable_executor  # noqa: F401 (its pool starts processes by fork and exec)
     from loky.backend.context import get_context
     from loky.process_executor import ProcessPoolExecutor
 
-    count, width = workers or cores(), max(1, cores() // (workers or cores()))
-    context = get_context("loky")
-    with ExitStack() as stack:
-        turns = stack.enter_context(TemporaryDirectory())
-        made: list[Executor] = []
+    count = workers or cores()
+    context, of = get_context("loky"), (os.getpid(),)
+    return _Engine(
+        lambda: ProcessPoolExecutor(count, context=context, initializer=guard, initargs=of), count,
+        max(1, cores() // count), lambda pool: pool.shutdown(wait=False, kill_workers=True),
+    )  # fmt: skip
 
-        def pool() -> Executor:
-            for old in made:
-                old.shutdown(wait=False, kill_workers=True)  # type: ignore[call-arg]
-            made.clear()
-            started = ProcessPoolExecutor(
-                count, context=context, initializer=_pinned, initargs=(turns, width)
-            )
-            made.append(started)
-            return started
 
-        def ended() -> None:
-            for old in made:
-                old.shutdown(wait=False, kill_workers=True)  # type: ignore[call-arg]
+def _dask(address: str, workers: int | None) -> _Engine:
+    try:
+        from distributed import Client
+    except ImportError:
+        remedy = "Run python3 -m pip install distributed"
+        raise InputError("dask.distributed is not installed", where=address, remedy=remedy) from None
+    clients: list[Client] = []
 
-        stack.callback(ended)
-        yield pool
+    def make() -> Executor:
+        clients[:] = [Client(address, timeout="20s", set_as_default=False)]
+        # equal tasks are one to dask unless they are not pure, and what fails is tried again here
+        return clients[0].get_executor(pure=False, retries=0)
+
+    try:
+        engine = _Engine(make, 1, 1, lambda _: clients[0].close(timeout=5))
+    except OSError as error:
+        remedy = "Start it: dask scheduler; dask worker tcp://host:port"
+        raise InputError(f"no dask scheduler answers: {error}", where=address, remedy=remedy) from None
+    threads = list(clients[0].nthreads().values())
+    engine.width, engine.threads = workers or max(sum(threads), 1), max(threads, default=1)
+    return engine
 
 
 @contextmanager
-def opened(on: str | Executor | None, workers: int | None) -> Iterator[tuple[Callable[[], Executor], int]]:
-    """An engine: None, tcp://host:port of a dask scheduler, or an executor of one's own; with its workers.
+def opened(on: str | Executor | None, workers: int | None) -> Iterator[_Engine]:
+    """An engine: None, tcp://host:port of a dask scheduler, or an executor of one's own.
 
     Raises:
         InputError: no such engine, or its package is missing.
     """
     if on is None:
-        with local(workers) as pool:
-            yield pool, workers or cores()
+        engine = _local(workers)
     elif not isinstance(on, str):
-        yield lambda: on, workers or getattr(on, "_max_workers", cores())
+        width = workers or getattr(on, "_max_workers", cores())
+        engine = _Engine(lambda: on, width, max(1, cores() // width))
     elif on.startswith(("tcp://", "tls://", "ucx://")):
-        with _dask(on) as (pool, count):
-            yield pool, workers or count
+        engine = _dask(on, workers)
     else:
         raise InputError(f"--on {on!r}", remedy="Give tcp://host:port of a dask scheduler")
-
-
-@contextmanager
-def _dask(address: str) -> Iterator[tuple[Callable[[], Executor], int]]:
     try:
-        from dask.distributed import Client
-    except ImportError:
-        remedy = "Run python3 -m pip install distributed"
-        raise InputError("dask.distributed is not installed", where=address, remedy=remedy) from None
-    try:
-        client = Client(address, timeout="20s", set_as_default=False)
-    except OSError as error:
-        remedy = "Start it: dask scheduler; dask worker tcp://host:port"
-        raise InputError(f"no dask scheduler answers: {error}", where=address, remedy=remedy) from None
-    with client:
-        # equal tasks are one to dask unless they are not pure, and what fails is retried by us
-        made = client.get_executor(pure=False, retries=0)
-        yield (lambda: made), max(sum(client.nthreads().values()), 1)
+        yield engine
+    finally:
+        engine.close()
 
 
 def computed(
@@ -133,57 +168,60 @@ def computed(
     Args:
         work: of a task, in another process.
         lost: called with a task whose process ended without an answer, and why: whether it was at work on it.
-            One that was twice is given up, with an exception as its answer; one that was not is begun again.
+            A task that was three times, the last time alone, is given up; one that was not is begun again.
 
     Yields:
         (task, answer), the answer an exception where there is none.
+
+    Raises:
+        InputError: no such engine, or one that fails again and again.
     """
-    waiting, tries, idle = deque(range(len(tasks))), [0] * len(tasks), 0
-    with opened(on, workers) as (pool, width):
-        executor = pool()
+    waiting, alone, tries, idle = deque(range(len(tasks))), deque[int](), [0] * len(tasks), 0
+    caller = socket.gethostname(), os.getpid()
+    with opened(on, workers) as engine:
         running: dict[Future[Any], int] = {}
         try:
-            while waiting or running:
-                broken = ""
-                while waiting and len(running) < _AHEAD * width and not broken:
-                    k = waiting.popleft()
+            while waiting or alone or running:
+                failed, broken = "", False
+                # what may have been lost by a neighbor's fault shows whose it is when it has none
+                some, room = (waiting, _AHEAD * engine.width) if waiting or not alone else (alone, 1)
+                while some and len(running) < room and not broken:
                     try:
-                        running[executor.submit(work, tasks[k])] = k
+                        future = engine.executor.submit(
+                            _answered, work, tasks[some[0]], caller, engine.threads
+                        )
+                        running[future] = some.popleft()
                     except Exception as error:
-                        waiting.appendleft(k)
-                        broken = f"{type(error).__name__}: {error}"
-                done = wait(running, return_when=FIRST_COMPLETED).done if running else ()
-                for future in done:
+                        failed, broken = f"{type(error).__name__}: {error}", True
+                ended = wait(running, return_when=FIRST_COMPLETED).done if running else set[Future[Any]]()
+                if any(isinstance(_error(future), BrokenExecutor) for future in ended):
+                    # all of its futures end
+                    ended = wait(running).done
+                for future in ended:
                     k = running.pop(future)
                     error = _error(future)
                     if error is None:
-                        idle = 0
-                        yield tasks[k], future.result()
+                        idle, (answer, wrong) = 0, future.result()
+                        yield tasks[k], answer if wrong is None else wrong
                         continue
-                    broken = f"{type(error).__name__}: {error}".splitlines()[0]
-                    tries[k] += lost(tasks[k], broken)
+                    failed = f"{type(error).__name__}: {error}".splitlines()[0]
+                    broken = broken or isinstance(error, BrokenExecutor | CancelledError)
+                    tries[k] += lost(tasks[k], failed)
                     if tries[k] >= _TRIES:
-                        idle = 0
                         yield tasks[k], error
                     else:
-                        waiting.append(k)
-                if not broken:
+                        (alone if tries[k] == _TRIES - 1 else waiting).append(k)
+                if not failed:
                     continue
                 idle += 1
-                if idle > _IDLE:
+                if idle > _IDLE or (broken and engine.end is None):
                     remedy = "Is it running, and does its environment have mdnum?"
-                    raise InputError(f"no worker answers: {broken[:300]}", where="the engine", remedy=remedy)
-                if on is None:
-                    # whatever else the pool was given ends with it, and is begun again
-                    for future, k in running.items():
-                        if future.done() and _error(future) is None:
-                            yield tasks[k], future.result()
-                        else:
-                            waiting.append(k)
+                    raise InputError(f"no worker answers: {failed[:300]}", where="the engine", remedy=remedy)
+                sleep(min(idle - 1, 10))
+                if broken:
+                    waiting.extend(running.values())
                     running.clear()
-                    executor = pool()
-                else:
-                    sleep(min(idle, 10))
+                    engine.again()
         finally:
             for future in running:
                 future.cancel()

@@ -167,28 +167,34 @@ class Workspace:
             yield True
         finally:
             ended.set()
-            self._release(address)
+            self._release(claim)
 
     def _claim(self, address: str) -> Path | None:
         held = self.claims(address)
         if held and not gone(held[-1][0]):
             return None
         claim = self.place / f".{address}.claim.{held[-1][1] + 1 if held else 0}"
-        try:
-            number = os.open(claim, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
-        except FileExistsError:
-            return None
-        except OSError as error:
-            raise FolderError(f"no claim can be made: {error.strerror}", where=str(claim)) from None
-        with os.fdopen(number, "w", encoding="utf-8") as opened:
-            json.dump(me(), opened)
+        with disk_errors(claim):
+            try:
+                number = os.open(claim, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
+            except FileExistsError:
+                return None
+            try:
+                with os.fdopen(number, "w", encoding="utf-8") as opened:
+                    json.dump(me(), opened)
+            except OSError:
+                # a full disk has room for a name and none for what is in the file
+                claim.unlink()
+                raise
         return claim
 
-    def _release(self, address: str) -> None:
-        # the latest last: another process that finds none left may begin
-        for file, _ in self.claims(address):
-            with suppress(FileNotFoundError):
-                file.unlink()
+    def _release(self, claim: Path) -> None:
+        # the own one last: another process that finds none left may begin. A later one is of a process that
+        # took this one for gone
+        address, number = claim.name[1:33], int(claim.suffix[1:])
+        for file, earlier in self.claims(address):
+            if earlier <= number:
+                file.unlink(missing_ok=True)
 
     # --- results ------------------------------------------------------------------------------------------
 
@@ -207,20 +213,23 @@ class Workspace:
                 shutil.rmtree(here, ignore_errors=True)
 
     def _publish(self, made: Path, target: Path) -> None:
-        with suppress(OSError):
+        try:
             made.rename(target)
             return
-        # it is there already: measured again, or by somebody whose claim had been given up
-        for file in made.iterdir():
+        except OSError:
+            if not target.is_dir():
+                raise
+        # it is there already: measured again, or by somebody whose claim had been given up; results come last
+        for file in sorted(made.iterdir(), key=lambda file: file.name == RESULT):
             if not file.is_dir():
                 os.replace(file, target / file.name)
 
     def swept(self) -> int:
         """Removes what processes that are gone left half done; how many folders those were."""
         count = 0
-        held = {file.name[1:33] for file, _ in self.claims() if not gone(file)}
-        for folder in self.place.glob(".????????????????????????????????.*.*"):
-            if folder.is_dir() and folder.name[1:33] not in held:
+        # folders before claims: whoever makes a folder has claimed its point before
+        for folder in [one for one in self.place.glob(".*.*.*") if one.is_dir()]:
+            if all(gone(claim) for claim, _ in self.claims(folder.name[1:33])):
                 shutil.rmtree(folder, ignore_errors=True)
                 count += 1
         return count
@@ -258,12 +267,9 @@ def born(pid: int) -> str | None:
         pass
     with suppress(OSError, IndexError):
         # the name in parentheses may hold anything
-        return (
-            Path(f"/proc/{pid}/stat")
-            .read_text(encoding="utf-8", errors="replace")
-            .rpartition(")")[2]
-            .split()[19]
-        )
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2]
+        # one that was killed has its number until whoever started it looks
+        return None if stat.split()[0] in "ZX" else stat.split()[19]
     return ""
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import socket
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.errors import FolderError, MdnumError
+from mdnum.errors import FolderError, InputError, MdnumError
 from mdnum.sweeps.measures import Sample, chosen, measured
 from mdnum.sweeps.plan import resolved
-from mdnum.sweeps.points import Workspace, write_result
+from mdnum.sweeps.points import Workspace, code, write_result
 
 _SERIES = "series.parquet"
 
@@ -36,7 +38,10 @@ def enough(result: Mapping[str, Any] | None, measures: Sequence[str]) -> bool:
     """Whether a stored result has all that is asked."""
     if result is None:
         return False
-    return result["status"] == "failed" or all(name in result["measures"] for name in measures)
+    if result["status"] == "failed":
+        # what failed for no reason of its own, such as a process that was killed, is tried by the next sweep
+        return not result.get("again", False)
+    return all(name in result["measures"] for name in measures)
 
 
 def work(task: Task) -> list[dict[str, Any]]:
@@ -47,6 +52,12 @@ def work(task: Task) -> list[dict[str, Any]]:
     """
     place, told = Workspace(Path(task.workspace)), []
     for point in task.points:
+        if point["state"]["code"] != code():
+            raise InputError(
+                "a worker has another mdnum, jax or numpy than the sweep",
+                where=f"{sys.prefix} on {socket.gethostname()}",
+                remedy="Give it the same environment: points are stored by the code that computes them",
+            )
         address, status, why = point["address"], "there", ""
         if not enough(place.result(address), task.measures):
             with place.claimed(address) as mine:
@@ -71,17 +82,21 @@ def _compute(place: Workspace, task: Task, point: Mapping[str, Any]) -> None:
     with place.filling(point["address"], point["state"]) as folder:
         result: dict[str, Any]
         try:
-            if stored is not None and series.exists() and all(one.needs == "series" for one in measures):
-                sample = _sample(task, point, folder, series, stored["summary"])
+            known = stored["summary"] if stored else {}
+            if known and series.exists() and all(one.needs == "series" for one in measures):
+                sample = _sample(task, point, folder, series, known)
             else:
                 sample = _run(task, point, folder)
             result = {"status": "complete", "summary": sample.summary, "measures": measured(measures, sample)}
             if stored is not None:
                 result["measures"] = {**stored["measures"], **result["measures"]}
+        except (FolderError, OSError):
+            raise
         except MdnumError as error:
-            if isinstance(error, FolderError):
-                raise
             result = {"status": "failed", "why": str(error), "measures": {}, "summary": {}}
+        except Exception as error:
+            why = f"{type(error).__name__}: {error}"
+            result = {"status": "failed", "why": why, "measures": {}, "summary": {}, "again": True}
         result["seconds"] = perf_counter() - began + (stored or {}).get("seconds", 0.0)
         write_result(folder, result)
         if not task.keep:
