@@ -24,7 +24,7 @@ from mdnum.provenance import cores
 from mdnum.safe_path import guard
 
 #: Times that a task may take its process with it before it counts as failed; the last time it is alone.
-_TRIES = 3
+TRIES = 3
 #: Times in a row that an engine may fail without an answer before it is given up.
 _IDLE = 10
 #: Tasks that an executor is given at a time, for each worker: a scheduler need not hold all of a sweep.
@@ -106,7 +106,7 @@ def _local(workers: int | None) -> _Engine:
     context, of = get_context("loky"), (os.getpid(),)
     return _Engine(
         lambda: ProcessPoolExecutor(count, context=context, initializer=guard, initargs=of), count,
-        max(1, cores() // count), lambda pool: pool.shutdown(wait=False, kill_workers=True),
+        max(1, cores() // count), lambda pool: pool.shutdown(wait=False, kill_workers=True),  # type: ignore[call-arg]
     )  # fmt: skip
 
 
@@ -128,7 +128,8 @@ def _dask(address: str, workers: int | None) -> _Engine:
     except OSError as error:
         remedy = "Start it: dask scheduler; dask worker tcp://host:port"
         raise InputError(f"no dask scheduler answers: {error}", where=address, remedy=remedy) from None
-    threads = list(clients[0].nthreads().values())
+    of_each: Any = clients[0].nthreads()
+    threads = list(of_each.values())
     engine.width, engine.threads = workers or max(sum(threads), 1), max(threads, default=1)
     return engine
 
@@ -207,10 +208,10 @@ def computed(
                     failed = f"{type(error).__name__}: {error}".splitlines()[0]
                     broken = broken or isinstance(error, BrokenExecutor | CancelledError)
                     tries[k] += lost(tasks[k], failed)
-                    if tries[k] >= _TRIES:
+                    if tries[k] >= TRIES:
                         yield tasks[k], error
                     else:
-                        (alone if tries[k] == _TRIES - 1 else waiting).append(k)
+                        (alone if tries[k] == TRIES - 1 else waiting).append(k)
                 if not failed:
                     continue
                 idle += 1

@@ -139,9 +139,10 @@ class _Cell:
 
 def describe(step: int, steps: int, info: dict[str, Any]) -> str:
     """The numbers beside the bar, in one line."""
-    parts = [f"{step:,} of {steps:,} {info.get('unit', 'steps')}"]
+    unit = info.get("unit", "steps")
+    parts = [f"{step:,} of {steps:,} {unit}"]
     parts += [f"{info[name]:,} {name}" for name in ("flips", "rebuilds") if name in info]
-    if rate := info.get("steps_per_second"):
-        parts.insert(1, f"{rate:,.0f} steps/s")
+    if rate := info.get(f"{unit}_per_second"):
+        parts.insert(1, f"{rate:,.0f} {unit}/s" if rate >= 10 else f"{rate:.2g} {unit}/s")
         parts.append("ETA " + time.strftime("%H:%M:%S", time.gmtime((steps - step) / rate)))
     return "  ".join(parts)

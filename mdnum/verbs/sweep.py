@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, MdnumError
 from mdnum.provenance import cores
 from mdnum.sweeps.analysis import analyzed
 from mdnum.sweeps.design import Design
-from mdnum.sweeps.engines import computed
+from mdnum.sweeps.engines import TRIES, computed
 from mdnum.sweeps.measures import USUAL
 from mdnum.sweeps.plan import Plan, Planned, Question, Setting, planned
 from mdnum.sweeps.points import Workspace, gone
@@ -180,9 +180,14 @@ def _compute(
             plan.overrides, plan.names, keep, code,
         )  # fmt: skip
 
+    left_before = {claim for claim, _ in place.claims() if gone(claim)}
+
     def lost(one: Task, why: str) -> bool:
-        # whose claim a dead process holds was at work on it; others were only waiting
-        return any(gone(claim) for point in one.points for claim, _ in place.claims(point["address"]))
+        # whose claim a process holds that died since was at work on it; others were only waiting
+        claims = {claim for point in one.points for claim, _ in place.claims(point["address"])}
+        dead = {claim for claim in claims - left_before if gone(claim)}
+        left_before.update(dead)
+        return bool(dead)
 
     def say() -> None:
         rate = done / (monotonic() - begun) if done else 0.0
@@ -194,6 +199,8 @@ def _compute(
         say()
         again: list[list[Planned]] = []
         for one, told in computed(work, [task(some) for some in left], on=on, workers=workers, lost=lost):
+            if isinstance(told, MdnumError):
+                raise told
             if isinstance(told, BaseException):
                 again += _after_a_loss(place, one, wanted, told, counts)
                 done += sum(place.result(p["address"]) is not None for p in one.points)
@@ -221,7 +228,7 @@ def _compute(
 def _after_a_loss(
     place: Workspace, one: Task, wanted: Mapping[str, Planned], error: BaseException, counts: dict[str, Any]
 ) -> list[list[Planned]]:
-    """Points of a task whose process died twice: the one that it was at work on is given up, others go on."""
+    """Points of a task whose process died each time: this sweep gives up the one it was at work on."""
     from mdnum.sweeps.points import write_result
 
     again = []
@@ -231,11 +238,13 @@ def _after_a_loss(
             continue
         if any(gone(claim) for claim, _ in place.claims(address)):
             with place.claimed(address) as mine:
-                if mine and place.result(address) is None:
-                    why = f"its process ended twice without an answer ({type(error).__name__}): memory?"
+                if mine and not enough(place.result(address), one.measures):
+                    why = (
+                        f"its process ended {TRIES} times without an answer ({type(error).__name__}): memory?"
+                    )
                     with place.filling(address, point["state"]) as folder:
                         write_result(folder, {"status": "failed", "why": why, "measures": {}, "summary": {},
-                                              "seconds": 0.0})  # fmt: skip
+                                              "seconds": 0.0, "again": True})  # fmt: skip
                     counts["given_up"] += 1
         else:
             again.append([wanted[address]])
