@@ -87,7 +87,7 @@ def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):
     arguments = ("audit", EMT, "-s", "cu.extxyz", "-o", "out", "--checks")
     assert call(*arguments, "forces,curl,state") == 130
     lines = printed(capsys)
-    left = ("1 of 15 ways of forces", "curl not asked", "state not asked")
+    left = ("1 of 15 ways of forces", "curl not tested", "state not tested")
     # a headline is folded where it is piped
     said = " ".join(lines)
     assert said.startswith(f"Stopped during curl. {EMT} on Cu4: ") and all(part in said for part in left)

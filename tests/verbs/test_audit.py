@@ -106,7 +106,7 @@ def test_calls_that_a_check_does_not_need_are_for_those_after_it(make, tmp_path)
     atoms = bulk("Ar", cubic=True).repeat(2) if make is lennard_jones else None
     outcome = mdnum.audit_calculator(counted, atoms, out=tmp_path / "a", report=False)
     assert all(one["asked"] == one["possible"] for one in outcome.summary["parts"])
-    assert "as far as asked" not in outcome.summary["headline"] and len(calls) <= 12_000
+    assert "as far as tested" not in outcome.summary["headline"] and len(calls) <= 12_000
 
 
 def test_a_check_leaves_the_calls_that_it_does_not_make():
@@ -370,7 +370,7 @@ def test_a_killed_audit_is_resumed_and_ends_as_one_that_was_not(tmp_path, monkey
     assert summary["status"] == "unfinished"
     assert "invariance" in summary["headline"]
     assert call("report", "cut") == 0
-    assert "invariance not asked" in (tmp_path / "cut/report.html").read_text()
+    assert "invariance not tested" in (tmp_path / "cut/report.html").read_text()
     asked.clear()
     capsys.readouterr()
     assert call("audit", "--resume", "cut", "--no-report") == 0 and set(asked) == {"invariance"}

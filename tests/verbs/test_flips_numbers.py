@@ -120,7 +120,12 @@ def test_what_the_page_writes_agrees(
     low, high = told["pairs inside"].split(" to ")
     assert value(low) <= value(keys["Pairs inside"]) <= value(high)
     # a median that is a bound never stands beside a mean that is none
-    lives = [keys["Median contact"], keys["Mean by rate"], told["Median life"], told["Mean life (by rate)"]]
+    lives = [
+        keys["Median contact"],
+        keys["Mean by rate"],
+        told["Median lifetime"],
+        told["Mean lifetime (from the breaking rate)"],
+    ]
     assert len({"at most" in text for text in lives}) == 1
     assert ("at most" in lives[0]) == (one["lifetime"]["median"] == 1)
     for finding in found.verdict.findings:
@@ -145,14 +150,14 @@ def test_worst_and_expected_rounding_are_not_told_as_one_number(tmp_path: Path) 
     share = one["ambiguous"] / one["flips"]
     assert max(one["grid"]["missed"], one["grid"]["invented"]) < share / 3
     (said,) = [one for one in found.verdict.findings if one.code == "UNDECIDABLE"]
-    assert "largest rounding error" in said.text and "usual rounding error" in said.text
+    assert "largest rounding error" in said.text and "typical rounding error" in said.text
 
 
 def test_a_cutoff_below_every_distance_is_no_contact(tmp_path: Path) -> None:
     found = examined(tmp_path, gas(0, 20, 24, 0.3), cutoffs=[1e-3])
     keys = {key.label: key.value for key in found.page.keys}
     assert keys["Median contact"] == keys["Mean by rate"] == "no contact"
-    assert "below every distance" in found.verdict.headline
+    assert "shorter than every distance" in found.verdict.headline
     assert "longer than seen" not in " ".join(rows(found).values())
     # with a rule that has some, the other still has none
     (tmp_path / "b").mkdir()
