@@ -143,7 +143,7 @@ def call(words: list[str]) -> tuple[str, str]:
         )[:600]
     if code not in (0, 1) or any("Traceback" in line or "Exception ignored" in line for line in said):
         return "TRACEBACK", "\n".join(said)[:600]
-    part = "could be used up to frame" in out.getvalue()
+    part = "frames after frame" in out.getvalue()
     return ("part" if part else "read"), out.getvalue().strip().partition("\n")[0]
 
 

@@ -572,7 +572,7 @@ def test_a_list_that_hangs_does_not_outlive_who_asks_it(mine: Path, by: signal.S
     summary = RunFolder.open("out").summary
     assert summary["status"] == "stopped" and summary["left"] > 100 and not summary["failures"]
     if by != signal.SIGKILL:
-        assert summary["asked"] >= 5 and "resumes it" in summary["verdict"] and "right pairs" in out
+        assert summary["asked"] >= 5 and "continues it" in summary["verdict"] and "right pairs" in out
         assert "5 of " in out and "cube of 2.1 cutoffs" in summary["headline"]
     # of most areas nothing was asked; after a kill, what was saved last counts
     assert f"{summary['asked']} of " in summary["headline"]
@@ -598,7 +598,7 @@ def test_time_that_is_up_ends_it(mine: Path, name: str, code: int, status: str, 
     assert monotonic() - began < 40
     summary = RunFolder.open("out").summary
     assert summary["status"] == status and summary["left"] > 500
-    assert ("A call was running" in summary["headline"]) or name == "slow"
+    assert ("ended during a call" in summary["headline"]) or name == "slow"
     assert (mine / "out" / "report.html").exists()
     areas = {row["area"]: row["asked"] + row["skipped"] for row in summary["areas"]}
     if status == "partial":

@@ -146,7 +146,7 @@ def test_an_interval_is_a_key_and_two_numbers():
         (("ball/drop", "--vary", "zzz"), " reduction, order, stop, max_iter, contact,"),
         (("argon/crystal-108", "--along", "sigma=1:2"), "No such option: --along"),
         (("forecast", "argon/crystal-108", "0"), "expected a length above 0"),
-        (("forecast", "ball/drop", "1e-6"), "that mdnum ball records"),
+        (("forecast", "ball/drop", "1e-6"), "mdnum ball records"),
         (("processes", "ball/drop"), "mdnum ball --demo determinism"),
         (("benign", "ball/drop", "start"), "no ensemble"),
         (("map", "argon/crystal-108", "sigma"), "KEY=LOW:HIGH"),

@@ -444,7 +444,7 @@ def test_two_digits_are_shown_where_nobody_knows_how_many_hold(tmp_path):
 @pytest.mark.parametrize(
     ("trust", "left", "remedy"),
     [
-        (open_trust("time step", "near miss"), "half the time step", "Leave out --no-half-step."),
+        (open_trust("time step", "near miss"), "half the time step", "Remove --no-half-step."),
         (open_trust("time step", "near miss"), "", "--set dynamics.kind=nve"),
         (open_trust("standard error", unknown=("other starts",)), "", "--replicas 8"),
         (open_trust("near miss"), "", "fewer parameters"),

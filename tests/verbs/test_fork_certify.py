@@ -87,7 +87,7 @@ def test_who_leaves_first_is_the_headline(ball):
     assert judged(None, None).tone == "good"
     some = judged(None, 40)
     assert some.tone == "info" and "bfloat16" in some.headline and "step 40" in some.headline
-    assert judged(70, 40).headline.startswith("No precision keeps")
+    assert judged(70, 40).headline.startswith("At no precision")
     wrong = {"float64": {"total": 1, "horizon": 5, "wrong": 9}}
     assert [one.code for one in judged(None, None, ambiguous=wrong).findings] == ["WRONG_DECISION"]
 
