@@ -392,7 +392,7 @@ def open_trust(*unseen: str, unknown: tuple[str, ...] = ()) -> dict[str, Any]:
     ("trust", "tone", "words"),
     [
         (TRUST, "warning", "not trusted … 300: near miss"),
-        (open_trust("time step", unknown=("other starts",)), "warning", "undecided, other starts"),
+        (open_trust("time step", unknown=("other starts",)), "warning", "undecided … other starts"),
         ({**TRUST, "verdict": "trusted", "limited_by": ""}, "good", "; trusted."),
         (None, "info", "= 2.000 σ²/σ and"),
     ],
