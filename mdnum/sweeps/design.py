@@ -23,6 +23,7 @@ from mdnum.systems.toml import scalar
 MOST_POINTS, _MOST_VALUES = 100_000, 10_000
 #: Words for keys that belong together, with the values that they have by default.
 PRECISIONS = ("float64", "float32")
+_ROLES = {"md": ("state", "force"), "ball": ("state", "arithmetic", "decision")}
 _RANGE = re.compile(r"\s*([^:\s]+)\s*:\s*([^:\s]+)\s*:\s*([^:\s]+)\s*")
 _REMEDY = "Write KEY=LOW:HIGH:STEP or KEY=VALUE,VALUE,…, such as cutoff.radius=2.0:3.5:0.25"
 Design = Literal["one-at-a-time", "factorial", "space-filling"]
@@ -40,10 +41,10 @@ class Axis:
         """Whether its values are numbers."""
         return all(isinstance(one, int | float) and not isinstance(one, bool) for one in self.values)
 
-    def settings(self, value: Any) -> dict[str, Any]:
-        """The keys of a system file that a value stands for."""
+    def settings(self, value: Any, world: str = "md") -> dict[str, Any]:
+        """The keys of a system file, of molecular dynamics or of a ball, that a value stands for."""
         if self.key == "precision" and isinstance(value, str):
-            return {f"precision.{role}": value for role in ("state", "force")}
+            return {f"precision.{role}": value for role in _ROLES[world]}
         return {self.key: value}
 
 

@@ -77,6 +77,7 @@ class Measure:
         of: its value.
         needs: "series", or "frames" of positions along the run.
         physical: whether it is a result, and no property of the machine or of the lists.
+        world: "md" or "ball", whose runs have it.
     """
 
     name: str
@@ -85,17 +86,22 @@ class Measure:
     of: Callable[[Sample], Value]
     needs: Literal["series", "frames"] = "series"
     physical: bool = True
+    world: Literal["md", "ball"] = "md"
 
 
 MEASURES: Registry[Measure] = Registry("measure", "mdnum.measures", kind=Measure)
 
 
 def _measure(
-    unit: str, title: str, needs: Literal["series", "frames"] = "series", physical: bool = True
+    unit: str,
+    title: str,
+    needs: Literal["series", "frames"] = "series",
+    physical: bool = True,
+    world: Literal["md", "ball"] = "md",
 ) -> Callable[..., Any]:
     def add(of: Callable[[Sample], Value]) -> Callable[[Sample], Value]:
         name = of.__name__
-        MEASURES.add(name, Measure(name, unit, title, of, needs, physical))
+        MEASURES.add(name, Measure(name, unit, title, of, needs, physical, world))
         return of
 
     return add
@@ -260,19 +266,49 @@ def diffusion(run: Sample) -> Value:
     )
 
 
-#: What is measured where nothing else is asked for.
-USUAL = ("energy", "pressure", "temperature", "drift", "flips")
+# --- the ball: a run is what it is, and has no statistical error ----------------------------------------
 
 
-def chosen(words: Sequence[str]) -> list[Measure]:
+@_measure("length", "mean height at the end", world="ball")
+def final_height(run: Sample) -> Value:
+    return Value(float(run.series["mean_height"][-1]), 0.0, np.inf)
+
+
+@_measure("", "energy at the end as a share of that at the start", world="ball")
+def energy_kept(run: Sample) -> Value:
+    return Value(float(run.series["energy"][-1] / run.series["energy"][0]), 0.0, np.inf)
+
+
+@_measure("", "contacts that begin, per ball", world="ball")
+def bounces(run: Sample) -> Value:
+    return Value(float(run.series["entered"].sum() / run.atoms), 0.0, np.inf)
+
+
+@_measure("", "solver iterations per step", physical=False, world="ball")
+def iterations(run: Sample) -> Value:
+    return Value(float(run.series["iterations"][1:].mean()), 0.0, np.inf)
+
+
+#: What is measured where nothing else is requested, by world.
+USUAL: Mapping[str, tuple[str, ...]] = {
+    "md": ("energy", "pressure", "temperature", "drift", "flips"),
+    "ball": ("final_height", "energy_kept", "bounces"),
+}
+
+
+def chosen(words: Sequence[str], world: str) -> list[Measure]:
     """Measures by name.
 
     Raises:
-        InputError: no such measure, or one twice.
+        InputError: no such measure of this world, or one twice.
     """
     if twice := [word for word in words if list(words).count(word) > 1]:
         raise InputError(f"--measure has {twice[0]} twice", remedy="Give each once")
-    return [MEASURES[word] for word in words]
+    measures = [MEASURES[word] for word in words]
+    if other := [measure.name for measure in measures if measure.world != world]:
+        known = ", ".join(name for name in MEASURES.shipped if MEASURES[name].world == world)
+        raise InputError(f"{other[0]} is no measure of this world", remedy=f"Known are {known}")
+    return measures
 
 
 def measured(measures: Sequence[Measure], run: Sample) -> dict[str, dict[str, Any]]:

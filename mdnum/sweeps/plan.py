@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mdnum.errors import InputError, MdnumError
@@ -26,7 +26,7 @@ class Question:
     """What a sweep is asked, as `mdnum.sweep` has it."""
 
     seeds: int | Sequence[int] = 4
-    measure: Sequence[str] | str = USUAL
+    measure: Sequence[str] | str = USUAL["md"]
     steps: int | None = None
     design: Design = "one-at-a-time"
     samples: int = 16
@@ -101,7 +101,7 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
     from mdnum.systems.build import build
     from mdnum.systems.simulation import Simulation
 
-    axes, measures = _axes(over), chosen(_words(question.measure))
+    axes = _axes(over)
     seeds = list(range(question.seeds)) if isinstance(question.seeds, int) else list(question.seeds)
     if not seeds:
         raise InputError("no seeds", remedy="Give 1 or more")
@@ -111,49 +111,62 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
         system, overrides = build(system, overrides), {}
     filed = not isinstance(system, Simulation)
     loaded: Any = load(system, overrides) if filed else system
-    if isinstance(loaded, BallSystem):
-        raise InputError("sweeps of a ball are not supported", where=loaded.name)
+    world = "ball" if isinstance(loaded, BallSystem) else "md"
+    if world == "ball":
+        # nothing of it is drawn
+        seeds = seeds[:1]
+    measures = chosen(_words(USUAL[world] if question.measure == USUAL["md"] else question.measure), world)
     own = flat(loaded.spec.model_dump(mode="json") if filed else loaded.program)
     base = {axis.key: _own_value(axis, own, loaded, system, overrides) for axis in axes}
     filling = question.design == "space-filling"
     axes = axes if filling else [with_base(axis, base[axis.key]) for axis in axes]
-    own_steps = loaded.spec.dynamics.steps if filed else loaded.steps
+    table = "integrator" if world == "ball" else "dynamics"
+    own_steps = getattr(loaded.spec, table).steps if filed else loaded.steps
     steps = own_steps if question.steps is None else question.steps
     framed = any(measure.needs == "frames" for measure in measures)
     every = (question.save_every or max(1, steps // _FRAMES)) if framed else 0
-    pace = float(own["dynamics.timestep"])
+    pace = float(own[f"{table}.timestep"])
     rows = []
     for point in points(axes, base, seeds, question.design, question.samples):
-        settings: dict[str, Any] = {"dynamics.seed": point.seed}
+        settings: dict[str, Any] = {"dynamics.seed": point.seed} if world == "md" else {}
         for axis in axes:
             if point.choices[axis.key] != base[axis.key] or filling:
-                settings |= axis.settings(point.choices[axis.key])
+                settings |= axis.settings(point.choices[axis.key], world)
         # of the same time, whatever the step: results would differ by how long they were waited for
-        share = pace / float(settings.get("dynamics.timestep", pace))
+        share = pace / float(settings.get(f"{table}.timestep", pace))
         run = {"steps": round(steps * share), "save_every": max(1, round(every * share)) if every else 0}
         setting = tuple(label(point.choices[axis.key]) for axis in axes)
         try:
-            one: Any = load(system, {**overrides, **settings}) if filed else resolved(loaded, settings)
+            named = filed and not isinstance(system, BallSystem)
+            one: Any = load(system, {**overrides, **settings}) if named else resolved(loaded, settings)
         except MdnumError as error:
             rows.append(Planned(point, setting, settings, {}, "", str(error)))
             continue
         program = json.loads(json.dumps(one.program))
         # what is asked of a run counts as asked, whatever its file says
-        program.get("dynamics", {}).pop("steps", None)
+        program.get(table, {}).pop("steps", None)
         program.pop("record", None)
         state = state_point(program, hashes(one)["structure"], run)
         rows.append(Planned(point, setting, settings, state, address_of(state)))
-    atoms = len(loaded.atoms) if filed else loaded.atoms
+    units = "ball" if world == "ball" else loaded.units.name
+    atoms = loaded.balls if world == "ball" else len(loaded.atoms) if filed else loaded.atoms
     return Plan(
-        loaded, system, overrides, axes, base, seeds, measures, rows, steps, loaded.units.name, atoms,
-        question,
+        loaded, system, overrides, axes, base, seeds, measures, rows, steps, units, atoms, question
     )  # fmt: skip
 
 
 def resolved(simulation: Any, settings: Mapping[str, Any]) -> Any:
-    """A simulation made of objects with other values, its velocities drawn by its seed as those of a file."""
+    """A simulation made of objects, or a loaded ball, with other values.
+
+    Velocities of atoms are drawn by the seed, as those of a file.
+    """
+    from mdnum.systems import BallSystem
+    from mdnum.systems.load import vary
     from mdnum.systems.parameters import changed, redrawn
 
+    if isinstance(simulation, BallSystem):
+        spec = simulation.spec
+        return replace(simulation, spec=vary("setting", settings, spec, "--over") if settings else spec)
     return changed(simulation if simulation.draw.drawn else redrawn(simulation), settings)
 
 
@@ -175,15 +188,17 @@ def _axes(over: Any) -> list[Axis]:
 
 def _own_value(axis: Axis, own: Mapping[str, Any], loaded: Any, system: Any, overrides: Any) -> Any:
     """The value of an axis that a system has."""
-    from mdnum.systems import load
+    from mdnum.systems import BallSystem, load
     from mdnum.systems.parameters import names, number, resolve
 
     if axis.key == "precision":
         return "float64"
     if own.get(axis.key) is not None:
         return own[axis.key]
-    if system is loaded:
+    if system is loaded and not isinstance(loaded, BallSystem):
         return number(loaded, resolve(loaded, axis.key, names(loaded)))
     # a key that the file leaves to its default, or one that does not exist, as loading it says
-    load(system, {**overrides, **axis.settings(axis.values[0])})
+    (resolved if isinstance(system, BallSystem) else load)(
+        system, {**overrides, **axis.settings(axis.values[0])}
+    )
     return axis.values[0]

@@ -85,10 +85,11 @@ class _Runs(NamedTuple):
         runs = len(rows)
         between = float(value.var(ddof=1)) / runs if runs > 1 else np.nan
         within = float(np.sum(error**2)) / runs**2
+        if within == 0:
+            # exact values, such as counts and what nothing random enters
+            return cls(runs, 0.0, np.inf, between)
         if not (np.isfinite(within) and (samples > 1).all()):
             return cls(runs, np.nan, 0.0, between)
-        if within == 0:
-            return cls(runs, 0.0, np.inf, between)
         freedom = float(np.sum(error**2) ** 2 / np.sum(error**4 / (samples - 1)))
         if runs > 2:
             square = error**2

@@ -39,7 +39,7 @@ def sweep(
     over: Mapping[str, Sequence[Any]] | Sequence[str] | str,
     *,
     seeds: int | Sequence[int] = 4,
-    measure: Sequence[str] | str = USUAL,
+    measure: Sequence[str] | str = USUAL["md"],
     steps: int | None = None,
     design: Design = "one-at-a-time",
     samples: int = 16,
@@ -64,8 +64,9 @@ def sweep(
         system: a simulation, a system, a shipped name or the path of a system file.
         over: values by key of the system file, or texts as on the command line: "cutoff.radius=7:9:0.5",
             "dynamics.timestep=0.001,0.002", "precision".
-        seeds: how many, or which, `dynamics.seed` has: each draws velocities and noise anew.
-        measure: names of `mdnum.sweeps.measures.MEASURES`.
+        seeds: how many, or which, `dynamics.seed` has: each draws velocities and noise anew. A ball, of which
+            nothing is drawn, is run once.
+        measure: names of `mdnum.sweeps.measures.MEASURES`; default the usual ones of the system's world.
         steps: of a run at the system's own time step, default the system's: all runs take the same time.
         design: "one-at-a-time" around the system's own values, "factorial", or "space-filling" between the
             ends of each choice.

@@ -77,7 +77,8 @@ def work(task: Task) -> list[dict[str, Any]]:
 def _compute(place: Workspace, task: Task, point: Mapping[str, Any]) -> None:
     began = perf_counter()
     stored = place.result(point["address"])
-    measures = chosen([name for name in task.measures if stored is None or name not in stored["measures"]])
+    missing = [name for name in task.measures if stored is None or name not in stored["measures"]]
+    measures = chosen(missing, "ball" if "integrator" in point["state"]["system"] else "md")
     series = place.folder(point["address"]) / _SERIES
     with place.filling(point["address"], point["state"]) as folder:
         result: dict[str, Any]
@@ -104,23 +105,27 @@ def _compute(place: Workspace, task: Task, point: Mapping[str, Any]) -> None:
 
 
 def _simulation(task: Task, point: Mapping[str, Any]) -> Any:
-    from mdnum.systems import load
-    from mdnum.systems.build import build
+    """A simulation, or the system of a ball."""
+    from mdnum.systems import opened
     from mdnum.systems.code import allow_code
 
     with allow_code(task.allow_code):
         if isinstance(task.system, str):
-            return build(load(task.system, {**task.overrides, **point["settings"]}))
+            return opened(task.system, {**task.overrides, **point["settings"]})
         import cloudpickle
 
         return resolved(cloudpickle.loads(task.system), point["settings"])
 
 
 def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
+    from mdnum.systems import BallSystem
     from mdnum.verbs.run import run
 
+    system = _simulation(task, point)
+    if isinstance(system, BallSystem):
+        return _bounced(system, point["state"]["asked"]["steps"], task, point, folder)
     made = run(
-        _simulation(task, point), **point["state"]["asked"], out=folder / "run", check=False, report=False,
+        system, **point["state"]["asked"], out=folder / "run", check=False, report=False,
         progress=False, allow_code=task.allow_code,
     )  # fmt: skip
     shutil.copy(folder / "run" / _SERIES, folder / _SERIES)
@@ -130,6 +135,20 @@ def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
     summary["steps_per_second"] = summary["steps_per_second"] or float("nan")
     structure = made.result.simulation
     summary |= {"k_B": structure.units.k_B, "volume": structure.cell.volume, "units": structure.units.name}
+    return _sample(task, point, folder, folder / _SERIES, summary)
+
+
+def _bounced(system: Any, steps: int, task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
+    """A ball's run; its variants and gradients are no points of a sweep."""
+    import pyarrow
+    import pyarrow.parquet as parquet
+
+    from mdnum.systems.build_ball import problem
+    from mdnum.verbs.ball_record import steps as rows
+
+    run = problem(system.for_steps(steps).spec).run()
+    parquet.write_table(pyarrow.table(rows(run)), folder / _SERIES)
+    summary = {"atoms": run.balls, "steps": run.steps, "k_B": 1.0, "volume": float("nan"), "units": "ball"}
     return _sample(task, point, folder, folder / _SERIES, summary)
 
 

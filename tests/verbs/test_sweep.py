@@ -112,6 +112,26 @@ def test_a_loaded_system_is_that_of_its_file(tmp_path):
     assert values[0] == values[1] and np.isfinite(values[0]).all()
 
 
+def test_a_ball_is_swept_without_seeds(tmp_path):
+    """Against the closed form: without a contact, semi-implicit Euler lags g h t / 2 behind the parabola."""
+    ball = mdnum.load("ball/drop", {"variants": {}})
+    with ThreadPoolExecutor(1) as pool:
+        made = mdnum.sweep(
+            ball, ["integrator.timestep=0.0005,0.001,0.002", "precision"], seeds=3, steps=400, on=pool,
+            tolerance={"final_height": 0.0015}, out=tmp_path / "one",
+        )  # fmt: skip
+    assert made.summary["points"] == 4 and not made.summary["failed"]
+    heights = {tuple(one["setting"]): one["value"] for one in made.summary["estimates"]
+               if one["measure"] == "final_height"}  # fmt: skip
+    for h in (0.0005, 0.001, 0.002):
+        expected = 1 - 9.81 * 0.4**2 / 2 - 9.81 * h * 0.4 / 2
+        assert heights[f"{h:g}", "float64"] == pytest.approx(expected, abs=1e-12)
+    advice = {one["choice"]: one["best"] for one in made.summary["advice"]}
+    assert advice == {"integrator.timestep": 0.001, "precision": "float32"}
+    moved = {row["measure"] for row in made.summary["differences"] if row["moves"] == "yes"}
+    assert moved == {"final_height", "energy_kept"}
+
+
 def test_what_cannot_be_swept_is_refused(simulation):
     refused: Any = (
         ({"cutoff.radios": [1.0]}, {}), ({}, {}), ({"neighbors.skin": [0.1]}, {"measure": "enthalpy"}),
