@@ -99,6 +99,7 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
     """
     from mdnum.systems import BallSystem, System, load
     from mdnum.systems.build import build
+    from mdnum.systems.load import world_of
     from mdnum.systems.simulation import Simulation
 
     axes = _axes(over)
@@ -111,7 +112,7 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
         system, overrides = build(system, overrides), {}
     filed = not isinstance(system, Simulation)
     loaded: Any = load(system, overrides) if filed else system
-    world = "ball" if isinstance(loaded, BallSystem) else "md"
+    world = world_of(loaded)
     if world == "ball":
         # nothing of it is drawn
         seeds = seeds[:1]
