@@ -138,8 +138,10 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
         run = {"steps": round(steps * share), "save_every": max(1, round(every * share)) if every else 0}
         setting = tuple(label(point.choices[axis.key]) for axis in axes)
         try:
-            named = filed and not isinstance(system, BallSystem)
-            one: Any = load(system, {**overrides, **settings}) if named else resolved(loaded, settings)
+            if isinstance(system, Simulation | BallSystem):
+                one: Any = resolved(loaded, settings)
+            else:
+                one = load(system, {**overrides, **settings})
         except MdnumError as error:
             rows.append(Planned(point, setting, settings, {}, "", str(error)))
             continue
