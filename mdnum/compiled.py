@@ -11,7 +11,8 @@ from mdnum.errors import InputError
 
 if numba.config.DISABLE_JIT:  # pyright: ignore
     raise InputError(
-        "NUMBA_DISABLE_JIT is set, and what XLA calls has to be compiled", remedy="Unset NUMBA_DISABLE_JIT"
+        "NUMBA_DISABLE_JIT is set, but the functions that XLA calls must be compiled",
+        remedy="Unset NUMBA_DISABLE_JIT",
     )
 
 #: What the command line says of a process that could not keep everything.

@@ -127,7 +127,7 @@ def reading(
             ) from error
         if isinstance(error, ImportError) or "install" in str(error):
             raise InputError(
-                f"reading it needs a package that is not installed ({said})",
+                f"reading this file needs a package that is not installed ({said})",
                 remedy="Install the package, or convert the file to xtc or extxyz",
                 where=where,
             ) from error
@@ -138,7 +138,7 @@ def reading(
             said, remedy = next(
                 (_NOT_SUPPORTED[one] for one in _NOT_SUPPORTED if head.startswith(one)), (said, remedy)
             )
-        raise InputError(f"{by} cannot open it ({said})", remedy=remedy, where=where) from error
+        raise InputError(f"{by} cannot open the file ({said})", remedy=remedy, where=where) from error
     finally:
         sys.unraisablehook = hook
 
@@ -195,7 +195,7 @@ def first_line(error: BaseException) -> str:
         # how a reader stumbles over an end is its own business, unless a word is no number
         text = []
     if (not text and isinstance(error, StopIteration | EOFError)) or (text and _ENDS in text[0]):
-        return "the file ends in it"
+        return "the file ends within this frame"
     said = text[0].rstrip(".") if text else ""
     # the message of some is no more than a key or a number
     said = said if " " in said else f"{type(error).__name__}: {said}" if said else type(error).__name__
@@ -216,7 +216,7 @@ class _Lines(io.TextIOWrapper):
             raise ValueError(f"a line is longer than {_LONGEST_LINE:,} characters")
         self._at_end = 0 if line else self._at_end + 1
         if self._at_end > _PATIENCE:
-            raise ValueError("the file ends before what its head announces")
+            raise ValueError("the file ends before the amount of data that its header announces")
         return line
 
 

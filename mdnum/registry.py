@@ -39,7 +39,7 @@ def unknown(noun: str, word: str, known: Iterable[str], *, where: str | None = N
     """The error for a name that does not exist: what it may have meant, and what there is."""
     known = list(known)
     remedy = f"{meant(word, known)}Known are {', '.join(known)}"
-    return InputError(f"no {noun} {word!r}", remedy=remedy, where=where)
+    return InputError(f"unknown {noun} {word!r}", remedy=remedy, where=where)
 
 
 @functools.lru_cache
@@ -73,7 +73,7 @@ class Registry(Generic[T]):
         if value is None:
             return lambda decorated: self.add(name, decorated, description=description)
         if name in self._own:
-            raise ValueError(f"two values of {self.noun} {name!r}")
+            raise ValueError(f"the {self.noun} {name!r} was registered twice")
         self._own[name] = value
         if description:
             self._descriptions[name] = description
@@ -92,8 +92,9 @@ class Registry(Generic[T]):
                 taken = _package(added[point.name])
             if taken:
                 raise InputError(
-                    f"package {_package(point)} adds the {self.noun} {point.name!r}, which {taken} has",
-                    remedy=f"Uninstall {_package(point)}, or use a version of it that names it otherwise",
+                    f"package {_package(point)} adds the {self.noun} {point.name!r}, which {taken} "
+                    "already provides",
+                    remedy=f"Uninstall {_package(point)}, or use a version that gives it another name",
                 )
             added[point.name] = point
         return added
@@ -138,10 +139,10 @@ class Registry(Generic[T]):
             loaded: Any = point.load()
             a_kind = isinstance(loaded, type) and issubclass(loaded, self.kind or object)
             if not (a_kind or inspect.isroutine(loaded) or isinstance(loaded, self.kind or object)):
-                raise TypeError(f"{point.value} is no {self.kind}")
+                raise TypeError(f"{point.value} is not a {self.kind}")
             named = getattr(loaded, "name", None)
             if isinstance(named, str) and named != point.name:
-                raise ValueError(f"its name is {named!r}")
+                raise ValueError(f"it is named {named!r}")
             if self.check:
                 self.check(loaded)
         except Exception as error:

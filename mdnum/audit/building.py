@@ -118,10 +118,10 @@ class _Builder:
             return self.best  # on which no atom feels another: the forces say so
         if made is None:
             raise InputError(
-                "the calculator answers neither for atoms of any element nor for water "
+                "the calculator computed no energy, neither for single elements nor for water "
                 f"({why}; saved in {saved})",
                 where=self.name,
-                remedy="Give a structure that it is made for: --structure FILE",
+                remedy="Give a structure that the calculator supports: --structure FILE",
             )
         return self._mixed(made)
 

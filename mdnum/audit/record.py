@@ -46,7 +46,7 @@ def load_calculator(words: str) -> LoadedCalculator:
     """
     text = words.strip()
     if not text:
-        raise InputError("no calculator named", remedy=_WAYS)
+        raise InputError("no calculator was given", remedy=_WAYS)
     spot = place(text)
     if spot is None:
         return _of_system(text)
@@ -59,14 +59,15 @@ def load_calculator(words: str) -> LoadedCalculator:
             except Exception as error:  # whatever a constructor raises
                 remedy = "Give the arguments it needs: Class(argument=value)"
                 raise InputError(
-                    f"making it failed: {in_a_line(error)}", where=text, remedy=remedy
+                    f"the calculator could not be constructed: {in_a_line(error)}", where=text, remedy=remedy
                 ) from error
         return value
 
     made = make()
     if not _is_calculator(made):
         raise InputError(
-            f"that is a {type(made).__name__}, not an ASE calculator (an object with get_potential_energy "
+            f"the object is a {type(made).__name__}, not an ASE calculator (an object with "
+            "get_potential_energy "
             "and get_forces)",
             where=text,
             remedy=_WAYS,
@@ -89,7 +90,7 @@ def _of_system(text: str) -> LoadedCalculator:
         if "." in text and "/" not in text and not text.endswith(".toml"):
             module, _, last = text.rpartition(".")
             raise InputError(
-                f"{text!r} is no system of mdnum",
+                f"{text!r} is not an mdnum system",
                 remedy=f"For a class, put a colon before its name: {module}:{last}",
             ) from error
         raise InputError(
@@ -158,7 +159,7 @@ def kept(folder: RunFolder) -> AuditState:
         FolderError: answers.json holds something else.
     """
     if not (folder.path / NAME).exists():
-        raise FolderError("holds no audit", remedy="Begin a new one", where=str(folder.path))
+        raise FolderError("the folder holds no audit", remedy="Start a new audit", where=str(folder.path))
     state = restored(folder, AuditState)
     with restoring(folder.path / NAME):
         assert state.atoms

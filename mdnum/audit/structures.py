@@ -38,7 +38,9 @@ def read_structure(words: str | Path) -> Atoms:
     path, which = (Path(head), index) if separator and not Path(text).exists() else (Path(text), "-1")
     if not path.is_file():
         raise InputError(
-            "no such structure file", where=str(path), remedy="Correct --structure, or leave it out"
+            "no such structure file",
+            where=str(path),
+            remedy="Correct the path given to --structure, or omit the option",
         )
     with reading(text, by="ASE", remedy=CHECK_STRUCTURE):
         chosen = list(ase_images(path, which))
@@ -52,12 +54,14 @@ def read_structure(words: str | Path) -> Atoms:
         )
     atoms = chosen[0]
     if not len(atoms):
-        raise InputError("holds no atoms", where=text, remedy="Name another file, or another index: file@0")
+        raise InputError(
+            "the structure holds no atoms", where=text, remedy="Give another file, or another index: file@0"
+        )
     bad = ~np.isfinite(atoms.positions).all(axis=1)
     if bad.any() or not np.isfinite(np.asarray(atoms.cell)).all():
         what = f"atom {int(np.argmax(bad))}" if bad.any() else "the cell"
         raise InputError(
-            f"{what} has a number that is not finite", where=text, remedy="Correct the structure"
+            f"{what} contains a number that is not finite", where=text, remedy="Correct the structure"
         )
     atoms.info["origin"] = f"{len(atoms)} atoms, {atoms.get_chemical_formula()}, from {text}"
     return atoms

@@ -237,7 +237,7 @@ class ExactPenalty(_Motion):
         _positive("damping", self.damping, zero=True)
         if self.damping**2 == 4 * self.k:
             raise InputError(
-                "critical damping has no such closed form", remedy="Change the damping by an ulp"
+                "the closed form does not hold at critical damping", remedy="Change the damping by one ulp"
             )
 
     def state(self, t: Times) -> tuple[Known, Known]:
@@ -272,7 +272,10 @@ def _bounced(p: Parameters, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if not np.any(t >= begin.real):
             break
     else:
-        raise InputError(f"more than {_MOST:,} contacts before the last time", remedy="Ask for earlier times")
+        raise InputError(
+            f"more than {_MOST:,} contacts occur before the last requested time",
+            remedy="Request earlier times",
+        )
     return y, v
 
 
@@ -323,14 +326,14 @@ def _positive(name: str, value: float, *, zero: bool = False, most: float = np.i
 def _numbers(n: Counts, least: int = 1) -> Float[np.ndarray, "*counts"]:
     n = np.asarray(n, np.float64)
     if np.any(n < least) or np.any(n != np.floor(n)) or np.any(np.isinf(n)):
-        raise InputError(f"impact number {n!r}", remedy=f"Count in whole numbers from {least}")
+        raise InputError(f"impact number {n!r}", remedy=f"Give an integer of at least {least}")
     return n
 
 
 def _later(t: Times) -> Float[np.ndarray, "*times"]:
     t = np.asarray(t, np.float64)
     if not np.all(t >= 0):
-        raise InputError("a time before the start", remedy="Ask for times of at least 0")
+        raise InputError("a requested time lies before the start", remedy="Request times of at least 0")
     return t
 
 

@@ -91,12 +91,13 @@ class BallProgram:
         kinds = [type(one.problem.world.contact).__name__ for one in (self, other)]
         if kinds[0] != kinds[1] or (self.problem.world.lift is None) != (other.problem.world.lift is None):
             raise InputError(
-                f"{kinds[0]} and {kinds[1]} decide different things",
+                f"{kinds[0]} and {kinds[1]} make different kinds of decisions",
                 remedy="Compare programs with one kind of contact",
             )
         if self.size != other.size:
             raise InputError(
-                f"{self.size} balls and {other.size}", remedy="Compare programs of the same number of balls"
+                f"the programs have {self.size} and {other.size} balls",
+                remedy="Compare programs of the same number of balls",
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
@@ -224,7 +225,7 @@ class BallProgram:
         problem, world = self.problem, self.problem.world
         if word not in START and not world.has(word):
             known = ", ".join([*world.parameters, *START])
-            raise InputError(f"{key!r} is no number that can be varied", remedy=f"Use one of: {known}")
+            raise InputError(f"{key!r} is not a parameter that can be varied", remedy=f"Use one of: {known}")
 
         def at(value: float) -> BallProgram:
             filled = np.full(np.atleast_1d(np.asarray(problem.y0)).shape, value)

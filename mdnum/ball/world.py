@@ -117,7 +117,7 @@ class World(eqx.Module):
         path = self._place(name)
         if path is None:
             raise InputError(
-                f"no parameter called {name!r} here", remedy=f"There are {', '.join(self.parameters)}"
+                f"this ball has no parameter {name!r}", remedy=f"Choose one of {', '.join(self.parameters)}"
             )
         return path
 
@@ -245,7 +245,7 @@ def _check(world: World) -> None:
         if name != "eps" or contact.smooth:
             _in_range(name, world.value(name))
     if world.control is not None and not np.all(np.isfinite(np.asarray(world.control, np.float64))):
-        raise InputError("the control holds a number that is not finite")
+        raise InputError("the control contains a number that is not finite")
     if isinstance(integrator, EventLocated):
         if not isinstance(contact, Impact):
             raise InputError(
@@ -259,7 +259,7 @@ def _check(world: World) -> None:
             raise InputError(
                 f"alpha * k = {gain:g}: each iteration leaves {abs(1 - gain):g} of the penetration,"
                 " so the projection cannot converge",
-                remedy="Choose alpha * k below 2; at 1 one iteration is enough",
+                remedy="Choose alpha * k below 2; at alpha * k = 1 one iteration is enough",
             )
         _check_stop(contact.stop, world.policy, gain)
     if (stop := getattr(integrator, "stop", None)) is not None:

@@ -237,12 +237,18 @@ def calibrate(
     Error: statistical. The limit is a quantile over the members, see `Calibration.rate_bounds`.
     """
     if members < FEWEST:
-        raise InputError(f"members = {members} are too few for a limit", remedy=f"Give at least {FEWEST}")
+        raise InputError(
+            f"members = {members}: too few runs in the ensemble for a statistical limit",
+            remedy=f"Give at least {FEWEST}",
+        )
     expect_at_least(0, held_out=held_out)
     expect_at_least(1, tries=tries, steps=1 if steps is None else steps)
     changes = planted(simulation) if changes is None else changes
     if not any(change.must_fail for change in changes):
-        raise InputError("no planted change must fail", remedy="Plant one that must: else nothing is proven")
+        raise InputError(
+            "the list of planted changes that must be detected is empty",
+            remedy="Add a planted change that must be detected; otherwise the test proves nothing",
+        )
     tried = [steps] if steps is not None else _windows(simulation, start)
     nodes = nodes_of(simulation, start or first_state(simulation))
     own = members + held_out
@@ -300,9 +306,13 @@ def choose(windows: Sequence[Window], name: str) -> Window:
         if not one.ok
     )
     raise InputError(
-        f"planted changes cannot be told from rounding after {steps} steps: after {best.step}, {missed}",
+        f"the planted changes cannot be distinguished from rounding errors after {steps} steps (step "
+        f"{best.step}: {missed})",
         where=name,
-        remedy="Compare at an earlier step, before members have split, or start from a hotter fluid",
+        remedy=(
+            "Compare at an earlier step, before the runs of the ensemble have split, or start "
+            "from a hotter fluid"
+        ),
     )
 
 
@@ -380,9 +390,9 @@ def _check(twin: Twin) -> None:
     a, b = (() if key is None else np.asarray(jax.random.key_data(key)) for key in keys)
     if not np.array_equal(a, b):
         raise InputError(
-            "the runs have different noise, so they diverge at the first step whatever else they do",
+            "the runs have different random noise, so they diverge at the first step in any case",
             where="dynamics.seed",
-            remedy="Give both the same seed; runs of different seeds are compared by their averages",
+            remedy="Give both runs the same seed; compare runs of different seeds by their averages",
         )
 
 

@@ -175,7 +175,7 @@ def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
     """
     if not simulation.rule.safe:
         raise InputError(
-            "this rebuild rule may leave pairs out of the list, and then nothing is decided about them",
+            "this rebuild rule can leave pairs out of the list, so their decisions would not be certified",
             remedy="Use --set neighbors.rebuild.every=1 with check = true",
             where="neighbors.rebuild",
         )

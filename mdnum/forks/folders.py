@@ -108,15 +108,15 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
         folder.check_start()
         if folder.kind not in _ELSEWHERE:
             raise InputError(
-                "this is a fork folder, the answer of `mdnum fork`, and no run",
+                "this folder holds a result of `mdnum fork`, not a run",
                 where=str(folder.path),
-                remedy="Give two folders of `mdnum run`, `mdnum ball` or `mdnum flips`; see a fork by "
-                "`mdnum report DIR`",
+                remedy="Give two folders of `mdnum run`, `mdnum ball` or `mdnum flips`; `mdnum report DIR` "
+                "shows a fork",
             )
     where = f"{first.path} and {second.path}"
     if first.kind != second.kind:
         kinds = f"these are folders of {first.kind} and {second.kind}"
-        raise InputError(kinds, where=where, remedy="Compare runs of one world")
+        raise InputError(kinds, where=where, remedy="Compare two molecular-dynamics runs, or two ball runs")
     with first.explained(), second.explained():
         return _compared(first, second, where)
 
@@ -135,7 +135,7 @@ def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bo
         return opened(load(folder)) if built else load(folder)
     if not objects:
         remedy = "Give it from Python, made by the same code: mdnum.fork_folders(a, b, objects=[...])"
-        message = "was made of objects, and no file says how to make them again"
+        message = "was made from Python objects, and no file describes how to recreate them"
         raise InputError(message, where=str(folder), remedy=remedy)
     from mdnum.systems.build import again
 
@@ -198,7 +198,11 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
     names_of = [", ".join(one["rule"] for one in each) for each in rules]
     if names_of[0] != names_of[1] or between[0] != between[1]:
         seen = " and ".join(f"{one} {two or ''}".rstrip() for one, two in zip(names_of, between, strict=True))
-        raise InputError(f"pairs are examined by {seen}", where=where, remedy="Compare those of one rule")
+        raise InputError(
+            f"the runs use different membership rules: {seen}",
+            where=where,
+            remedy="Compare runs with the same rule",
+        )
     differences = [(name, *(each[name] for each in summaries)) for name in _GIVEN]
     frames = [folder.read("frames", ["rule", "number"]) for folder in (first, second)]
     numbers = [each["number"][each["rule"] == 0] for each in frames]
@@ -269,7 +273,7 @@ def _md_dates(first: RunFolder, second: RunFolder) -> dict[str, Any]:
     series = [folder.read("series", ["step", "pairs", *_NUMBERS]) for folder in (first, second)]
     steps = min(len(table["step"]) for table in series) - 1
     if steps < 0:
-        raise InputError("a run has no step to compare", remedy="Resume it, or run again")
+        raise InputError("one run has no recorded step to compare", remedy="Resume that run, or repeat it")
     differ = np.zeros(steps + 1, bool)
     for name in _NUMBERS:
         one, other = (table[name][: steps + 1] for table in series)

@@ -99,7 +99,7 @@ def tangents(
     tangent = np.asarray(dx, np.float64).T, np.asarray(dv, np.float64).T
     first = _length(tangent, clock)
     if not (np.isfinite(first) and first > 0):
-        raise InputError("the perturbation is nothing", remedy="Give a direction that is not zero")
+        raise InputError("the perturbation is zero", remedy="Give a nonzero direction")
     for segment in Engine(simulation, steps).segments():
         order = segment.table.order
         tables = simulation.tables(segment.table)
@@ -455,7 +455,7 @@ def forecast(
         dx = direction(simulation, seed)
     change = [np.zeros(shape) if part is None else np.asarray(part, np.float64) for part in (dx, dv)]
     if any(part.shape != shape for part in change):
-        raise InputError(f"a direction has the shape of the start, {shape}")
+        raise InputError(f"expected a direction with the shape of the start, {shape}")
     dx, dv = change
     parts = list(tangents(simulation, last, dx, dv))
     tables = [part.segment.table for part in parts]

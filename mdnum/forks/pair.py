@@ -176,9 +176,9 @@ def counterfactuals(
     most = repeats_asked(repeats, runs, reason or "those are left out")
     if back and not runs:
         raise InputError(
-            f"A under B's decisions was asked for, and B under A's is not run: "
+            f"A cannot be run with B's decisions, because B is not run with A's: "
             f"{reason or 'those are left out'}",
-            remedy="Leave out back",
+            remedy="Omit the option back",
         )
     return runs, runs if back is None else back, most
 
@@ -193,13 +193,13 @@ def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "those a
         return REPEATS if counterfactual else 0
     if repeats < 0 or 0 < repeats < FEWEST:
         raise InputError(
-            f"repeats = {repeats}; expected 0, or {FEWEST} and more",
-            remedy="So few could never be clear" if repeats > 0 else None,
+            f"repeats = {repeats}; expected 0 or at least {FEWEST}",
+            remedy="Fewer repeats cannot give a significant result" if repeats > 0 else None,
         )
     if repeats and not counterfactual:
         raise InputError(
-            f"repeats = {repeats}, and no runs under A's decisions, which repeats tell from chance: {why}",
-            remedy="Leave out the repeats, or ask for 0",
+            f"repeats = {repeats}, but B is not run with A's decisions, so there is nothing to repeat: {why}",
+            remedy="Omit the repeats, or set repeats = 0",
         )
     return repeats
 
@@ -357,7 +357,7 @@ def screen(
     """
     choices = list(shipped(world_of(system)).values()) if choices is None else choices
     if not choices:
-        raise InputError("no choice to screen", remedy="Give at least one")
+        raise InputError("no choice to screen was given", remedy="Give at least one")
     rows: list[Screened] = []
     for done, choice in enumerate(choices):
         if progress is not None:

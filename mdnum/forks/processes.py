@@ -177,7 +177,7 @@ def variants(
     reference, own = next(((row, x) for row, x in found if x is not None), (None, None))
     if reference is None or own is None:
         row = found[0][0]
-        raise MdnumError(f"no variant ran; {row.variant.name!r} said: {row.failed}")
+        raise MdnumError(f"no variant ran; the error of {row.variant.name!r} was: {row.failed}")
     cell = Cell.create(np.asarray(system.cell.matrix), system.pbc)
 
     def furthest(one: np.ndarray, other: np.ndarray) -> float:
@@ -388,7 +388,7 @@ def digests_elsewhere(
         failed = _ask({**_question(system, steps, folder), **asked}, folder / "question.json", heard)
     if failed or len(found) != len(values):
         raise MdnumError(
-            f"the process that was to confirm boundaries failed: {failed or 'no message'}",
+            f"the process that confirms boundaries failed: {failed or 'no message'}",
             remedy="Run `mdnum doctor`",
         )
     return found
@@ -403,9 +403,9 @@ def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
     own = system if isinstance(system, BallSystem) else system.file
     if own is None:
         raise InputError(
-            "objects of this process cannot be made again by another",
+            "objects of this process cannot be recreated in another process",
             where=system.name,
-            remedy="Ask it of a system file",
+            remedy="Give a system file",
         )
     return own
 

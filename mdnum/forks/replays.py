@@ -124,7 +124,7 @@ def pinned(
     last_step = fork.steps if steps is None else steps
     if pairs is None:
         if fork.decision is None:
-            raise InputError("the runs do not fork", remedy="Name the pairs to pin")
+            raise InputError("the runs do not fork", remedy="Name the pairs whose decisions are pinned")
         i, j = fork.decision.subject
         pairs = [(i, j)]
         spell = disagreements(fork, i, j)[0]
@@ -146,7 +146,7 @@ def pinned(
 
 def _check_pair(pair: tuple[int, int], atoms: int) -> None:
     if not (0 <= min(pair) < max(pair) < atoms):
-        raise InputError(f"no pair {pair[0]}-{pair[1]} of {atoms} atoms", where="pin")
+        raise InputError(f"the pair {pair[0]}-{pair[1]} does not exist among {atoms} atoms", where="pin")
 
 
 def parse_pin(text: str, atoms: int) -> dict[str, Any]:
@@ -160,13 +160,17 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
     named = re.fullmatch(r"(\d+)\s*[-–]\s*(\d+)(?::(\d+)\.\.(\d+))?", text.strip())
     if named is None:
         raise InputError(
-            f"{text!r} names no decision", where="pin", remedy="Write fork, 3-75 or 3-75:600..700"
+            f"{text!r} is not a decision", where="pin", remedy="Write fork, 3-75 or 3-75:600..700"
         )
     pair = int(named[1]), int(named[2])
     _check_pair(pair, atoms)
     first, last = (None if part is None else int(part) for part in named.groups()[2:])
     if first is not None and last is not None and first > last:
-        raise InputError(f"steps {first} to {last} are none", where="pin", remedy="Give the first step first")
+        raise InputError(
+            f"the range of steps {first} to {last} is empty",
+            where="pin",
+            remedy="Give the smaller step first",
+        )
     return {"pairs": [pair], "first": first, "last": last}
 
 
@@ -183,7 +187,10 @@ def check_pins(fork: Fork) -> None:
             remedy="Use a system with a pair potential",
         )
     if b.frame is not None and not b.frame.is_same:
-        raise InputError("the runs have other labels or axes", remedy="Choose a variation without")
+        raise InputError(
+            "the two runs have different atom labels or axes",
+            remedy="Vary a choice that keeps labels and axes",
+        )
 
 
 def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:

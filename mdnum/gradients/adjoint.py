@@ -371,7 +371,8 @@ class StretchReversal:
         force: Any = simulation.force
         if guard is not None and not simulation.imposable:
             raise InputError(
-                "what flips add is known for pair potentials, and for energies that the list decides",
+                "the contribution of flips is known only for pair potentials and for energies whose "
+                "pairs the list decides",
                 remedy="Use the method symmetric for a many-body potential",
                 where=simulation.name,
             )

@@ -106,15 +106,16 @@ class Implicit(BallMethod):
         contact = problem.world.contact
         if not isinstance(contact, Projection):
             raise InputError(
-                f"{type(contact).__name__} has no iterated projection to take the fixed point of",
+                f"{type(contact).__name__} has no iterated projection, so it has no fixed point to "
+                "differentiate",
                 remedy="Use the unrolled derivative, or event-aware for an impact.",
             )
         gain = float(contact.alpha) * float(contact.k)
         condition = max(1.0, gain + self.regularization) / min(1.0, gain + self.regularization)
         if condition > LIMIT:
             raise InputError(
-                f"1 - dG/dy has the condition number {condition:.3g}; expected at most {LIMIT:g}",
-                remedy="Regularize the solve, and read the derivative as that of a regularized problem.",
+                f"1 - dG/dy has condition number {condition:.3g}; expected at most {LIMIT:g}",
+                remedy="Regularize the solve; the derivative is then that of the regularized problem.",
             )
         rule = FixedPointRule(self.regularization, self.at_iterate)
         attached = _with_contact(problem, replace(contact, derivative=rule))
@@ -224,7 +225,8 @@ def softened(problem: BallProblem, eps: float) -> BallProblem:
     rate, h = speed / eps, float(world.integrator.h)
     if h * rate * _RESOLVED > 1.001:
         raise InputError(
-            f"a floor of width {eps:g} m acts for {1 / rate:.3g} s; a step of {h:g} s does not resolve it",
+            f"the ball crosses the contact layer of width {eps:g} m in {1 / rate:.3g} s, which a step "
+            f"of {h:g} s does not resolve",
             remedy=f"Choose eps of at least {_RESOLVED * speed * h:.2g} or a shorter step.",
             where="eps",
         )
@@ -293,7 +295,7 @@ class ThroughContacts(BallMethod):
             events, flagged = _events(problem, run)
         if flagged:
             raise NumericalError(
-                f"contacts that graze the floor: {int(flagged)}; their time has no derivative",
+                f"contacts that graze the floor: {int(flagged)}; the contact time has no derivative there",
                 remedy="Move the start or the step until the ball crosses the floor, or smooth the contact.",
             )
         use = used(problem, names, slopes, run, own=located or smooth)

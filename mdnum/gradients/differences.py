@@ -163,7 +163,10 @@ def nonzero(problem: Problem, name: str) -> float:
     """
     here = float(parameters.value(problem.simulation, name))
     if here == 0:
-        raise InputError(f"{name} is 0, and a step is a share of it", remedy="Shift another parameter")
+        raise InputError(
+            f"{name} is 0, but the finite-difference step is relative to its value",
+            remedy="Differentiate with respect to another parameter",
+        )
     return here
 
 

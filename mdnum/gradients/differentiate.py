@@ -82,8 +82,8 @@ def differentiable(
     def at(values: Values) -> Problem:
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
             raise InputError(
-                "a rollout was called inside jit or vmap; its lists are made on the host",
-                remedy="Call it, and jax.grad of it, outside of jit and vmap",
+                "a rollout was called inside jit or vmap, but neighbor lists are built on the host",
+                remedy="Call the rollout, and jax.grad of it, outside of jit and vmap",
             )
         return problem.at(_in_full(problem, values, full))
 
@@ -138,7 +138,9 @@ def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) ->
             if blamed.operation:
                 why = f": at step {blamed.step} {blamed.operation}({inputs}) in {blamed.source}"
         what = "the loss" if not np.isfinite(found.value) else f"the gradient by {', '.join(bad)}"
-        raise NumericalError(f"{what} is not finite{why}", where=found.method, remedy="Mend that operation")
+        raise NumericalError(
+            f"{what} is not finite{why}", where=found.method, remedy="Correct that operation"
+        )
     return found
 
 
@@ -153,8 +155,8 @@ def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str,
         (name,) = parameters.resolve(problem.simulation, [word])
         if name not in full:
             raise InputError(
-                f"a value for {word}, which the gradient was not asked for",
-                remedy=f"Name it among the parameters; they are {', '.join(full)}",
+                f"a value was given for {word}, which is not a parameter of this gradient",
+                remedy=f"Add it to the parameters, which are {', '.join(full)}",
             )
         out[name] = np.asarray(value)
     return out

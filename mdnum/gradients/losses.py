@@ -259,7 +259,7 @@ class EinsteinDiffusion(Loss):
     def looks_at(self, steps, last):
         if last < self.first + self.every:
             seen = f"a slope needs two frames, and up to step {last} there is one at most"
-            raise self.wrong(seen, "Run longer, or look earlier or more often")
+            raise self.wrong(seen, "Run longer, or evaluate the loss earlier or more often")
         return super().looks_at(steps, last)
 
 
@@ -456,8 +456,8 @@ def parse(text: str, simulation: Simulation, steps: int) -> Loss:
         key, equals, value = (piece.strip() for piece in part.partition("="))
         if not equals or key not in known:
             raise InputError(
-                f"{part!r} is no number of the loss {name}",
-                remedy=f"It has {', '.join(known)}; write for example {name}:every=10",
+                f"{part!r} is not an option of the loss {name}",
+                remedy=f"Its options are {', '.join(known)}; write for example {name}:every=10",
             )
         try:
             options[key] = int(value) if "int" in known[key] else float(value)

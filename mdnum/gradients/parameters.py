@@ -113,14 +113,18 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
         below = [name for name in known if name.startswith(f"{word}.")]
         whole = next((key for key in _INTEGERS if word in (key, key.rpartition(".")[2])), None)
         if whole is not None and whole not in known:
-            raise InputError(f"nothing is differentiable by {whole}: {_INTEGERS[whole]}", where=word)
+            raise InputError(
+                f"no loss is differentiable with respect to {whole}: {_INTEGERS[whole]}", where=word
+            )
         if shared := parameters.shared_radius(simulation.model, word):
             message = f"one decision of a pair is that of {', '.join(shared)}, which have the same radius"
             remedy = "Differentiate by cutoff.radius, which moves that of all terms, or let theirs differ"
             raise InputError(message, where=word, remedy=remedy)
         out += below or [parameters.resolve(simulation, word, known)]
     if not out:
-        raise InputError("no parameter to differentiate by", remedy=f"There are {', '.join(known)}")
+        raise InputError(
+            "no parameter to differentiate with respect to", remedy=f"Choose from {', '.join(known)}"
+        )
     return tuple(dict.fromkeys(out))
 
 

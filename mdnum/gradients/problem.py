@@ -56,13 +56,13 @@ class Problem:
         assert self.simulation.propagator is not None
         if not self.loss.looks_at(np.arange(self.steps + 1), self.steps).any():
             raise InputError(
-                f"the loss {self.loss.name} looks at no step up to {self.steps}",
-                remedy="Run longer, or look earlier or more often",
+                f"the loss {self.loss.name} is evaluated at no step up to {self.steps}",
+                remedy="Run longer, or evaluate the loss earlier or more often",
             )
         around = surroundings(self.simulation)
         why = self.loss.reason_unavailable(around)
         if why is not None:
-            raise InputError(f"the loss {self.loss.name} has no meaning here: {why}")
+            raise InputError(f"the loss {self.loss.name} is not defined here: {why}")
         # a loss that is no number is refused before anything is run
         shape: Any = jax.ShapeDtypeStruct
         vector = shape((3, self.simulation.atoms), self.simulation.policy.dtype("state"))
@@ -75,7 +75,9 @@ class Problem:
             raise InputError(f"the loss has shape {seen}; expected a scalar", remedy="Reduce it to a number")
         if not np.issubdtype(made.dtype, np.inexact):
             remedy = "A count has no gradient: make a float of it that varies smoothly"
-            raise InputError(f"the loss is of dtype {made.dtype}; expected a float", remedy=remedy)
+            raise InputError(
+                f"the loss has dtype {made.dtype}; expected a floating-point type", remedy=remedy
+            )
         if np.issubdtype(made.dtype, np.complexfloating):
             parts = (ComplexPart(inner=self.loss, factor=jnp.asarray(one)) for one in (1 + 0j, -1j))
             object.__setattr__(self, "parts", tuple(replace(self, loss=one) for one in parts))
@@ -166,7 +168,7 @@ class Method:
         full = self.known(problem, names)
         why = self.reason_unavailable(problem, full)
         if why is not None:
-            raise InputError(f"the method {self.name} does not apply: {why}")
+            raise InputError(f"the method {self.name} is not applicable: {why}")
         return full
 
     def differentiate(self, problem: Any, names: tuple[str, ...], progress: Progress | None) -> Gradient:

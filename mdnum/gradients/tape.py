@@ -199,9 +199,9 @@ class RunTape:
         skin = self.simulation.rule.skin
         if segment.closes == "displacement" and segment.moved > skin:
             raise NumericalError(
-                f"a list missed pairs at step {segment.last}: an atom moved {segment.moved:.3g} since it "
-                f"was built, and the skin is {skin:.3g}",
-                remedy="Use a smaller time step if one step moves atoms that far, else a wider skin",
+                f"the neighbor list may miss pairs at step {segment.last}: an atom moved {segment.moved:.3g} "
+                f"since the list was built, and the skin is {skin:.3g}",
+                remedy="Use a smaller time step if one step moves atoms that far; otherwise use a wider skin",
             )
         ledger = None if self._recorder is None else self._recorder.flips(segment)
         stretch = stretch_of(segment, self._next, ledger)
@@ -340,8 +340,8 @@ class ReversibleTape(RunTape):
     def _astray(self, step: int, last: int) -> None:
         where = f"at step {step}" if last - step <= 1 else f"between steps {step} and {last}"
         raise NumericalError(
-            f"reversed, the run is not the one that was made: the way back went astray {where}",
-            remedy="The run may have missed pairs: use a list that is rebuilt in time (neighbors.rebuild)",
+            f"the reversed run did not retrace the forward run: it deviated {where}",
+            remedy="The neighbor list may have missed pairs: rebuild it in time (neighbors.rebuild)",
             where=self.simulation.name,
         )
 

@@ -253,7 +253,7 @@ class ChunkedProgram:
         between, record = chunk(*self._arguments(at, rows), rule=self.rule)
         if not bool(record.finite):
             raise NumericalError(
-                f"the program that is differentiated blew up at step {int(record.place.step) - 1}",
+                f"the differentiated run blew up at step {int(record.place.step) - 1}",
                 remedy="Use a smaller time step, or a start without overlapping atoms",
             )
         return Snapshot(between, record.place, self.list_of(at)[0].slots)

@@ -151,12 +151,12 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
 
     made = cutoff if isinstance(cutoff, Cutoff) else cutoff()
     if not isinstance(getattr(made, "name", None), str):
-        raise ValueError("it has no name")
+        raise ValueError("the cutoff has no name")
     with jax.enable_x64(True):
         ends = [_ends(made, power) for power in (1, 3)]
     if made.smoothness < _ORDERS and not any(ends):
         after = _DERIVATIVES[max(made.smoothness + 1, 0)]
-        raise ValueError(f"its smoothness is {made.smoothness}, and its {after} does not jump")
+        raise ValueError(f"its declared smoothness is {made.smoothness}, but its {after} does not jump")
 
 
 def _ends(made: Cutoff, power: int) -> bool:
@@ -184,7 +184,7 @@ def _ends(made: Cutoff, power: int) -> bool:
             f"its slope is not the derivative of its energy at r = {r[off.argmax()]:g}, r_cut = 2"
         )
     if made.switches and not np.allclose(energy[r < 1.6], r[r < 1.6] ** (-2 * power), rtol=1e-12):
-        raise ValueError("it switches, and changes the energy below the onset")
+        raise ValueError("the switching function changes the energy below the onset")
 
     edges = np.array([1.6**2 * (1 - 2**-46), 1.6**2 * (1 + 2**-46), 4 * (1 - 2**-46)])
     for order in range(min(claimed + 1, _ORDERS) + 1):
@@ -196,14 +196,15 @@ def _ends(made: Cutoff, power: int) -> bool:
             # no event tells of a jump of the energy at the onset, whatever is claimed
             if order <= claimed or (order == 0 and place == "the onset"):
                 raise ValueError(
-                    f"its {_DERIVATIVES[order]} jumps by {jump:g} at {place}, and its smoothness is {claimed}"
+                    f"its {_DERIVATIVES[order]} jumps by {jump:g} at {place}, which contradicts its "
+                    f"declared smoothness of {claimed}"
                 )
             ends = True
     inside, steep = (float(value[2]) for value in cut(edges))
     for name, limit, least in (("energy", inside, 1e-9 * at.energy), ("force", -4 * steep, -1e-5 * at.slope)):
         told = float(getattr(made, f"{name}_jump")(at))
         if not abs(told - limit) <= least:
-            raise ValueError(f"its {name}_jump is {told:g}, and its {name} inside r_cut is {limit:g}")
+            raise ValueError(f"its {name}_jump is {told:g}, but its {name} just inside r_cut is {limit:g}")
     return ends
 
 

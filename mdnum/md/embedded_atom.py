@@ -60,19 +60,20 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
         n_rho, n_r = int(first), int(second)
     except (IndexError, ValueError) as error:
         raise InputError(
-            f"this is no setfl table: lines 4 and 5 should name the elements and the grids ({error})",
+            f"this is not a setfl table: lines 4 and 5 must name the elements and the grids ({error})",
             where=where,
             remedy="Give a file in LAMMPS's eam/alloy format",
         ) from error
     if len(elements) != 1:
         raise InputError(
-            f"a table for {len(elements)} elements ({', '.join(elements)}); one is supported",
+            f"the table is for {len(elements)} elements ({', '.join(elements)}); only tables of one "
+            "element are supported",
             where=where,
             remedy="Give a table of a single element",
         )
     if others := sorted(set(symbols) - set(elements)):
         raise InputError(
-            f"a table for {elements[0]}, but the structure holds {', '.join(others)}",
+            f"the table is for {elements[0]}, but the structure holds {', '.join(others)}",
             where=where,
             remedy="Correct the structure or potential.file",
         )
@@ -84,13 +85,13 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError as error:
-        raise InputError(f"a number of the table cannot be read ({error})", where=where) from error
+        raise InputError(f"a number in the table cannot be read ({error})", where=where) from error
     if not np.isfinite(numbers).all() or min(drho, dr, r_cut) <= 0 or min(n_rho, n_r) < 5:
-        raise InputError("the table has numbers that are not finite, or grids that are empty", where=where)
+        raise InputError("the table contains numbers that are not finite, or empty grids", where=where)
     # many files end one step before their cutoff: the last cubic is carried on, as ASE does it
     if r_cut > n_r * dr * (1 + 1e-9):
         raise InputError(
-            f"the table ends at {(n_r - 1) * dr:g}, its cutoff is {r_cut:g}",
+            f"the table ends at r = {(n_r - 1) * dr:g}, before its cutoff {r_cut:g}",
             where=where,
             remedy="Lower the cutoff in line 5 or extend the table",
         )

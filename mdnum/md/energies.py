@@ -223,7 +223,7 @@ def energy_function(
         InputError: a convention that is not known, or that takes a graph; units that are not known.
     """
     if not (np.isfinite(r_cut) and r_cut > 0):
-        raise InputError(f"an interaction radius above 0 is needed; got {r_cut}")
+        raise InputError(f"the interaction radius is {r_cut}; expected a length above 0")
     parts = list(given) if isinstance(given, tuple | list) else [given]
     lists = next((part for part in parts if hasattr(part, "allocate")), None)
     # (neighbor_fn, init_fn, energy_fn), or (energy_fn, neighbor_fn, displacement_fn)
@@ -232,7 +232,7 @@ def energy_function(
     if not others or not callable(function := others[0 if first else -1]):
         seen = ", ".join(type(part).__name__ for part in parts)
         raise InputError(
-            f"no energy function; got {seen}", remedy="Give a function, or (neighbor_fn, function)"
+            f"expected an energy function; got {seen}", remedy="Give a function, or (neighbor_fn, function)"
         )
     start = others[0] if not first and len(others) > 1 else None
     if not name:
@@ -242,7 +242,9 @@ def energy_function(
     how = recognized(function, parameters is not None or start is not None, name)
     how = replace(how, images=lists is not None and "MultiImage" in type(lists).__name__)
     if how.parameters and parameters is None and start is None:
-        raise InputError(f"{name}: its first argument is its parameters", remedy="Give parameters=")
+        raise InputError(
+            f"{name} takes its parameters as first argument, and none were given", remedy="Give parameters="
+        )
     length, energy = _scales(units, name)
     tree = () if parameters is None else jax.tree.map(jnp.asarray, parameters)
     made = Call(function, how, length, energy, name)
@@ -267,7 +269,7 @@ def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Con
     names = [one.name.lower() for one in placed]
     if placed and (names[0] in _GRAPHS or "Graph" in str(placed[0].annotation)):
         raise InputError(
-            f"{name} takes a graph and no neighbor list: no list can be given to it as it is",
+            f"{name} takes a graph, not a neighbor list, so mdnum cannot pass its list to it",
             remedy="Wrap it: def energy(parameters, R, neighbor, cell), which makes the graph of "
             "neighbor.idx and mdnum.md.jaxmd.displacement(cell)",
         )

@@ -119,7 +119,9 @@ class FixedPointUnits:
             )
         matrix = np.round(np.asarray(cell.matrix, np.float64) / self.spacing)
         if np.max(np.abs(matrix)) >= 2**50:
-            raise InputError("the box is too large for positions this fine", where="precision.state")
+            raise InputError(
+                "the box is too large for fixed-point positions of this resolution", where="precision.state"
+            )
         made = Cell.create(matrix * self.spacing, cell.pbc)
         # an atom at the far face is at the near one: L times its inverse must not round below 1
         inverse, edges = np.array(made.inverse), np.diag(matrix * self.spacing)
@@ -339,7 +341,7 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
     """
     if type(integrator) not in (VelocityVerlet, Langevin):
         raise InputError(
-            f"in fixed-point numbers there are steps of nve and langevin, and none of {integrator.name}",
+            f"fixed-point arithmetic supports nve and langevin, not {integrator.name}",
             where="precision.state",
             remedy='Use state = "float64"',
         )
@@ -357,7 +359,8 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
         period = _period(kept)
         if period < 1:
             raise InputError(
-                f"friction x timestep = {loss:.3g}; in fixed-point numbers it must lie between 1e-7 and 10",
+                f"friction x timestep = {loss:.3g}; in fixed-point arithmetic it must lie between "
+                "1e-7 and 10",
                 where="dynamics.friction",
             )
         decay = kept / 2**_SHIFT
@@ -406,9 +409,9 @@ def counted(x: Float[Array, "*shape"], zero: jax.Array) -> jax.Array:
 def _counted_jvp(primals, tangents):
     # a derivative of 0 would be taken for an answer
     raise InputError(
-        "a program in fixed-point numbers has no derivative of its own",
+        "a step in fixed-point arithmetic has no derivative",
         where="precision.state",
-        remedy="Use the method reversible or symmetric, which count a rounding as the identity",
+        remedy="Use the method reversible or symmetric, which treat rounding as the identity",
     )
 
 

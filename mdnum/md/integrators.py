@@ -302,7 +302,9 @@ class KickDrift(Integrator):
         super().__init_subclass__(**options)
         own = ("kick", "init", "finish", "begin", "deform")
         if other := [name for name in own if getattr(cls, name) is not getattr(KickDrift, name)]:
-            raise TypeError(f"{cls.__name__} has its own {other[0]}: make it an Integrator, not a KickDrift")
+            raise TypeError(
+                f"{cls.__name__} overrides {other[0]}: derive it from Integrator, not from KickDrift"
+            )
 
     def kick(self, v: Vector, time: Number, acceleration: Vector) -> Vector:
         """Velocities after an acceleration has acted for a time."""
@@ -344,7 +346,9 @@ def check_kick(integrator: Integrator) -> None:
 def check_one_box(integrator: Integrator, what: str) -> None:
     """Refuse an integrator that moves the box for what has one box alone, with an `InputError`."""
     if integrator.moves_cell:
-        raise InputError(f"{what} need one box, and {integrator.name} moves it", where="dynamics.kind")
+        raise InputError(
+            f"{what} need a fixed box, but {integrator.name} changes the box", where="dynamics.kind"
+        )
 
 
 def _is_linear(integrator: KickDrift) -> bool:

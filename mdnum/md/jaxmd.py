@@ -68,7 +68,7 @@ def displacement(
     ) -> Array:
         if Ra.shape != (3,) or Rb.shape != (3,):
             # jax-md probes with one and two dimensions and moves on at a ValueError
-            raise ValueError(f"displacement of two points in 3 dimensions; got {Ra.shape} and {Rb.shape}")
+            raise ValueError(f"expected two points in 3 dimensions; got shapes {Ra.shape} and {Rb.shape}")
         vector = Ra - Rb
         if periodic:
             lattice = jnp.asarray(base if cell is None else cell, vector.dtype)
@@ -281,7 +281,7 @@ class PairSearch:
 
         def metric(Ra: Array, Rb: Array, **_: Any) -> Array:
             if Ra.shape != (3,):
-                raise ValueError("three dimensions")
+                raise ValueError("only three dimensions are supported")
             delta = Ra - Rb
             delta = delta - jnp.where(wraps, jnp.round(delta), 0.0)
             return delta[0] * rows[0] + delta[1] * rows[1] + delta[2] * rows[2]
@@ -324,7 +324,7 @@ class PairSearch:
             with standard_promotion(), _quiet_scatter():
                 found = self._allocate(folded)
             if bool(found.did_buffer_overflow):
-                raise CapacityError("jax-md's list overflows right after its allocation")
+                raise CapacityError("jax-md's neighbor list overflows immediately after its allocation")
             self._list = found
         idx = np.asarray(found.idx)
         vectors = positions[np.minimum(idx, atoms - 1)] - positions[:, None, :]

@@ -236,11 +236,14 @@ def _written(
     def text(value: Any, kind: str = "VEC") -> str:
         if isinstance(value, _Value):
             if value.kind != kind:
-                raise TypeError("a number where a decision is expected, or the other way round")
+                raise TypeError(
+                    "a number was given where a decision is expected, or a decision where a number "
+                    "is expected"
+                )
             return value.name
         known = not isinstance(value, Tracer | jax.Array)
         if np.size(value) != 1 or kind not in ("VEC", "BOOL", "LONG" if known else ""):
-            raise TypeError("an array, or a number of another kind")
+            raise TypeError("the value is an array, or a number of another kind")
         if known:
             return _number(value, kind)
         constants.setdefault(id(value), value)
@@ -322,7 +325,7 @@ def _written(
             "select_n": given[0] != "BOOL",
         }
         if line is None or not kind or unlike.get(name):
-            raise TypeError("no counterpart")
+            raise TypeError("the operation has no counterpart in the compiled loop")
         operands = list(map(text, inputs, given))
         if kind == "VEC" and name in ("mul", "div"):
             return [product(*operands) if name == "mul" else quotient(*operands)]

@@ -222,7 +222,7 @@ class VerletList:
             if most <= self.slots:
                 return PairTable(index, order, r_list, most, time.perf_counter() - begin)
             if most >= atoms and atoms > 1:
-                raise CapacityError(f"an atom has {most} neighbors among {atoms} atoms")
+                raise CapacityError(f"an atom has {most} neighbors, but there are only {atoms} atoms")
             self.slots = self._rounded(most * self.slack)
 
     def _guess(self, atoms: int, cell: Cell, r_list: float) -> int:

@@ -271,7 +271,8 @@ class ChannelForce(PairForce):
 
     def judge(self, positions):
         raise InputError(
-            "terms with different radii have a decision each, and here one is expected",
+            "each term with its own radius has its own decision, but here a single decision per pair "
+            "is expected",
             remedy="Give all terms the same radius",
         )
 

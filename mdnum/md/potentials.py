@@ -219,7 +219,7 @@ class PairFunction(PairPotential):
             raise InputError(
                 f"{error}; it takes {', '.join(arguments[1:])}",
                 where=_name_of(function),
-                remedy="Give every parameter by its name",
+                remedy="Give a value for every parameter by name",
             ) from None
 
     name = property(lambda self: _name_of(self.function))  # type: ignore[assignment]

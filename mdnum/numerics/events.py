@@ -67,7 +67,7 @@ class Hysteresis:
         # traced values are checked where they were made
         if isinstance(enter, float | int) and isinstance(leave, float | int) and leave < enter:
             raise InputError(
-                f"a yes would end at {leave:g}, before it begins at {enter:g}",
+                f"the decision would end at {leave:g}, before it begins at {enter:g}",
                 remedy="Put the threshold for leaving at or above the one for entering",
             )
 

@@ -152,7 +152,7 @@ def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
         TypeError: it is a program of its own, such as a loop.
     """
     if any(isinstance(param, Jaxpr | ClosedJaxpr) for param in equation.params.values()):
-        raise TypeError(f"{equation.primitive.name} cannot be run operation by operation")
+        raise TypeError(f"{equation.primitive.name} cannot be evaluated operation by operation")
     outputs = equation.primitive.bind(*inputs, **equation.params)
     return list(outputs) if equation.primitive.multiple_results else [outputs]
 
@@ -210,7 +210,7 @@ def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list
         if (inner := inlined(equation)) is not None:
             return interpreted(inner, inputs, rule, enter)
         if name not in _IN_BALLS:
-            raise TypeError(f"{name} has no counterpart in ball arithmetic")
+            raise TypeError(f"{name} is not available in ball arithmetic")
         return [_IN_BALLS[name](*inputs, **equation.params)]
 
     return lambda *balls: interpreted(program, balls, rule, enter)

@@ -20,9 +20,9 @@ def check_not_forked() -> None:
     """
     if _forked:
         raise InputError(
-            "this process was forked from one in which jax had been used, and jax would wait in it for ever",
-            remedy="Start workers with multiprocessing.get_context('spawn'), or use mdnum in workers "
-            "alone (docs/pools.md)",
+            "this process was forked from one in which jax had been used, and jax would deadlock in it",
+            remedy="Start workers with multiprocessing.get_context('spawn'), or use mdnum only in "
+            "the workers (docs/pools.md)",
         )
 
 

@@ -226,5 +226,6 @@ def check_scale(scale: float) -> None:
     """
     if not (scale > 0 and math.frexp(scale)[0] == 0.5):
         raise InputError(
-            f"a scale of {scale:g} is not a power of two", remedy="Give one; then scaling is exact"
+            f"the scale {scale:g} is not a power of two",
+            remedy="Give a power of two, for which scaling is exact",
         )

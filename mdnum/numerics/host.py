@@ -63,7 +63,7 @@ def _broadcast(x: np.ndarray, *, shape, broadcast_dimensions, **_: Any) -> np.nd
 def _dot(a: np.ndarray, b: np.ndarray, *, dimension_numbers, **_: Any) -> np.ndarray:
     (left, right), batches = dimension_numbers
     if any(batches):
-        raise TypeError("a product of stacks of matrices")
+        raise TypeError("products of stacks of matrices (batched matmul) are not supported")
     return np.tensordot(a, b, (left, right))
 
 

@@ -145,7 +145,9 @@ class FixedPoint(Reduction):
 
     def __post_init__(self):
         if abs(self.bits) > 1000:
-            raise InputError(f"{self.bits} digits after the binary point", remedy="Give -1000 to 1000.")
+            raise InputError(
+                f"{self.bits} binary digits after the point", remedy="Give a number from -1000 to 1000."
+            )
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """One int64 per sum."""
@@ -171,7 +173,7 @@ def _numbered(reduction: Callable[[int], Reduction], default: int) -> Callable[.
         try:
             return reduction(default if number is None else int(number))
         except ValueError:
-            raise InputError(f"{number!r} is not a whole number") from None
+            raise InputError(f"{number!r} is not an integer") from None
 
     return make
 
@@ -221,7 +223,7 @@ def segment_sum(
     """
     index = np.asarray(index)
     if len(index) and not (index.min() >= 0 and index.max() < segments):
-        raise InputError(f"an index outside 0 ... {segments - 1}")
+        raise InputError(f"a segment index lies outside 0 to {segments - 1}")
     order = np.argsort(index, kind="stable")
     counts = np.bincount(index, minlength=segments)
     starts = np.concatenate([[0], np.cumsum(counts)])[:-1]

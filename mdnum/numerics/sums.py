@@ -194,7 +194,7 @@ class Blocked(Reduction):
 
     def __post_init__(self):
         if self.width < 2:
-            raise InputError(f"a tree of width {self.width} adds nothing", remedy="Give 2 or more.")
+            raise InputError(f"a summation tree of width {self.width} adds nothing", remedy="Give 2 or more.")
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """Level by level."""
@@ -424,12 +424,15 @@ def running_sum_table(
     terms = np.asarray(terms)
     terms = terms.astype(np.dtype(dtype) if dtype is not None else terms.dtype)
     if terms.ndim != 1 or len(terms) == 0:
-        raise InputError(f"terms of shape {terms.shape}", remedy="Give one axis with at least one term.")
+        raise InputError(
+            f"the terms have shape {terms.shape}",
+            remedy="Give a one-dimensional array with at least one term.",
+        )
     if not np.isfinite(terms.astype(np.float64)).all():
-        raise InputError("a term is not finite, so the sum has no history")
+        raise InputError("a term is not finite, so partial sums cannot be recorded")
     if not isinstance(reduction, Serial):
         remedy = "Give sequential, reversed, permuted or sorted"
-        raise InputError(f"{reduction} is no loop over the terms", remedy=remedy)
+        raise InputError(f"{reduction} is not a sequential loop over the terms", remedy=remedy)
     with np.errstate(all="ignore"):
         rows = tuple(_loop(terms, reduction.places(terms)))
     exact = sum((Fraction(float(t)) for t in terms), Fraction(0))

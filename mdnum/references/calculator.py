@@ -139,7 +139,7 @@ class MdnumCalculator(ClassicalCalculator):
             TypeError: something is to be changed.
         """
         if changes:
-            raise TypeError(f"MdnumCalculator has no {', '.join(changes)} to set; make another calculator")
+            raise TypeError(f"MdnumCalculator cannot change {', '.join(changes)}; make another calculator")
         return {}
 
     def evaluated(self, atoms, changes):

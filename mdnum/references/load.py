@@ -72,7 +72,9 @@ class NamedObject:
         try:
             return target(*arguments, **keywords)
         except Exception as error:
-            raise self._wrong(f"making it failed: {in_a_line(error)}", "Correct the arguments") from error
+            raise self._wrong(
+                f"it could not be constructed: {in_a_line(error)}", "Correct the arguments"
+            ) from error
 
     def source(self) -> tuple[str, str]:
         """(lines that import the name, an expression that is the object), for a script without mdnum."""
@@ -135,7 +137,7 @@ class NamedObject:
                 names = public(value)
                 has = ", ".join(names[:8]) or "no function: give the name of one"
                 remedy = meant(part, names).rstrip() or f"It has {has}"
-                raise InputError(f"{where} has no {part!r}", remedy=remedy)
+                raise InputError(f"{where} has no attribute {part!r}", remedy=remedy)
             value, where = getattr(value, part), f"{where}.{part}"
         return value
 

@@ -121,7 +121,7 @@ def all_pairs(
     pbc = np.asarray(pbc, dtype=bool)
     cell = _usable_cell(np.asarray(cell, dtype=np.float64), pbc)
     if not np.isfinite(positions).all():
-        raise InputError("positions contain numbers that are not finite", where="pair oracle")
+        raise InputError("the positions contain numbers that are not finite", where="pair oracle")
     stored = np.where(pbc[:, None], cell, 0.0)
     bound = rounding_bound(positions, stored, r_cut)
     reach = r_cut + bound if reach is None else max(reach, r_cut + bound)

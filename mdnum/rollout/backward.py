@@ -182,7 +182,7 @@ class BackwardRun:
             return
         self._check_bath()
         if step not in self.baths:
-            raise NumericalError(f"what friction had forgotten before step {step} was not kept")
+            raise NumericalError(f"the bits that friction discarded before step {step} were not stored")
         self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
@@ -190,7 +190,8 @@ class BackwardRun:
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(
-                f"taken back, the run is not the one that was made: at step {step} the bath is not empty"
+                f"the reversed run did not retrace the forward run: at step {step} the store of "
+                "discarded bits is not empty"
             )
 
 

@@ -205,7 +205,7 @@ class PairRecorder:
         """Pairs, of which both ends were counted."""
         if both % 2:
             raise MdnumError(
-                "a pair was decided differently from its two ends", remedy="Report this as a bug"
+                "the decision of a pair differs between its two atoms", remedy="Report this as a bug"
             )
         return both // 2
 
@@ -264,8 +264,8 @@ class PairRecorder:
         decision was made with.
 
         Raises:
-            MdnumError: a flip was recorded from one end only, or a margin contradicts its decision: the
-                compiled program and the host would disagree about arithmetic.
+            MdnumError: a flip was recorded for one atom of the pair only, or a margin contradicts its decision:
+                the arithmetic of the compiled program differs from that of the host.
         """
         table, changes = segment.table, segment.changes
         replaced = self._replace(segment)
@@ -275,7 +275,9 @@ class PairRecorder:
             changes = _noted(before, bits, table.index, x, v)
         found, both, _ = np.asarray(changes.count).tolist()
         if 2 * found != both:
-            raise MdnumError("a flip was recorded from one end only", remedy="Report this as a bug")
+            raise MdnumError(
+                "a flip was recorded for one atom of the pair only", remedy="Report this as a bug"
+            )
         pairs, ends = np.asarray(changes.pairs), np.asarray(changes.ends)
         kept = np.searchsorted(pairs[:found, 0], segment.rows)
         pairs, ends = pairs[:kept], ends[:kept]

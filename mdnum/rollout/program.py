@@ -92,7 +92,8 @@ class MdProgram:
         """
         if self.size != other.size:
             raise InputError(
-                f"the runs have {self.size} and {other.size} atoms", remedy="Compare runs of one structure"
+                f"the runs have {self.size} and {other.size} atoms; expected the same number",
+                remedy="Compare runs of the same structure",
             )
 
     def lockstep(

@@ -386,7 +386,7 @@ def run(
             return finished
         rollout = _resumed(Path(resume), layout, given, steps, progress, began)
     elif system is None:
-        raise InputError("no system given", remedy="Name a system, or a folder to resume")
+        raise InputError("no system given", remedy="Give a system, or a folder to resume")
     else:
         simulation = build(system, overrides)
         rollout = _fresh(simulation, layout, out, steps, save_every, progress, began)
@@ -445,7 +445,7 @@ def _resumed(
     with folder.explained():
         state = folder.load_checkpoint()
         if steps is not None and steps < int(np.asarray(state["state_step"])) - 1:
-            raise FolderError(f"has run past step {steps} already", where=str(path))
+            raise FolderError(f"the run is already past step {steps}", where=str(path))
         folder.check_start()
         simulation = again(path, given)
         last = int(state["steps"]) if steps is None else steps

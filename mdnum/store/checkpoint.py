@@ -55,7 +55,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             arrays = _arrays(file)
         meta, store = (json.loads(str(arrays.pop(name))) for name in (_META, _STORE))
         if not isinstance(meta, dict) or not isinstance(store, dict):
-            raise ValueError("what it counts is no table")
+            raise ValueError("its row counts are not a table")
         return arrays | meta, store
     except FolderError:
         raise
@@ -73,10 +73,10 @@ def _arrays(file: BinaryIO) -> dict[str, np.ndarray]:
         members = archive.infolist()
         # members that are not packed and share no bytes cannot hold more than the file
         if any(one.compress_type != zipfile.ZIP_STORED for one in members):
-            raise ValueError("it is packed, which no checkpoint of mdnum is")
+            raise ValueError("the file is compressed, but mdnum writes checkpoints uncompressed")
         held = sum(one.file_size for one in members)
         if held > size:
-            raise ValueError(f"it claims to hold {held:,} bytes in a file of {size:,}")
+            raise ValueError(f"its header claims {held:,} bytes, but the file has {size:,}")
         return {one.filename.removesuffix(".npy"): _array(archive, one) for one in members}
 
 
@@ -87,7 +87,7 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         shape, _, dtype = header(stream)
         claimed = math.prod(shape) * dtype.itemsize
         if dtype.hasobject or claimed != member.file_size - stream.tell():
-            raise ValueError(f"{member.filename} claims {claimed:,} bytes that are not there")
+            raise ValueError(f"{member.filename} claims {claimed:,} bytes that the file does not contain")
     with archive.open(member) as stream:
         return npy.read_array(stream, allow_pickle=False)
 
@@ -99,7 +99,9 @@ def _split(state: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, A
         if hasattr(value, "__array__"):
             array = np.asarray(value)
             if array.dtype.kind not in "biufcU":
-                raise TypeError(f"checkpoint: {key!r} has dtype {array.dtype}, which npz would not give back")
+                raise TypeError(
+                    f"checkpoint: {key!r} has dtype {array.dtype}, which an npz file cannot restore"
+                )
             arrays[key] = array
         else:
             meta[key] = value

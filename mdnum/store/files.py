@@ -173,16 +173,16 @@ def _refuse(seen: os.stat_result, path: Path, in_place: bool) -> None:
     if stat.S_ISLNK(seen.st_mode):
         raise _linked(path)
     if not stat.S_ISREG(seen.st_mode):
-        raise FolderError("is no plain file", remedy="Remove it, or use another folder", where=str(path))
+        raise FolderError("is not a regular file", remedy="Remove it, or use another folder", where=str(path))
     if in_place and seen.st_nlink > 1:
         seen_so = "has a second name (a hard link), under which it would be changed too"
-        raise FolderError(seen_so, remedy="Put a copy in its place", where=str(path))
+        raise FolderError(seen_so, remedy="Replace it by a copy", where=str(path))
 
 
 def _linked(path: Path) -> FolderError:
     return FolderError(
-        "is a link, and a folder's files are not looked for elsewhere",
-        remedy="Put a copy in its place if it is yours",
+        "is a link; files of a result folder must lie in the folder itself",
+        remedy="Replace the link by a copy of the file if it is yours",
         where=str(path),
     )
 
@@ -243,11 +243,11 @@ def load(root: Path) -> Manifest | None:
         held = json.loads(text)
         stated = held.pop("digest")
         if stated != digest_of(_canonical(held)):
-            raise ValueError("its digest is that of another text")
+            raise ValueError("its digest does not match its content")
         files = {str(name): [str(one) for one in allowed] for name, allowed in held["files"].items()}
         # names of files in the folder, or in one of the folders in it
         if not all(map(_INSIDE.fullmatch, files)):
-            raise ValueError("it lists files of elsewhere")
+            raise ValueError("it lists files outside of the folder")
         layout = None
         if "kind" in held:
             # an earlier mdnum described columns of its own alone
@@ -255,8 +255,8 @@ def load(root: Path) -> Manifest | None:
         return Manifest(layout, bool(held["finished"]), files, str(held.get("version", "")))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FolderError(
-            "is damaged, so that the other files cannot be checked against it",
-            remedy="Restore the folder from a copy; its parquet files can be read one by one",
+            "is damaged, so the other files cannot be verified",
+            remedy="Restore the folder from a copy; its parquet files can still be read one at a time",
             where=str(path),
         ) from error
 

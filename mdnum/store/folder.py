@@ -138,7 +138,7 @@ class RunFolder:
             folder.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise FolderError(
-                f"cannot be made: {error.strerror}", remedy="Choose another folder", where=str(path)
+                f"cannot be created: {error.strerror}", remedy="Choose another folder", where=str(path)
             ) from error
         with disk_errors(folder.path):
             folder._take_lock()
@@ -171,7 +171,7 @@ class RunFolder:
             raise FolderError("no such folder", remedy="Give the folder of a run", where=str(path))
         names = (*_FILES, "parts", manifest.NAME)
         if not any([*((folder.path / name).exists() for name in names), *folder.path.glob("*.parquet")]):
-            raise FolderError("holds no run", remedy="Give the folder of a run", where=str(path))
+            raise FolderError("the folder holds no run", remedy="Give the folder of a run", where=str(path))
         made = manifest.load(folder.path)
         folder._layout = None if made is None else made.layout
         return folder
@@ -451,7 +451,7 @@ class RunFolder:
         free = [key for key in gaps if declared.get(key, ("", not declared))[1]]
         unknown = set() if columns else {key for key in free if gaps[key] == len(table)}
         if odd := [key for key in gaps if key not in unknown]:
-            raise FolderError(f"column {odd[0]!r} of table {name!r} has gaps", where=str(self.path))
+            raise FolderError(f"column {odd[0]!r} of table {name!r} has missing values", where=str(self.path))
         return {key: as_numpy(table[key]) for key in table.column_names if key not in unknown}
 
     def rows(self, name: str) -> int:
@@ -691,7 +691,9 @@ class RunFolder:
             or not all(isinstance(count, int) and count >= 0 for count in (*rows.values(), *mark, log))
         ):
             raise FolderError(
-                "counts what no folder of mdnum has", remedy="Run again in a new folder", where=str(path)
+                "counts rows of a table that mdnum does not write",
+                remedy="Run again in a new folder",
+                where=str(path),
             )
         return state, {"rows": rows, "frames": tuple(mark), "log": log}
 
@@ -724,7 +726,7 @@ class RunFolder:
         text = manifest.read_text(self.path / name)
         held = _parsed(self.path / name, text) if text else {}
         if not isinstance(held, dict):
-            raise FolderError("is damaged: holds no JSON object", where=str(self.path / name))
+            raise FolderError("is damaged: it does not contain a JSON object", where=str(self.path / name))
         return held
 
 
@@ -740,8 +742,8 @@ def restoring(path: Path) -> Iterator[None]:
     except _OF_WRONG_VALUES as error:
         seen = " ".join(str(error).split())[:200]
         raise FolderError(
-            f"holds what mdnum does not write there ({type(error).__name__} {seen})",
-            remedy="Restore it from a copy, or begin in a new folder",
+            f"has content that mdnum does not write there ({type(error).__name__} {seen})",
+            remedy="Restore the file from a copy, or start in a new folder",
             where=str(path),
         ) from error
 

@@ -54,7 +54,9 @@ class Layout:
     def __post_init__(self) -> None:
         matched = (_KIND.fullmatch(self.kind), _COMMAND.fullmatch(self.command))
         if not all(matched) or self.resumes_from not in ("", "checkpoint.npz", "answers.json"):
-            raise ValueError(f"no kind of folder: {self.kind!r}, {self.command!r}, {self.resumes_from!r}")
+            raise ValueError(
+                f"not a valid kind of folder: {self.kind!r}, {self.command!r}, {self.resumes_from!r}"
+            )
         if len(self.further) > _MOST_COLUMNS:
             raise ValueError(f"names of files: {self.further[:100]!r}")
         if len(self.tables) > _MOST_TABLES or not all(map(_TABLE.fullmatch, self.tables)):
@@ -63,14 +65,14 @@ class Layout:
         for table, texts in (self.described or {}).items():
             for column, said in texts.items():
                 if "*" not in column and column not in self.columns(table):
-                    raise ValueError(f"{table}.{column} is described, and no column")
+                    raise ValueError(f"{table}.{column} is described, but the table has no such column")
                 if (len(said) != 2 and type(said) is not str) or len("".join(said)) > _MOST_COLUMNS:
-                    raise ValueError(f"{table}.{column}: {said!r:.100} is no [unit, description]")
+                    raise ValueError(f"{table}.{column}: {said!r:.100} is not [unit, description]")
         for table, values in self.usual.items():
             for column, value in values.items():
                 kind, _ = self.columns(table)[column]
                 if type(value) not in TYPES[kind] or (type(value) is int and abs(value) >= 1 << 31):
-                    raise ValueError(f"{table}.{column} is {kind}, and {value!r} is none")
+                    raise ValueError(f"{table}.{column} is of type {kind}, but {value!r} is not")
 
     @cached_property
     def always(self) -> tuple[str, ...]:

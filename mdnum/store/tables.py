@@ -51,7 +51,7 @@ class TableStream:
         describe: Callable[[pa.Schema], pa.Schema] = pa.Schema.remove_metadata, in_parts: bool = False,
     ):  # fmt: skip
         if not re.fullmatch(r"[a-z][a-z_]*", name):
-            raise FolderError(f"no table is called {name!r}", where=str(root))
+            raise FolderError(f"there is no table {name!r}", where=str(root))
         self.name = name
         self._root = root
         self._check = check
@@ -104,7 +104,7 @@ class TableStream:
             if start > rows:
                 raise FolderError(
                     f"rows {rows} to {start - 1} of table {self.name!r} are missing",
-                    remedy="A part file was removed; run again in a new folder",
+                    remedy="A file of this table was removed; run again in a new folder",
                     where=str(self.parts_folder),
                 )
             count = self._row_count(path)
@@ -175,7 +175,7 @@ class TableStream:
         else:
             if self._writing is None:
                 if self.flushed:
-                    raise ValueError(f"table {self.name!r} is whole: no rows can be appended")
+                    raise ValueError(f"table {self.name!r} is complete: no rows can be appended")
                 self._writing = _Writing(self._write_merged)
             self._writing.put(table)
         self.flushed += self._buffered
@@ -188,7 +188,7 @@ class TableStream:
         have = sum(count for _, count in files)
         if have < rows:
             raise FolderError(
-                f"table {self.name!r} has {have} rows where its checkpoint counts {rows}",
+                f"table {self.name!r} has {have} rows, but its checkpoint counts {rows}",
                 remedy="The folder was changed since; run again in a new folder",
                 where=str(self.merged_path.parent),
             )
@@ -263,7 +263,7 @@ class TableStream:
         if not tables:
             fields = self._known
             if not fields:
-                raise FolderError(f"holds no table {self.name!r}", where=str(self._root))
+                raise FolderError(f"the folder has no table {self.name!r}", where=str(self._root))
             names = fields if columns is None else columns
             # as_arrow: an empty table of pyarrow's own imports pandas
             return pa.table({name: as_arrow([], fields[name]) for name in names})
@@ -326,7 +326,9 @@ class TableStream:
         if other or missing:
             seen = f"column {other[0]!r} holds {found[other[0]]}" if other else f"no column {missing[0]!r}"
             raise FolderError(
-                f"is not a table of {self.name} ({seen})", remedy="Run again in a new folder", where=str(path)
+                f"is not a valid table {self.name!r} ({seen})",
+                remedy="Run again in a new folder",
+                where=str(path),
             )
 
 

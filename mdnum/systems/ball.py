@@ -470,7 +470,7 @@ def _stops(spec: BallSpec) -> Iterator[Problem]:
     if stop is not None and not needed:
         yield (
             "stop",
-            f"[stop] has no meaning here: {contact.kind} with {spec.integrator.kind} iterates nothing",
+            f"[stop] does not apply: {contact.kind} with {spec.integrator.kind} does not iterate",
             'Remove the table, or set contact.kind to "projection"',
         )
     if isinstance(stop, _Tolerance) and stop.enter is not None and stop.enter < stop.tol:

@@ -140,7 +140,7 @@ def again(folder: Path, given: Simulation | None = None) -> Simulation:
     if not (folder / SIMULATION_FILE).is_file():
         if given is not None:
             message = "this run came from a system file and keeps it"
-            raise InputError(message, where=str(folder), remedy="Leave the simulation out")
+            raise InputError(message, where=str(folder), remedy="Omit the simulation")
         return build(load(folder / SYSTEM_FILE))
     if given is None:
         load(folder)
@@ -152,6 +152,8 @@ def again(folder: Path, given: Simulation | None = None) -> Simulation:
         seen = f"{other[0]} was {there.get(other[0])!r} and is {here.get(other[0])!r}"
         more = f", and so on: {', '.join(other[1:5])}" * (len(other) > 1)
         raise InputError(
-            f"this is not the simulation that ran there: {seen}{more}", where=str(folder), remedy=GIVE_OBJECTS
+            f"this simulation differs from the one in the folder: {seen}{more}",
+            where=str(folder),
+            remedy=GIVE_OBJECTS,
         )
     return given

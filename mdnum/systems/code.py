@@ -62,9 +62,9 @@ def function(place: str, folder: Path) -> Callable[..., Any]:
     file, name = parts(place, folder)
     if not is_allowed():
         raise InputError(
-            f"the system file names Python code ({file}:{name}), which is not executed unasked",
+            f"the system file names Python code ({file}:{name}), which is not executed without permission",
             where="potential.function",
-            remedy="Read it, then add --allow-code, or allow_code=True in Python",
+            remedy="Read the code, then add --allow-code, or allow_code=True in Python",
         )
     if not file.is_file():
         raise InputError("no such file", where=str(file), remedy="Correct potential.function")

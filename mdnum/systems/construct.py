@@ -174,7 +174,7 @@ def simulation(
     check(atoms, r_cut, skin, closest(model, units), system.length)
     if not isinstance(integrator, Integrator):
         if timestep is None:
-            raise InputError("no time step", where=name, remedy="Add timestep=...")
+            raise InputError("no time step was given", where=name, remedy="Add timestep=...")
         kind = integrator or (VelocityVerlet if friction is None else Langevin)
         numbers = {"timestep": timestep, "temperature": temperature, "seed": seed}
         optional = {"friction": friction, "pressure": pressure}
@@ -279,9 +279,9 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
         kind = int(np.argmin(ends))
         raise InputError(
             f"u of {pairs_of[kind]} is {u[-2, kind]:.6g} at its cutoff {r_cut[kind]:g} and "
-            f"{u[-1, kind]:.6g} just inside; expected a function that goes on there",
+            f"{u[-1, kind]:.6g} just inside; expected a function that continues smoothly across the cutoff",
             where=potential.name,
-            remedy="Leave the end to the cutoff: the function need not know of it",
+            remedy="Leave the truncation to the cutoff; the function need not include it",
         )
     differs = ~np.isclose(u, swapped, rtol=_SYMMETRIC, atol=_SYMMETRIC * scale, equal_nan=True)
     if differs.any():
@@ -362,7 +362,7 @@ def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, 
         missing = [one for one in names if pair_key(*one.split("-")) not in given]
         if missing:
             remedy = "Give one for every pair of species, or one number for all"
-            raise InputError(f"nothing for {', '.join(missing)}", where=what, remedy=remedy)
+            raise InputError(f"no value for {', '.join(missing)}", where=what, remedy=remedy)
         value = [given[pair_key(*one.split("-"))] for one in names]
     return np.broadcast_to(_finite(value, what), (len(names),)).copy()
 
@@ -375,7 +375,7 @@ def by_species(value: Mapping[str, Any], symbols: Sequence[str], what: str) -> F
     """
     if missing := [symbol for symbol in symbols if symbol not in value]:
         remedy = "Give a number for every species"
-        raise InputError(f"nothing for {', '.join(missing)}", where=what, remedy=remedy)
+        raise InputError(f"no value for {', '.join(missing)}", where=what, remedy=remedy)
     return _finite([value[symbol] for symbol in symbols], what)
 
 
@@ -459,7 +459,7 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
     symbols, old = species_of(atoms)[0], simulation.symbols
     if unknown := [one for one in symbols if one not in old]:
         raise InputError(
-            f"the potential has nothing for {', '.join(unknown)}; it is one for {', '.join(old)}",
+            f"the potential has no parameters for {', '.join(unknown)}, only for {', '.join(old)}",
             where=simulation.name,
             remedy="Give a potential for all species",
         )
@@ -493,9 +493,10 @@ def in_fixed_point(simulation: Simulation) -> Simulation:
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(
-            'state = "lattice" decides and sums in fixed-point numbers, from forces in float64',
+            'state = "lattice" decides and sums in fixed-point arithmetic with float64 forces, so no '
+            "other precision applies",
             where="precision",
-            remedy="Leave out force, decision and accumulate",
+            remedy="Omit force, decision and accumulate",
         )
     kT = units.k_B * simulation.draw.temperature
     own = masses * np.linalg.norm(simulation.velocities, axis=1)

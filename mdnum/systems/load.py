@@ -84,7 +84,9 @@ def find(name: str | Path) -> tuple[str, Path]:
         return path.resolve().name, path / SYSTEM_FILE
     if path.is_dir() and (path / SIMULATION_FILE).is_file():
         raise InputError(
-            "was made of objects, and no file says how to make them again", where=text, remedy=GIVE_OBJECTS
+            "was made from Python objects, and no file describes how to recreate them",
+            where=text,
+            remedy=GIVE_OBJECTS,
         )
     if path.is_file():
         return path.stem, path
@@ -96,8 +98,11 @@ def find(name: str | Path) -> tuple[str, Path]:
     short = [one for one in known if one.split("/")[-1] == text]
     hint = meant(short[0] if short else text, known)
     raise InputError(
-        f"no system called {text!r}, and no file of that name",
-        remedy=f"{hint}`mdnum systems list` names those shipped; your own system is a path to a .toml file",
+        f"there is neither a shipped system nor a file called {text!r}",
+        remedy=(
+            f"{hint}`mdnum systems list` lists the shipped systems; give your own system as the "
+            "path of a .toml file"
+        ),
     )
 
 
@@ -275,7 +280,7 @@ class BallSystem:
         """
         name = name or ", ".join(f"{key}={value}" for key, value in changes.items())
         if name in self.variants:
-            raise InputError(f"there is a variant {name!r} already", remedy="Give it once")
+            raise InputError(f"the variant {name!r} is defined twice", remedy="Define it once")
         given = {".".join(key): value for key, value in read_overrides(changes).items()}
         variant = vary(name, given, self.spec, f"--against {name}")
         tables = {**self.spec.variants, name: given}
@@ -318,13 +323,17 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
         InputError: it cannot be run.
     """
     if not changes:
-        raise InputError(f"variant {name!r} changes nothing", where=where, remedy="Name a key, or remove it")
+        raise InputError(
+            f"variant {name!r} changes no key",
+            where=where,
+            remedy="Give a key to change, or remove the variant",
+        )
     data = base.model_dump(exclude_none=True, exclude={"variants", "name"})
     values = {toml.dotted(key): value for key, value in changes.items()}
     for key in values:
         if key[0] in ("variants", "name", "about", "world") or key == ("integrator", "steps"):
             raise InputError(
-                f"variant {name!r} changes {'.'.join(key)}, which says nothing about the arithmetic of a run",
+                f"variant {name!r} changes {'.'.join(key)}, which does not affect the arithmetic of a run",
                 where=where,
                 remedy="Remove it",
             )
@@ -355,7 +364,7 @@ def copy(name: str | Path, folder: str | Path) -> Path:
     """
     system: System | BallSystem = load(name)
     if system.path is None:
-        raise TypeError("a loaded system has a path")
+        raise TypeError("a loaded system already has a path")
     target = Path(folder)
     is_ball = isinstance(system, BallSystem)
     files = [] if is_ball else sorted(system.tables)
@@ -370,7 +379,7 @@ def copy(name: str | Path, folder: str | Path) -> Path:
     there = [path for path in (goal, *(target / file.name for file in files)) if path.exists()]
     there = [path for path in there if path.name != schema_file.name]
     if there:
-        raise InputError("is there already", where=str(there[0]), remedy="Choose another folder")
+        raise InputError("already exists", where=str(there[0]), remedy="Choose another folder")
     target.mkdir(parents=True, exist_ok=True)
     for file in files:
         shutil.copyfile(file, target / file.name)
@@ -460,7 +469,7 @@ def _is_ball(data: Mapping[str, Any], where: str) -> bool:
         raise InputError(
             f'world = {data["world"]!r}; expected "ball"',
             where=where,
-            remedy="Leave the key out for molecular dynamics",
+            remedy="Omit the key for molecular dynamics",
         )
     return True
 

@@ -47,7 +47,7 @@ def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> 
     if missing:
         known = ", ".join(potential.pairs) if potential.pairs else "one set for all"
         raise InputError(
-            f"the structure holds {', '.join(species)}, but [potential] has no constants for "
+            f"the structure holds {', '.join(species)}, but [potential] has no parameters for "
             f"{', '.join(missing)} (it has {known})",
             remedy=f"Add [potential.pairs.{missing[0]}] and the like, or correct the structure's species",
         )
@@ -69,7 +69,7 @@ def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tu
     """
     cutoff = spec.cutoff
     if cutoff is None:
-        raise TypeError("a potential without a [cutoff]")
+        raise TypeError("the potential has no [cutoff]")
     names = pair_names(species)
     given = {pair_key(*name.split("-")): radius for name, radius in (cutoff.pairs or {}).items()}
     if cutoff.in_sigma is not None:
@@ -118,7 +118,7 @@ def many_body(
         return embedded_atom.embedded_atom(folder / potential.file, species, pbc)
     if unknown := [name for name in species if name != potential.parameters]:
         raise InputError(
-            f"the structure holds {', '.join(unknown)}, and {potential.kind} has constants for "
+            f"the structure holds {', '.join(unknown)}, but {potential.kind} has parameters for "
             f"{potential.parameters}",
             remedy="Correct the structure or the potential",
         )

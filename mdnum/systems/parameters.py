@@ -231,7 +231,7 @@ def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation
         if new.shape != here.shape or np.iscomplexobj(new) or not np.isfinite(new).all():
             raise InputError(
                 f"{name}: shape {new.shape}, {new.dtype}, finite: {bool(np.isfinite(new).all())}; expected "
-                f"finite numbers of shape {here.shape}, and none that is complex"
+                f"finite real numbers of shape {here.shape}"
             )
         place = entry(simulation, name)
         whole = value(simulation, place.whole)
@@ -364,12 +364,12 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
             return ends[0]
         if ends:
             several = f"{word!r} could be any of {', '.join(ends)}"
-            raise InputError(several, remedy="Write one of them in full")
+            raise InputError(several, remedy="Give the full name of one of them")
     if entry(simulation, word).index:
         return word
     hint = meant(word, [*known, *(name.rpartition(".")[2] for name in known)])
     listed = ", ".join((*known, "position.ATOM.x", "velocity.ATOM.x"))
-    raise InputError(f"no parameter {word!r}", where=simulation.name, remedy=f"{hint}There are {listed}")
+    raise InputError(f"unknown parameter {word!r}", where=simulation.name, remedy=f"{hint}There are {listed}")
 
 
 # --- keys of system files, words among them ------------------------------------------------------------

@@ -87,7 +87,7 @@ class PairPotentialTable(TomlTable):
         if not pairs:
             missing = [key for key in self.constants if getattr(self, key, None) is None]
             if missing:
-                raise ValueError(f"{', '.join(missing)} missing, and no pairs table gives them")
+                raise ValueError(f"missing: {', '.join(missing)}, which no pairs table gives either")
         return self
 
     @property
@@ -208,7 +208,7 @@ class OtherTable(PairPotentialTable):
 
 def _check_names(given: Mapping[str, Any], known: Sequence[str]) -> None:
     if unknown := set(given) - set(known):
-        raise ValueError(f"unknown {', '.join(sorted(unknown))}; it has {', '.join(known)}")
+        raise ValueError(f"unknown key {', '.join(sorted(unknown))}; known keys are {', '.join(known)}")
 
 
 def _or_other(tables: Sequence[type[TomlTable]], other: type[TomlTable], registry: str) -> Any:
@@ -277,15 +277,17 @@ class CutoffTable(TomlTable):
     def _one_radius(self) -> Any:
         _check_pairs(self.pairs)
         if self.radius is not None and self.in_sigma is not None:
-            raise ValueError("radius and in_sigma both given; keep one")
+            raise ValueError("radius and in_sigma are both given; keep one")
         if self.base is None and not self.pairs:
-            raise ValueError("radius missing; give radius, in_sigma or a pairs table")
+            raise ValueError("the radius is missing; give radius, in_sigma or a pairs table")
         if self.onset is None:
             return self
         if not self.switches:
             raise ValueError(f"onset has no meaning for the kind {self.kind}, which does not switch")
         if self.base is None:
-            raise ValueError("onset needs radius or in_sigma beside it; pairs scale it with their own radius")
+            raise ValueError(
+                "onset needs radius or in_sigma as well; for pairs it scales with the radius of each pair"
+            )
         if self.onset >= self.base:
             raise ValueError(f"onset {self.onset:g} is not below the radius {self.base:g}")
         return self
@@ -471,7 +473,7 @@ class OtherDynamics(_Dynamics):
         _check_names(given, sorted(keys.keys() - type(self).model_fields))
         needed = [key for key, field in keys.items() if field.default is MISSING and key != "seed"]
         if missing := [key for key in needed if key not in given.keys() | self.model_fields_set]:
-            raise ValueError(f"{', '.join(missing)} missing")
+            raise ValueError(f"missing: {', '.join(missing)}")
         return self
 
 
@@ -547,11 +549,11 @@ def check_interaction(potential: Any, cutoff: CutoffTable | None) -> None:
     kind = potential.kind
     if isinstance(potential, PairPotentialTable):
         if cutoff is None:
-            raise ValueError(f"table [cutoff] missing; {kind} needs one")
+            raise ValueError(f"the table [cutoff] is missing; {kind} needs one")
         if cutoff.in_sigma is not None and "sigma" not in potential.constants:
             raise ValueError(f"cutoff.in_sigma needs a potential with a sigma; {kind} has none, give radius")
     elif cutoff is not None:
-        raise ValueError(f"[cutoff] given, but {kind} carries its own cutoff; remove the table")
+        raise ValueError(f"[cutoff] is given, but {kind} includes its own cutoff; remove the table")
 
 
 class TermTable(TomlTable):
@@ -566,7 +568,9 @@ class TermTable(TomlTable):
     @model_validator(mode="after")
     def _cutoff_fits_potential(self) -> TermTable:
         if not isinstance(self.potential, PairPotentialTable):
-            raise ValueError(f"{self.potential.kind} is no pair potential, and only those add")
+            raise ValueError(
+                f"{self.potential.kind} is not a pair potential; only pair potentials can be added"
+            )
         check_interaction(self.potential, self.cutoff)
         return self
 

@@ -121,11 +121,13 @@ def _read(path: Path, index: int) -> Atoms:
         found = next(ase_images(path.resolve(), index), None)
     if not isinstance(found, Atoms) or len(found) == 0:
         raise InputError(
-            "holds no atoms", where=str(path), remedy="Correct structure.file or structure.index"
+            "the structure holds no atoms",
+            where=str(path),
+            remedy="Correct structure.file or structure.index",
         )
     if found.constraints:
         raise InputError(
-            "holds constraints (fixed atoms), which mdnum does not apply",
+            "the structure has constraints (fixed atoms), which mdnum does not support",
             where=str(path),
             remedy="Remove them from the structure",
         )
@@ -138,7 +140,7 @@ def _build(structure: schema.BuilderStructure) -> Atoms:
 
     if structure.symbol not in atomic_numbers:
         remedy = meant(structure.symbol, atomic_numbers).rstrip() or "Use one such as Ar"
-        raise InputError(f"structure.symbol = {structure.symbol!r} is no chemical symbol", remedy=remedy)
+        raise InputError(f"structure.symbol = {structure.symbol!r} is not a chemical symbol", remedy=remedy)
     cells = math.prod(structure.repeat)
     if cells > _MOST_ATOMS // _ATOMS_IN_CELL[structure.builder]:
         raise InputError(
@@ -222,8 +224,8 @@ def _check_finite(atoms: Atoms) -> None:
             count = int(bad.sum())
             raise InputError(
                 f"atom {first} ({atoms.symbols[first]}) has {name} ({values})"
-                + (f", and {count - 1} more atoms are like it" if count > 1 else ""),
-                remedy="Every coordinate must be a finite number; write the structure again",
+                + (f", and the same is true of {count - 1} other atoms" if count > 1 else ""),
+                remedy="Every coordinate must be a finite number; rewrite the structure file",
             )
 
 
@@ -259,7 +261,8 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
     )
     raise InputError(
         f"r_cut + skin = {r_cut:g} + {skin:g} = {r_cut + skin:.6g} {length}, but half the smallest "
-        f"perpendicular width of the box (along {axis}) is {half:.6g} {length}, where a pair gets two images",
+        f"perpendicular width of the box (along {axis}) is {half:.6g} {length}; beyond it a pair has "
+        "two images",
         remedy=f"This box allows {allowed}; or repeat the structure {repeats(cell, r_cut + skin)}",
     )
 

@@ -51,7 +51,7 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
         raise InputError(
             f"tables or arrays are nested more than {_DEEPEST} deep",
             where=str(where),
-            remedy="No table of a system file is deeper than three",
+            remedy="Tables of a system file are nested at most three deep",
         ) from None
     except ValueError as error:
         seen = str(error)
@@ -64,7 +64,7 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
         raise InputError(
             f"not TOML: {what}{shown}",
             where=f"{where}:{number}",
-            remedy='Text goes in "double quotes", tables are [in brackets], arrays are [1, 2, 3]',
+            remedy='Write text in "double quotes", table names in [brackets] and arrays as [1, 2, 3]',
         ) from None
 
 
@@ -185,7 +185,7 @@ def _value(value: Any) -> str:
         return "[" + ", ".join(_value(item) for item in value) + "]"
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(key)} = {_value(item)}" for key, item in value.items()) + "}"
-    raise TypeError(f"no TOML for {type(value).__name__}")
+    raise TypeError(f"{type(value).__name__} cannot be written as TOML")
 
 
 # --- tables -------------------------------------------------------------------------------------------
@@ -253,12 +253,12 @@ class TomlTable(BaseModel):
                 if not isinstance(number, int | float) or isinstance(number, bool):
                     continue
                 if isinstance(number, int) and abs(number) > _LARGEST_INT:
-                    raise ValueError(f"{name} = {number}; expected a whole number of at most 2^62")
+                    raise ValueError(f"{name} = {number}; expected an integer of at most 2^62")
                 # a tolerance is compared and not squared, and what tolerances can be is checked with them
                 if number and name != "tol" and not _SMALLEST <= abs(number) <= 1 / _SMALLEST:
                     raise ValueError(
                         f"{name} = {number:g}; expected 0 or a size from {_SMALLEST:g} to {1 / _SMALLEST:g}, "
-                        "whose square is a number, too"
+                        "whose square is representable, too"
                     )
         return self
 

@@ -150,7 +150,7 @@ class NeighborFlips(AnalysisBase):
             second = _group_of(other, "other")
             if second.universe is not group.universe:
                 raise InputError(
-                    "the two groups belong to two universes", remedy="Select both from one universe"
+                    "the two groups belong to different universes", remedy="Select both from one universe"
                 )
             self._second = np.unique(np.asarray(second.indices, np.int64))
         self.rules = _rules_of(r_cut, rule)
@@ -164,7 +164,7 @@ class NeighborFlips(AnalysisBase):
         self._check = FrameCheck(seen, radius=smallest_radius(self.rules), bits=32)
         if bound is not None and not (math.isfinite(bound) and bound >= 0):
             message = f"bound = {bound!r}; expected a length of 0 or more, Å"
-            raise InputError(message, remedy="Leave it out for what the resolution of the file gives")
+            raise InputError(message, remedy="Omit the bound to use the resolution of the file")
         self._bound = bound
         self._resolution: Resolution | None = None
         self._other_box: tuple[str, Box] | None = None
@@ -196,7 +196,8 @@ class NeighborFlips(AnalysisBase):
                 if not getattr(one, "parallelizable", False):
                     name = getattr(one, "__name__", type(one).__name__)
                     raise InputError(
-                        f"the transformation {name!r} of the trajectory cannot be handed over by {backend=}",
+                        f"the transformation {name!r} of the trajectory cannot be sent to workers "
+                        f"with {backend=}",
                         remedy="Use backend='serial', or make it an "
                         "MDAnalysis.transformations.TransformationBase with parallelizable=True",
                     )
@@ -214,7 +215,7 @@ class NeighborFlips(AnalysisBase):
         if back.size:
             after, before = self._numbers[back[0] + 1], self._numbers[back[0]]
             message = f"the frames go backward or stand still: frame {after} after frame {before}"
-            raise InputError(message, remedy="Give them in ascending order: flips follow time")
+            raise InputError(message, remedy="Give the frames in ascending order of time")
         sample, raw, changed = [], [], 0.0
         for number in self._numbers[:SAMPLE]:
             try:
@@ -234,8 +235,11 @@ class NeighborFlips(AnalysisBase):
                 why = f"they change distances by up to {changed:.3g} Å"
                 why = "they have replaced what was read in memory" if self.library.replaced else why
                 raise InputError(
-                    f"the transformations of the trajectory hide its digits: {why}",
-                    remedy="Give bound=LENGTH, by which a distance can be off (0 for none), or remove them",
+                    f"the transformations of the trajectory hide the resolution of its coordinates: {why}",
+                    remedy=(
+                        "Give bound=LENGTH, the largest error of a distance (0 for none), or "
+                        "remove the transformations"
+                    ),
                 )
         self._library = None
         return groups
@@ -391,12 +395,14 @@ def _group_of(atoms: Any, name: str) -> AtomGroup:
     """The group; refuses one that is none, is empty, or changes from frame to frame."""
     if isinstance(atoms, UpdatingAtomGroup):
         raise InputError(
-            f"the group {name} changes from frame to frame, and a pair not examined any more has not left",
+            f"the group {name} changes from frame to frame; a pair that leaves the group would be "
+            "counted as a flip",
             remedy="Give atoms.select_atoms(...) without updating=True",
         )
     if not isinstance(atoms, AtomGroup):
         raise InputError(
-            f"{type(atoms).__name__} where atoms are expected", remedy="Give a Universe or an AtomGroup"
+            f"expected a Universe or an AtomGroup; got {type(atoms).__name__}",
+            remedy="Give for example universe.select_atoms(...)",
         )
     if len(atoms) == 0:
         raise InputError(f"the group {name} is empty", remedy="Check the selection")
@@ -413,12 +419,13 @@ def _rules_of(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
         rules.extend(rule if isinstance(rule, Sequence) else [rule])
     if not rules:
         raise InputError(
-            "no cutoff", remedy="Give r_cut=8.5 (Å), several as a list, or a rule of mdnum.trajectories.rules"
+            "no cutoff was given",
+            remedy="Give r_cut=8.5 (Å), several as a list, or a rule of mdnum.trajectories.rules",
         )
     for one in rules:
         if not isinstance(one, Rule):
             raise InputError(
-                f"{one!r} is no membership rule",
+                f"{one!r} is not a membership rule",
                 remedy="Give CutoffRule, SpeciesCutoffs, Nearest or Capped of mdnum.trajectories.rules",
             )
     return rules

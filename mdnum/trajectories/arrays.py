@@ -37,7 +37,7 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
     """
     if hasattr(values, "value_in_unit"):
         remedy = "Give numbers: .value_in_unit(openmm.unit.nanometer), with length='nm'"
-        raise InputError(f"{name} in {values.unit}", remedy=remedy, where=name)
+        raise InputError(f"{name} has the unit {values.unit}", remedy=remedy, where=name)
     try:
         found = np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
     except TypeError as error:
@@ -84,7 +84,7 @@ class ArrayFrames(Trajectory):
         here, x = self._box_of(cell, box, pbc), host(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
             message = f"positions of shape {x.shape}; expected (atoms, 3)"
-            raise InputError(message, remedy="Give one frame; see_many takes several", where="positions")
+            raise InputError(message, remedy="Give one frame; use see_many for several", where="positions")
         bits, x = 32 if x.dtype == np.float32 else 64, np.array(x, np.float64)
         if not self._first:
             self._begin(x, here, bits)
@@ -95,7 +95,8 @@ class ArrayFrames(Trajectory):
         v = None if v is None else np.array(host(v, "velocities"), float)
         if v is not None and v.shape != x.shape:
             raise InputError(
-                f"velocities of shape {v.shape}, positions of {x.shape}", remedy="Give those of all"
+                f"velocities of shape {v.shape}, positions of {x.shape}",
+                remedy="Give velocities of all atoms",
             )
         x = x @ here.matrix if self._fractional else x
         return Frame(int(step), int(step) * self._timestep, x, here, v)
@@ -122,7 +123,7 @@ class ArrayFrames(Trajectory):
         matrix = np.eye(3) * given if given.ndim < 2 else np.array(given if box is None else given.T, float)
         if box is not None and np.triu(matrix, 1).any():
             message = f"box = {given.tolist()} is not upper triangular, as columns are in jax-md"
-            raise InputError(message, remedy="Give lattice vectors in rows as cell", where="box")
+            raise InputError(message, remedy="Give the lattice vectors as the rows of cell", where="box")
         repeats = matrix.any(axis=1) if pbc is None else np.broadcast_to(np.asarray(pbc, bool), 3)
         return Box(matrix, np.array(repeats, bool))
 
@@ -139,7 +140,9 @@ class ArrayFrames(Trajectory):
             raise InputError(message, remedy=remedy, where="positions")
         words = ["X"] * len(x) if self.named is None else list(map(str, np.asarray(self.named).tolist()))
         if len(words) != len(x):
-            raise InputError(f"{len(words)} species for {len(x)} atoms", remedy="Give one for each atom")
+            raise InputError(
+                f"{len(words)} species were given for {len(x)} atoms", remedy="Give one for each atom"
+            )
         self.table, self.bits = AtomTable.plain(words, self.named is not None), bits
         self.format = f"{'fractional coordinates' if fractional else 'positions'} in float{bits}"
         if self._box[1] is None and np.triu(box.matrix, 1).any() and not np.tril(box.matrix, -1).any():
@@ -159,7 +162,11 @@ class ArrayFrames(Trajectory):
                 here = {"cell": x.cell.array, "pbc": x.pbc, **here}
             found.put(found.read(k, getattr(x, "positions", x), **here))
         if not found._first:
-            raise InputError("no frame in the array", remedy="Give (frames, atoms, 3)", where="positions")
+            raise InputError(
+                "the array contains no frame",
+                remedy="Give an array of shape (frames, atoms, 3)",
+                where="positions",
+            )
         found.time = "frame" if found.time == "step" else found.time
         return found
 

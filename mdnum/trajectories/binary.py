@@ -92,7 +92,7 @@ class XdrFile:
             self._stream(at)
             end = self._file.tell()
             if end > self._size:
-                raise ValueError("the file ends in it")
+                raise ValueError("the file ends within this frame")
             self._starts.append(end)
         return self._starts[number]
 
@@ -107,7 +107,7 @@ class XdrFile:
     def _read(self, count: int) -> bytes:
         data = self._file.read(min(count, self._size + 1))
         if len(data) < count:
-            raise ValueError("the file ends in it")
+            raise ValueError("the file ends within this frame")
         return data
 
 
@@ -156,7 +156,7 @@ class XtcFile(XdrFile):
         self._file.seek(self.start(number))
         head = _HEAD.unpack(self._read(_HEAD.size))
         if head[0] not in _MAGIC or head[1] != head[-1] or head[1] < 0:
-            raise ValueError("damaged: no head of a frame where one has to be")
+            raise ValueError("damaged: a frame header is missing where one is expected")
         return head
 
     def _stream(self, number: int, look: bool = False) -> None:
@@ -174,14 +174,14 @@ class XtcFile(XdrFile):
             return
         sizes = [high - low + 1 for low, high in zip(limits[:3], limits[3:], strict=True)]
         if not _FIRST <= small <= _LAST or min(sizes) <= 0 or not precision > 0:
-            raise ValueError("damaged: the head of the compressed coordinates makes no sense")
+            raise ValueError("damaged: the header of the compressed coordinates is invalid")
         product = sizes[0] * sizes[1] * sizes[2]
         wide = max(sizes) > _WIDE
         bits = sum(one.bit_length() for one in sizes) if wide else product.bit_length()
         stream = np.frombuffer(self._read(size), np.uint8)
         self._read(-size % 4)
         if (_walk(stream, atoms, bits, small) + 7) // 8 != size:
-            raise ValueError("damaged: the compressed coordinates do not end where their length says")
+            raise ValueError("damaged: the compressed coordinates do not end where their length requires")
 
 
 @njit
@@ -244,7 +244,7 @@ class TrrFile(XdrFile):
         width = box // 9 if box else max(vectors, default=0) // max(3 * atoms, 1)
         fits = all(size == 3 * width * atoms for size in vectors) and box in (0, 9 * width)
         if (magic, word) != _TRR_BEGIN or width not in (4, 8) or not fits or min(sizes) < 0:
-            raise ValueError("damaged: no head of a frame where one has to be")
+            raise ValueError("damaged: a frame header is missing where one is expected")
         return atoms, width, sizes
 
     def has_box(self, number: int) -> bool:
@@ -263,7 +263,7 @@ class TrrFile(XdrFile):
             blocks[k].reshape(-1, 3).astype(f"f{width}") if sizes[k] else None for k in (_BOX, _X, _X + 1)
         )
         if x is None:
-            raise ValueError("it has no positions")
+            raise ValueError("the frame has no positions")
         return float(time[0]), box, x, v
 
 

@@ -94,7 +94,7 @@ def _usable(
         yield frames, stepped
     if not found.frames:
         where = str(files[0].path) if len(files) == 1 else None
-        raise InputError("no frame is left of what was asked for", remedy="Ask for others", where=where)
+        raise InputError("the requested range contains no frame", remedy="Request other frames", where=where)
 
 
 # ---- one trajectory

@@ -93,7 +93,7 @@ def _reduced(rows: bytes, periodic: bytes) -> ReducedLattice:
         scaled = matrix[pbc] / np.linalg.norm(matrix[pbc], axis=1)[:, None]
         if not np.sqrt(max(np.linalg.det(scaled @ scaled.T), 0.0)) > _FLAT:
             message = f"the vectors of the box lie in one plane: {matrix[pbc].tolist()}"
-            raise InputError(message, remedy="Give the frame the box it was run in", where="box")
+            raise InputError(message, remedy="Give the frame the box of its simulation", where="box")
         if np.count_nonzero(matrix) > pbc.sum():
             # a box with right angles is reduced, and stays in its order
             # in the layout of the one above: of another, numba would compile every search a second time
@@ -336,7 +336,7 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
     wrapped, home, bin_of = wrap(positions, lattice, bins, step)
     if (away // bins * lattice.periodic).max() >= MOST_IMAGES - 1:
         message = f"a box of widths {np.round(lattice.widths, 6).tolist()} for pairs within {reach:g}"
-        raise InputError(message, remedy="Check the unit of the cutoff, and the box", where="cutoff")
+        raise InputError(message, remedy="Check the unit of the cutoff, and check the box", where="cutoff")
     total, half = int(np.prod(bins)), who.centers is who.others
     start, order = _sorted_by_bin(bin_of, who.others, total)
     first, centers = (start, order) if half else _sorted_by_bin(bin_of, who.centers, total)

@@ -440,7 +440,7 @@ class NetcdfTrajectory(Trajectory):
 
     @property
     def _ends(self) -> str:
-        return f"the file ends in it, and its head tells of {max(self._file.told, 0):,} frames"
+        return f"the file ends within this frame; its header announces {max(self._file.told, 0):,} frames"
 
     def decoded(self, number: int, raw: dict[str, np.ndarray]) -> Frame:
         box, velocities = Box(), raw.get("velocities")

@@ -62,7 +62,9 @@ def open_trajectory(
         expect_path(one, IN_MEMORY)
     file, words = split_path(str(path))
     if words and slice:
-        raise InputError(f"frames are named twice, by @{words} and by {slice!r}", remedy="Name them once")
+        raise InputError(
+            f"frames are selected twice, by @{words} and by {slice!r}", remedy="Select them once"
+        )
     frames = parse_slice(slice or words, where=str(path))
     if file.is_dir() and (file / "trajectory.traj").exists():
         from mdnum.store import RunFolder
@@ -71,10 +73,10 @@ def open_trajectory(
         file = file / "trajectory.traj"
     if file.is_dir() and (file / "summary.json").exists():
         message = "this folder holds results, and no trajectory"
-        remedy = "Give the trajectory itself; a run keeps one with --save-every 1 (or another number)"
+        remedy = "Give the trajectory file; a run writes one with --save-every 1 (or another number)"
         raise InputError(message, remedy=remedy, where=str(file))
     if file.is_dir() and file.suffix != ".bundle":
-        raise InputError("it is a folder", remedy="Give the trajectory itself", where=str(file))
+        raise InputError("the path is a folder", remedy="Give the trajectory file", where=str(file))
     named = [] if topology is None else [Path(topology).expanduser()]
     for one in (file, *named):
         if not one.exists():
@@ -83,7 +85,9 @@ def open_trajectory(
             continue
         if not one.is_file():
             # a reader would wait for what comes, or read without end
-            raise InputError("it is no regular file", remedy="Copy it to a file", where=str(one))
+            raise InputError(
+                "the path is not a regular file", remedy="Copy the data to a regular file", where=str(one)
+            )
         if not one.stat().st_size:
             raise InputError("the file is empty", remedy="Check how it was written", where=str(one))
         check_claim(one)

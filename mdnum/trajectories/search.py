@@ -156,9 +156,10 @@ def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float)
     pairs = 0.5 * centers * others * images
     if images > _MOST_IMAGES_EACH and pairs > _MOST_REPEATED:
         raise InputError(
-            f"about {pairs:,.0f} pairs within {radius:.6g}: any two atoms through about {images:,.0f} images "
+            f"about {pairs:,.0f} pairs lie within {radius:.6g}: any two atoms through about "
+            f"{images:,.0f} images "
             f"in a box of widths {np.round(lattice.widths, 3).tolist()}",
-            remedy="Check the unit of the cutoff, and the box; or select fewer atoms",
+            remedy="Check the unit of the cutoff and the box, or select fewer atoms",
             where="cutoff",
         )
     _check_count(pairs, radius)
@@ -170,9 +171,10 @@ def _check_count(pairs: float, radius: float) -> None:
     memory = _memory()
     if pairs > min(MOST_PAIRS, memory / _BYTES):
         raise InputError(
-            f"about {pairs:,.0f} pairs within {radius:.6g}, which would take {pairs * _BYTES / 1e9:,.0f} GB "
-            f"of this machine's {memory / 1e9:,.0f}",
-            remedy="Check the unit of the cutoff, and the box; or select fewer atoms",
+            f"about {pairs:,.0f} pairs lie within {radius:.6g}, which would need "
+            f"{pairs * _BYTES / 1e9:,.0f} GB "
+            f"of memory; this machine has {memory / 1e9:,.0f}",
+            remedy="Check the unit of the cutoff and the box, or select fewer atoms",
             where="cutoff",
         )
 

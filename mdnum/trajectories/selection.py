@@ -44,7 +44,7 @@ def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
             raise InputError(message, remedy=_LANGUAGE, where=where) from error
     if len(found) == 0:
         raise InputError(
-            f"the selection {words!r} names no atom of {trajectory.atoms:,}; {_there_are(table)}",
+            f"the selection {words!r} matches none of {trajectory.atoms:,} atoms; {_there_are(table)}",
             remedy=_LANGUAGE if table.named else "Give a topology with -s TOPOLOGY",
             where=where,
         )
@@ -58,7 +58,7 @@ def _universe(trajectory: Trajectory) -> Any:
     first = next(iter(trajectory.frames()), None)
     if first is None:
         raise InputError(
-            "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
+            "the requested range contains no frame", remedy="Request other frames", where=str(trajectory.path)
         )
     if trajectory.universe is not None:
         # `frames` has left the Universe there

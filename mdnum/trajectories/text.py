@@ -167,8 +167,9 @@ def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
         others = [word for word in words[:-1] if "." in word]
     if _is_cut(words[-1], others):
         raise ValueError(
-            f"the file ends in the middle of a number, {words[-1]!r}: it has fewer digits than those before, "
-            "and its line no end; if it is whole, end the line"
+            f"the file ends in the middle of a number, {words[-1]!r}: it has fewer digits than the "
+            "numbers before it, "
+            "and its line has no newline; if the number is complete, add a newline"
         )
 
 
@@ -233,13 +234,13 @@ def _whole_number(line: str, what: str) -> int:
     try:
         return int(line)
     except ValueError:
-        raise ValueError(f"{line.strip()[:40]!r} where {what} is expected") from None
+        raise ValueError(f"expected {what}; found {line.strip()[:40]!r}") from None
 
 
 def _rows(lines: Any, head: int, atoms: int, cut: bool = True) -> list[str]:
     """The lines of so many atoms, behind some others."""
     if atoms < 0:
-        raise ValueError(f"{atoms} where the number of atoms is expected")
+        raise ValueError(f"expected the number of atoms; found {atoms}")
     rows = list(islice(lines, head + atoms))
     if len(rows) < head + atoms:
         raise ValueError(f"the file ends after {max(len(rows) - head, 0):,} of {atoms:,} atoms")
@@ -257,7 +258,7 @@ class ExtxyzTrajectory(AseFrames, TextTrajectory):
         head = lines.readline()
         if not head.strip():
             if any(line.strip() for line in lines):
-                raise ValueError("a blank line where the number of atoms is expected")
+                raise ValueError("expected the number of atoms; found a blank line")
             return None
         return [head, *_rows(lines, 1, _whole_number(head, "the number of atoms"))]
 
@@ -359,17 +360,17 @@ class LammpsDump(TextTrajectory):
             if not block and not line.strip():
                 continue
             if not block and not line.startswith("ITEM:"):
-                raise ValueError(f"{line.strip()[:40]!r} where ITEM: is expected")
+                raise ValueError(f"expected ITEM:; found {line.strip()[:40]!r}")
             block.append(line)
             if line.startswith("ITEM: NUMBER OF ATOMS"):
                 block.append(next(lines, ""))
                 atoms = _whole_number(block[-1], "the number of atoms")
             elif line.startswith("ITEM: ATOMS"):
                 if atoms is None:
-                    raise ValueError("atoms before their number")
+                    raise ValueError("atoms are listed before their number")
                 return block + _rows(lines, 0, atoms)
         if block:
-            raise ValueError("the file ends in the head of a frame")
+            raise ValueError("the file ends in the header of a frame")
         return None
 
 
@@ -403,7 +404,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
     words = np.array("".join(rows).split(), dtype=object)
     if len(words) != len(rows) * len(columns):
         odd = next(row for row in rows if len(row.split()) != len(columns))
-        raise ValueError(f"{odd.strip()[:40]!r} where {len(columns)} columns are expected")
+        raise ValueError(f"expected {len(columns)} columns; found {odd.strip()[:40]!r}")
     return columns, words.reshape(len(rows), len(columns))
 
 
@@ -453,7 +454,7 @@ class GroTrajectory(TextTrajectory):
             raise ValueError("no atoms")
         points = [k for k, letter in enumerate(rows[0]) if letter == "." and k >= _HEAD]
         if len(points) < 3:
-            raise ValueError(f"no three numbers in {rows[0]!r}")
+            raise ValueError(f"expected three numbers; found {rows[0]!r}")
         width = points[1] - points[0]
         # one decimal more in the same width and one column more
         moving = all(len(row.rstrip()) >= _HEAD + 6 * width for row in rows)
@@ -481,7 +482,7 @@ class GroTrajectory(TextTrajectory):
         if not box.endswith("\n"):
             refuse_cut_line([box], words[:-1])
             if len(words) < self._box_words:
-                raise ValueError(f"the file ends after {len(words)} numbers of the box")
+                raise ValueError(f"the file ends after {len(words)} numbers of the box line")
         self._box_words = len(words)
         return [title, count, *rows, box]
 
@@ -498,7 +499,7 @@ def _gro_box(line: str) -> Box:
     """Three diagonal elements, or nine: v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros for no box."""
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
-        raise ValueError(f"a box of {len(values)} numbers")
+        raise ValueError(f"the box line has {len(values)} numbers")
     if not any(values):
         return Box()
     xx, yy, zz, xy, xz, yx, yz, zx, zy = values if len(values) == 9 else [*values, *[0.0] * 6]

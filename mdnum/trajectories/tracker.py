@@ -199,7 +199,7 @@ class Tracker:
             message = (
                 f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot resolve them"
             )
-            raise InputError(message, remedy="Check the unit, and that the file's coordinates are not broken")
+            raise InputError(message, remedy="Check the unit, and check the file's coordinates")
         none = np.zeros(0)
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
@@ -311,7 +311,7 @@ def _participants(
     for name, chosen in (("first", first), ("second", second)):
         if len(chosen) and chosen.max() >= atoms:
             message = f"atom {int(chosen.max())} is selected, but frames have {atoms} atoms (from 0)"
-            raise InputError(message, remedy="Select atoms of this trajectory", where=name)
+            raise InputError(message, remedy="Select atoms from this trajectory", where=name)
     if species is not None and len(species) != atoms:
         message = f"{len(species)} species for frames of {atoms} atoms"
         raise InputError(message, remedy="Use the topology that belongs to the trajectory", where="species")

@@ -115,8 +115,8 @@ def home(kind: str) -> str:
             if heading.search(Path(_file(name)).with_suffix(".toml").read_text(encoding="utf-8")):
                 return name
     raise InputError(
-        f"no verb of this installation makes folders of kind {kind!r}",
-        remedy="Install the package that made it",
+        f"no installed verb writes folders of kind {kind!r}",
+        remedy="Install the package that wrote the folder",
     )
 
 
@@ -145,5 +145,5 @@ def _file(name: str) -> str:
     found = next((file for file in files if file.with_suffix(".toml").is_file()), None)
     if found is None:
         seen = f"{VERBS.noun} {name!r} of package {VERBS.package(name)} has no text file"
-        raise InputError(seen, remedy=f"Put {parts[-1]}.toml beside {parts[-1]}.py")
+        raise InputError(seen, remedy=f"Add the file {parts[-1]}.toml next to {parts[-1]}.py")
     return str(found)

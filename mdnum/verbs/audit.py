@@ -105,8 +105,8 @@ def audit(
                  "steps": steps, "out": out}  # fmt: skip
         if names := [name for name, value in given.items() if value is not None]:
             raise InputError(
-                f"an audit is resumed as it was asked for, and {names[0]} is given",
-                remedy=f"Leave out {', '.join(names)}, or begin another audit",
+                f"an audit is resumed with its own options, but {names[0]} is given",
+                remedy=f"Omit {', '.join(names)}, or start a new audit",
             )
         with closing(take(resume, frame.layout("audit"))) as folder:
             state = kept(folder)
@@ -117,7 +117,7 @@ def audit(
                     remove(file)
             return _ask_all(folder, loaded, state, deadline, report, progress)
     if calculator is None:
-        raise InputError("no calculator is named", remedy="Name one, or resume an audit")
+        raise InputError("no calculator was given", remedy="Give a calculator, or resume an audit")
     loaded = _loaded(calculator)
     _internal(timestep, loaded.units)
     wanted = _wanted(checks)
@@ -267,7 +267,7 @@ def _wanted(checks: str | Sequence[str] | None) -> list[str]:
         if name not in CHECKS:
             raise unknown("check", name, CHECKS)
     if not names:
-        raise InputError("no check is named", remedy=f"There are {', '.join(CHECKS)}")
+        raise InputError("no check was given", remedy=f"Choose from {', '.join(CHECKS)}")
     return conclusion.in_order(list(names))
 
 
@@ -279,8 +279,9 @@ def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
         return load_calculator(calculator)
     if not callable(calculator):
         raise InputError(
-            f"that is a {type(calculator).__name__}, neither words nor a function that makes a calculator",
-            remedy="Give lambda: LennardJones(), so that a new one can be made for each check",
+            f"the calculator is a {type(calculator).__name__}; expected its name, or a function that "
+            "makes it",
+            remedy="Give lambda: LennardJones(), so that each check can make a new one",
         )
     name = getattr(calculator, "__name__", type(calculator).__name__)
     name = "calculator" if name == "<lambda>" else name
@@ -290,10 +291,14 @@ def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
 def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: Path) -> LoadedCalculator:
     """The calculator of an audit that is resumed."""
     if calculator is None and not state.named:
-        raise InputError("the calculator of this audit has no name", remedy="Give it again", where=str(path))
+        raise InputError(
+            "the calculator of this audit was an object without a name",
+            remedy="Give it again",
+            where=str(path),
+        )
     if isinstance(calculator, str) and state.named and calculator != state.name:
         raise InputError(
-            f"that is an audit of {state.name}, not of {calculator}", remedy="Leave out the calculator"
+            f"the folder holds an audit of {state.name}, not of {calculator}", remedy="Omit the calculator"
         )
     return _loaded(state.name if calculator is None else calculator)
 
@@ -309,7 +314,7 @@ def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator, d
     else:
         found = default_structure(loaded, deadline) if structure is None else read_structure(structure)
     if not len(found):
-        raise InputError("a structure without atoms", remedy="Give one with atoms: -s FILE")
+        raise InputError("the structure has no atoms", remedy="Give a structure with atoms: -s FILE")
     return found
 
 
@@ -318,7 +323,9 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
     if timestep is None:
         return None
     if not timestep > 0:
-        raise InputError(f"a time step of {timestep:g}; expected one above 0", remedy="Correct --timestep")
+        raise InputError(
+            f"the time step is {timestep:g}; expected a value above 0", remedy="Correct --timestep"
+        )
     return timestep * given.time_factor / (1000.0 if given.time == "ps" else 1.0)
 
 

@@ -83,7 +83,7 @@ def command(system: str | None = None, *, demo: str | None = None, **given: Any)
                    "--against": given.get("against")}  # fmt: skip
         if first := next((name for name, value in foreign.items() if value), None):
             seen = f"a demonstration has its own balls, so it takes no {first}"
-            raise InputError(seen, remedy="Leave one of them out", where="--demo")
+            raise InputError(seen, remedy="Omit one of them", where="--demo")
         return demos.demonstrate(demo, **given)
     if system is not None:
         return bounce(system, **given)

@@ -62,12 +62,14 @@ class Options:
             InputError: a precision, a limit or a number of cases that there is not.
         """
         if not 0 <= self.cases <= MOST_CASES:
-            raise InputError(f"{self.cases:,} random cases", remedy=f"Ask for 0 to {MOST_CASES:,}")
+            raise InputError(
+                f"{self.cases:,} random cases were requested", remedy=f"Request 0 to {MOST_CASES:,}"
+            )
         if self.precision not in (None, *PRECISIONS):
             raise InputError(f"precision = {self.precision!r}", remedy=f"Give one of {', '.join(PRECISIONS)}")
         unknown = [word for word in self.limits if word not in LIMITS]
         if unknown:
-            raise InputError(f"no limit is called {unknown[0]!r}", remedy=f"Give some of {', '.join(LIMITS)}")
+            raise InputError(f"unknown limit {unknown[0]!r}", remedy=f"Choose from {', '.join(LIMITS)}")
         unit = PRECISIONS.get(self.precision or "")
         tested = tested.with_options(full=self.full, superset=self.superset, unit=unit)
         limits: Any = {LIMITS[word]: True for word in self.limits}
@@ -155,13 +157,15 @@ def conform(
             frame.words(limits),
         )  # fmt: skip
         if not pairs:
-            raise InputError("no list is given", remedy="Give a name, package.module:function or a function")
+            raise InputError(
+                "no neighbor list was given", remedy="Give a name, package.module:function or a function"
+            )
         tested = options.declared(load(pairs) if isinstance(pairs, str) else from_object(pairs))
         name = tested.name, tested.version
         if state is not None and state.tested != name:
             was, now = (" ".join(filter(None, words)) for words in (state.tested, name))
             remedy = "Begin in a new folder"
-            raise InputError(f"was begun with {was}, not {now}", where=str(resume), remedy=remedy)
+            raise InputError(f"the folder was begun with {was}, not {now}", where=str(resume), remedy=remedy)
         # scripts of what is known already need its conventions
         opening = deadline if state is None else Deadline(time and max(time, 0.2))
         examiner = Examiner(tested, reuse=True, apart=True, deadline=opening)

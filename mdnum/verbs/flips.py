@@ -235,18 +235,18 @@ def rules(
 
     if most is not None and not cutoffs:
         raise InputError(
-            "--most keeps the nearest of those inside a cutoff, and there is no cutoff",
+            "--most keeps the nearest neighbors inside a cutoff, but no cutoff is given",
             remedy="Add --cutoff R; for the K nearest without a cutoff write --nearest K",
         )
     radii, species, counts = map(_listed, (cutoffs, pairs, nearest))
     if wrong := [one for one in (*radii, *counts) if not isinstance(one, Real)]:
-        raise InputError(f"{wrong[0]!r} is no number", remedy="Write cutoffs=5.0 or cutoffs=[4.0, 5.0]")
+        raise InputError(f"{wrong[0]!r} is not a number", remedy="Write cutoffs=5.0 or cutoffs=[4.0, 5.0]")
     found: list[Rule] = [CutoffRule(r) if most is None else Capped(r, most) for r in map(float, radii)]
     found += [SpeciesCutoffs(_species_cutoffs(one)) for one in species]
     found += [Nearest(k) for k in counts]
     names = [one.name for one in found]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"the rule {twice[0]!r} is asked for twice", remedy="Keep one of them")
+        raise InputError(f"the rule {twice[0]!r} is given twice", remedy="Keep one of them")
     return tuple(found)
 
 
@@ -287,7 +287,7 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
         radius = RunFolder(trajectory.path.parent).system.get("cutoff", {}).get("radius")
     if not isinstance(radius, int | float):
         unit = f" in {trajectory.length}" if trajectory.length else ""
-        message = "no rule says which pairs count"
+        message = "no rule selects the pairs to examine"
         remedy = f'Add --cutoff R{unit}, --pairs "O-H=2.5,O-O=3.5" or --nearest K'
         raise InputError(message, remedy=remedy, where=str(trajectory.path))
     return rules([float(radius)])
@@ -307,7 +307,7 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
             if kinds[0] not in _STRUCTURES and len(open_trajectory(names[0]).sample()) > 1:
                 return
         raise InputError(
-            f"two paths are two trajectories to compare, and {Path(names[0]).name} looks like the "
+            f"two paths mean two trajectories to compare, but {Path(names[0]).name} looks like the "
             f"topology of {Path(names[1]).name}",
             remedy=f"Write mdnum flips {second} -s {first}",
         )

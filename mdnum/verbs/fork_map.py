@@ -105,7 +105,7 @@ def fork_map(
     loaded = opened(system, keep.get("overrides"))
     if isinstance(loaded, BallSystem):
         if loss is not None:
-            raise InputError("the loss of a ball is that of its system file", remedy="Leave out loss")
+            raise InputError("the loss of a ball is taken from its system file", remedy="Omit the loss")
         loaded = loaded if steps is None else loaded.for_steps(steps)
         last, kind = last_step(loaded, steps), str(loaded.spec.loss.kind)
         lost = kind.replace("-", " "), "m²" if kind == "residual-penetration" else "m"
@@ -344,7 +344,7 @@ def fork_forecast(
     from mdnum.forks.linearized import LINEAR, forecast
 
     if not 0 < size < float("inf"):
-        raise InputError(f"a displacement of {size:g}; expected a length above 0")
+        raise InputError(f"the displacement is {size:g}; expected a length above 0")
     loaded = of_md(system, keep.get("overrides"), "forecast", pairwise=True)
     last = last_step(loaded, steps)
     with frame.answering("forecast", f"fork-{loaded.name}", loaded, **keep) as answer:

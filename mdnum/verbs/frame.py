@@ -244,7 +244,8 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
         text = json.dumps([__version__, verb, held], sort_keys=True)
     except TypeError as error:
         raise InputError(
-            f"no folder can be named by its content: {error}", remedy="Name it otherwise, or by words alone"
+            f"the folder cannot be named by the content of its input: {error}",
+            remedy="Give the folder a name with --out",
         ) from error
     return digest_of(text.encode())[:16]
 
@@ -284,7 +285,7 @@ def answering(
         InputError: overrides of no system. FolderError: the folder cannot be used.
     """
     if overrides and system is None:
-        raise InputError("overrides change a system file, and there is none", remedy="Leave them out")
+        raise InputError("overrides apply to a system file, but none was given", remedy="Omit the overrides")
     began = perf_counter()
     with new_folder(kind, name, out, system=system) as folder:
         answer = Answer(folder, logged(folder, progress, STEPWISE))
@@ -360,7 +361,7 @@ def finish(
         summary = folder.summary if view is None else view.summary
         if not summary and not verb.unfinished:
             raise FolderError(
-                f"holds no answer: `mdnum {folder.layout.command}` was stopped before it had one",
+                f"the folder holds no result: `mdnum {folder.layout.command}` was stopped before it finished",
                 remedy=folder.again, where=str(folder.path),
             )  # fmt: skip
         view = verb.view(folder, summary) if view is None else view

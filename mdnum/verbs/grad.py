@@ -88,12 +88,14 @@ def grad(
     from mdnum.systems.load import world_of
 
     if replicas < 0 or replicas == 1:
-        raise InputError(f"replicas = {replicas}; a standard error takes at least 2")
+        raise InputError(f"replicas = {replicas}; a standard error needs at least 2")
     names, further = words(wrt), words(also)
     asked = None if methods is None else words(methods)
     unknown = [word for word in further if word not in (*ALSO, ALL)]
     if unknown:
-        raise InputError(f"no part {unknown[0]!r} of a diagnosis", remedy=f"There are {', '.join(ALSO)}")
+        raise InputError(
+            f"unknown part {unknown[0]!r} of a diagnosis", remedy=f"Choose from {', '.join(ALSO)}"
+        )
     further = ALSO if ALL in further else further
     if world_of(system) == "ball":
         whose = "of molecular dynamics: this system is a ball"
@@ -132,12 +134,14 @@ def _problem(
 
     if of is None:
         remedy = f"Add --of LOSS. There are {', '.join(LOSSES)}"
-        raise InputError("no loss to differentiate", where=simulation.name, remedy=remedy)
+        raise InputError("no loss to differentiate was given", where=simulation.name, remedy=remedy)
     last = last_step(simulation, steps, FEW_STEPS)
     loss = parse(of, simulation, last)
     if not names:
-        remedy = f"Add --wrt NAME,NAME. There are {', '.join(parameters.names(simulation))}"
-        raise InputError("no parameter to differentiate by", where=simulation.name, remedy=remedy)
+        remedy = f"Add --wrt NAME,NAME. The parameters are {', '.join(parameters.names(simulation))}"
+        raise InputError(
+            "no parameter to differentiate with respect to", where=simulation.name, remedy=remedy
+        )
     if (problem := Problem(simulation, loss, last)).parts:
         raise loss.wrong(*NOT_REAL)
     return problem, parameters.resolve(simulation, names)
@@ -203,7 +207,11 @@ def _diagnosed(
     where = problem.simulation.name
     if not chosen:
         reasons = "; ".join(f"{one['what']}: {one['why']}" for one in left)
-        raise InputError(f"no method applies: {reasons}", where=where, remedy="Ask for one with --methods")
+        raise InputError(
+            f"no gradient method is applicable: {reasons}",
+            where=where,
+            remedy="Choose a method with --methods",
+        )
     scalars = [name for name in names if not np.ndim(parameters.value(problem.simulation, name))]
 
     def tell(done: int, steps: int, phase: str) -> None:
@@ -373,15 +381,17 @@ def _ball_system(
 
     kinds = get_args(ball.LossTable.model_fields["kind"].annotation)
     if of is not None and of not in kinds:
-        raise InputError(f"no loss {of!r} of a ball", remedy=f"There are {', '.join(kinds)}")
+        raise InputError(f"a ball has no loss {of!r}", remedy=f"Choose from {', '.join(kinds)}")
     changes: dict[str, Any] = {} if of is None else {"loss.kind": of}
     changes |= {"gradient.of": list(names)} if names else {}
     made = load(system, overrides, world="ball")
     known = ball.parameters(made.spec.contact.kind)
     unknown = [name for name in names if name not in known]
     if unknown or not (names or made.spec.gradient.of):
-        seen = f"no parameter {unknown[0]!r}" if unknown else "no parameter to differentiate by"
-        raise InputError(seen, where=made.name, remedy=f"Add --wrt NAME,NAME. There are {', '.join(known)}")
+        seen = f"no parameter {unknown[0]!r}" if unknown else "no parameter to differentiate with respect to"
+        raise InputError(
+            seen, where=made.name, remedy=f"Add --wrt NAME,NAME. The parameters are {', '.join(known)}"
+        )
     if not isinstance(system, BallSystem):
         made = load(system, {**(overrides or {}), **changes}, world="ball")
     elif changes:
@@ -402,7 +412,7 @@ def _differentiated(system: BallSystem, methods: list[str], answer: Answer) -> N
     rows = [_method(one) for one in found]
     if not rows:
         reasons = "; ".join(f"{name}: {why}" for name, why in found.refused.items())
-        raise InputError(f"no method applies: {reasons}", where=system.name)
+        raise InputError(f"no gradient method is applicable: {reasons}", where=system.name)
     right = (exact(system, run, rows) or {}).get("gradient") or {}
     made = {one["method"]: one["gradient"] for one in rows}
     reference = "closed form" if right else "event-aware" if "event-aware" in made else rows[0]["method"]

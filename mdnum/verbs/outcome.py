@@ -82,7 +82,7 @@ class Outcome:
             names = sorted(parts | {file.stem for file in self._place.glob("*.parquet")})
             if name not in names:
                 has = f"Its tables: {', '.join(names)}" if names else "It has no tables"
-                raise FolderError(f"has no table {name!r}", remedy=has, where=str(self.path))
+                raise FolderError(f"the result has no table {name!r}", remedy=has, where=str(self.path))
             return folder.table(name)
 
     def plot(self, name: str) -> Axes:

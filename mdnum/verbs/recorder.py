@@ -76,12 +76,14 @@ class Recorder:
         **arrays: Any,
     ) -> None:  # fmt: skip
         if compare not in ("r2 <", "r2 <=", "r <", "r <="):
-            raise InputError(f"compare = {compare!r}", remedy="Write r2 <, r2 <=, r < or r <=")
+            raise InputError(
+                f"unknown comparison compare = {compare!r}", remedy="Write r2 <, r2 <=, r < or r <="
+            )
         if compare.endswith("="):
             r_cut = np.nextafter(np.atleast_1d(np.asarray(r_cut, float)), np.inf).tolist()
         self._rules = rules(r_cut, pairs, nearest, most)
         if not self._rules:
-            raise InputError("no rule says which pairs count", remedy="Give r_cut, pairs or nearest")
+            raise InputError("no rule selects the pairs to record", remedy="Give r_cut, pairs or nearest")
         self._source, self._atoms = ArrayFrames(name, **arrays), atoms
         self._source.reach = max(one.reach for one in self._rules)
         self._how = {"between": between, "window": window, "out": out, "report": report, "live": True}
@@ -89,7 +91,10 @@ class Recorder:
         if pair_energy is not None:
             if len(self._rules) > 1 or (radius := getattr(rule, "radius", None)) is None or rule.directed:
                 names = ", ".join(one.name for one in self._rules)
-                raise InputError(f"pair_energy with {names}", remedy="Give it with one r_cut alone")
+                raise InputError(
+                    f"pair_energy cannot be combined with {names}",
+                    remedy="Give pair_energy with a single r_cut only",
+                )
             self._jump = float(pair_energy(radius))
         self._check = ListCheck(rule)
         # the list in use; energy, list and its flag of each frame that waits
@@ -124,7 +129,9 @@ class Recorder:
         frame = self._source.read(step, positions, cell, box, pbc, velocities)
         if len(frame.positions) != self._source.atoms:
             message = f"{len(frame.positions)} atoms at step {step}, and {self._source.atoms} before"
-            raise InputError(message, remedy="Record each set of atoms by itself", where="positions")
+            raise InputError(
+                message, remedy="Record each set of atoms with its own recorder", where="positions"
+            )
         if neighbors is not None:
             self._list = self._check.given(neighbors, self._source.species)
         overflow = bool(np.any(np.asarray(getattr(neighbors, "did_buffer_overflow", False))))
@@ -168,7 +175,9 @@ class Recorder:
         elif args or self._atoms is not None:
             self.see_atoms(*(args or (self._atoms,)))
         else:
-            raise InputError("called without a frame", remedy="Give Recorder(atoms=...), or call see")
+            raise InputError(
+                "the recorder was called without a frame", remedy="Give Recorder(atoms=...), or call see"
+            )
 
     def hook(self, step: Any, positions: Any, **given: Any) -> None:
         """`see` inside of jax.jit, fori_loop and scan: the host is called at every step, in order."""
@@ -212,7 +221,7 @@ class Recorder:
         if self._one is None and self._failed is None and self._given:
             self._advance()
         if self._one is None:
-            raise self._failed or InputError("no frame was given", remedy="Call see at least once")
+            raise self._failed or InputError("no frame was recorded", remedy="Call see at least once")
         one, folder = self._one, self._one.answer.folder
         with self._stack:
             self._add("lost", self._check.ended(self._done, one.found.rules[0].tracker.bound))

@@ -68,7 +68,7 @@ def test_a_system_brings_its_structure_and_temperature():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("", "no calculator named"),
+        ("", "no calculator was given"),
         ("nonesuch.package:Thing", "No module named 'nonesuch'"),
         ("ase.calculators.emt:Emt", "Did you mean EMT"),
         ("ase.calculators.emt.EMT", "ase.calculators.emt:EMT"),
@@ -77,7 +77,7 @@ def test_a_system_brings_its_structure_and_temperature():
         ("ase.calculators.emt:EMT(**{})", "cannot be used here"),
         ("ase.calculators.emt:EMT().results", "only a name"),
         ("ase.calculators.emt:EMT(", "a name with arguments"),
-        ("ase.calculators.lj:LennardJones(3)", "making it failed: TypeError"),
+        ("ase.calculators.lj:LennardJones(3)", "could not be constructed: TypeError"),
         ("ase.calculators.tersoff:Tersoff", "Class(argument=value)"),
         ("ase.build:molecule('H2O')", "not an ASE calculator"),
         ("argon/crystl-108", "Did you mean argon/crystal-108"),

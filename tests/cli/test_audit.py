@@ -33,7 +33,7 @@ def copper(tmp_path: Path, monkeypatch) -> Path:
         ((EMT, "-s", "no.xyz"), "no.xyz"),
         ((EMT, "-s", "cu.extxyz@7"), "cu.extxyz@7"),
         ((EMT, "-s", "cu.extxyz@:"), "one structure"),
-        ((EMT, "-s", "cu.extxyz", "--timestep", "0", "--checks", "dynamics"), "expected one above 0"),
+        ((EMT, "-s", "cu.extxyz", "--timestep", "0", "--checks", "dynamics"), "expected a value above 0"),
     ],
 )
 def test_what_cannot_be_asked_is_named_in_one_line(arguments, message, copper, capsys):

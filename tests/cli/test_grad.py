@@ -28,14 +28,17 @@ grad: Any = importlib.import_module("mdnum.verbs.grad")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("nope", "--of", "msd"), "no system called 'nope'"),
+        (("nope", "--of", "msd"), "nor a file called 'nope'"),
         ((WELL,), "Add --of LOSS. There are msd,"),
         ((WELL, "--of", "mds", "--wrt", "sigma"), "Did you mean msd?"),
-        ((WELL, "--of", "msd"), "Add --wrt NAME,NAME. There are potential.sigma,"),
+        ((WELL, "--of", "msd"), "Add --wrt NAME,NAME. The parameters are potential.sigma,"),
         ((WELL, "--of", "msd", "--wrt", "sgima"), "Did you mean sigma?"),
-        ((WELL, "--of", "msd", "--wrt", "sigma,seed"), "nothing is differentiable by dynamics.seed"),
+        (
+            (WELL, "--of", "msd", "--wrt", "sigma,seed"),
+            "no loss is differentiable with respect to dynamics.seed",
+        ),
         ((WELL, "--of", "msd", "--wrt", "sigma", "--methods", "symetric"), "Did you mean symmetric?"),
-        ((WELL, "--of", "pressure", "--wrt", "sigma"), "has no meaning here"),
+        ((WELL, "--of", "pressure", "--wrt", "sigma"), "is not defined here"),
         ((WELL, "--of", "potential:first=9", "--wrt", "sigma", "--steps", "8"), "no step up to 8"),
         ((WELL, "--of", "potential:evry=2", "--wrt", "sigma"), "write for example potential:every=10"),
         ((WELL, "--of", "potential:every=x", "--wrt", "sigma"), "not a whole number"),

@@ -203,7 +203,7 @@ def hover() -> BallProblem:
         ("smoothed", bouncing(1e-2, 1.0), "y0", {"eps": 1e-3}, "does not resolve"),
         ("smoothed", bouncing(1e-2, 1.0), "y0", {"eps": 0.0}, "width"),
         ("randomized", relaxation(1e-3), "k", {"samples": 1}, "2 samples"),
-        ("unrolled", relaxation(1e-2), "damping", {}, "no parameter called 'damping'"),
+        ("unrolled", relaxation(1e-2), "damping", {}, "this ball has no parameter 'damping'"),
     ],
 )
 def test_what_has_no_such_derivative_is_refused(word, problem, name, options, message):

@@ -153,7 +153,7 @@ def test_a_name_or_a_file_that_is_no_system(tmp_path: Path):
     for name, words in (
         (tmp_path / "gone.toml", r"gone\.toml: no such system file"),
         (tmp_path / "bytes.toml", "UTF-8"),
-        ("argon/liquid-846", f"no system called 'argon/liquid-846'.*{near}"),
+        ("argon/liquid-846", f"a file called 'argon/liquid-846'.*{near}"),
         ("liquid-864", near),
     ):
         with pytest.raises(InputError, match=words):

@@ -287,7 +287,7 @@ def test_variants_are_the_system_with_keys_changed(files: dict[str, Path]):
         more.against({"contact.k": "5e4"}, "stiffer")
     with pytest.raises(InputError, match=r"--against contact.k=-1: variant 'contact.k=-1': contact.k = -1"):
         system.against({"contact.k": "-1"})
-    with pytest.raises(InputError, match="changes nothing"):
+    with pytest.raises(InputError, match="changes no key"):
         system.against({}, "none")
 
 
@@ -302,7 +302,7 @@ def test_a_written_or_copied_system_is_the_same_system(name: str, tmp_path: Path
     assert {path.name for path in copied.parent.iterdir()} == {BALL_SCHEMA, short}
     assert copied.read_text(encoding="utf-8").startswith(f"#:schema {BALL_SCHEMA}\n")
     assert load(copied).spec.model_dump(exclude={"name"}) == load(name).spec.model_dump(exclude={"name"})
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         systems.copy(name, tmp_path / "mine")
 
 

@@ -239,7 +239,7 @@ def test_copy_gives_a_system_that_loads_and_overwrites_nothing(tmp_path: Path):
     assert files == {"liquid-864.extxyz", "liquid-864.toml", "schema.json"}
     assert same_bits(load(copied), load(ARGON))
     assert copied.read_text(encoding="utf-8").startswith("#:schema schema.json")
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         systems.copy(ARGON, tmp_path)
     systems.copy("argon/crystal-108", tmp_path)
 

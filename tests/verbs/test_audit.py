@@ -194,7 +194,7 @@ def test_a_calculator_that_fails_is_a_finding_with_its_structure(make, why, tmp_
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({"checks": ","}, "no check is named"),
+        ({"checks": ","}, "no check was given"),
         ({"structure": Atoms()}, "without atoms"),
         ({"calculator": 7}, "that is a int"),
         ({"time": 0.0}, "--time"),

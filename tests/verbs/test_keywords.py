@@ -158,7 +158,7 @@ def test_a_folder_goes_by_the_content_of_what_is_asked(tmp_path, monkeypatch):
         for word in ("a.xyz", tmp_path / "b.xyz", "c.xyz", "a.xyz@5:")
     )
     assert a == b and len({a, c, frames}) == 3
-    with pytest.raises(InputError, match="has no plain form"):
+    with pytest.raises(InputError, match="cannot be converted to plain data"):
         content("conform", {"pairs": lambda: None})
 
 

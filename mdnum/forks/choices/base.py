@@ -78,7 +78,7 @@ class Choice:
         """
         own = cls._fields()
         if argument and not own:
-            raise InputError(f"{cls.family} has no argument", where=f"{cls.family}={argument}")
+            raise InputError(f"{cls.family} takes no argument", where=f"{cls.family}={argument}")
         values: dict[str, Any] = {"both": both} if both else {}
         for one, part in zip(own, argument.split(":", len(own) - 1) if argument else (), strict=False):
             kind = {"int": int, "float": float}.get(str(one.type).partition(" ")[0])
@@ -143,7 +143,7 @@ def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> 
             raise
         message = f"{type(choice).__module__} reads the tables of a system file, and is given a Simulation"
         raise InputError(
-            message, where=choice.name, remedy="See `mdnum.choices` in docs/extending.md"
+            message, where=choice.name, remedy="Read about `mdnum.choices` in docs/extending.md"
         ) from error
     except InputError as error:
         # the choice is named where this is printed
@@ -161,7 +161,7 @@ def twin_of(choice: Choice, system: Simulation | System | BallSystem) -> Twin:
         raise InputError(
             f"does not apply to {system.name}: {made}",
             where=choice.name,
-            remedy="Choose another: `mdnum fork` lists them",
+            remedy="Choose another; `mdnum fork choices` lists all",
         )
     return made
 
@@ -188,8 +188,8 @@ def parse(text: str, world: str | None = None) -> Choice:
     head, _, role = family.partition(".")
     if family in _PROGRAMS:
         raise InputError(
-            f"{text} is another program of one run, and no choice of two",
-            remedy="Ask `mdnum fork processes SYSTEM`",
+            f"{text} compares program variants in separate processes and cannot be varied between two runs",
+            remedy="Run `mdnum fork processes SYSTEM`",
         )
     if head in CHOICES and (argument or not equals) and (both or not at):
         kind: type[Choice] = CHOICES[head]
@@ -200,7 +200,8 @@ def parse(text: str, world: str | None = None) -> Choice:
     families = [one for one in CHOICES if set(CHOICES[one].worlds) & set(worlds)]
     near = meant(text, [*families, *(name for one in worlds for name in shipped(one))])
     raise InputError(
-        f"no choice {text!r}", remedy=f"{near}There are {', '.join(families)}; `mdnum fork` lists all"
+        f"unknown choice {text!r}",
+        remedy=f"{near}Known choices are {', '.join(families)}; `mdnum fork choices` lists all",
     )
 
 

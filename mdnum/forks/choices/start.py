@@ -389,7 +389,7 @@ class EnergyShift(Choice):
 
     def make(self, system: Simulation) -> Twin:
         if not system.pairwise:
-            raise InputError("the potential carries its own cutoff")
+            raise InputError("the cutoff is part of this potential")
         kind = system.cutoff.name
         applies(kind in ("hard", "shifted"), f"a {kind} cutoff changes the force too")
         other = "shifted" if kind == "hard" else "hard"

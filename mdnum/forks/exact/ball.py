@@ -44,7 +44,7 @@ def exactly(value: SupportsFloat) -> Decimal:
     """
     value = float(value)
     if not math.isfinite(value):
-        raise ValueError(f"{value} is no number")
+        raise ValueError(f"{value} is not a number")
     return Decimal(value)
 
 
@@ -91,7 +91,8 @@ class _ExactBall:
         )
         if not served or getattr(contact, "smooth", False):
             raise InputError(
-                f"{type(contact).__name__} with {type(scheme).__name__} takes more than sums and products",
+                f"{type(contact).__name__} with {type(scheme).__name__} needs operations other than "
+                "sums and products",
                 remedy="Use explicit Euler, semi-implicit Euler or velocity Verlet, and a contact that is "
                 "not smooth",
             )
@@ -211,7 +212,9 @@ class _ExactRule:
         if isinstance(rule, HysteresisStop):
             self.enter, rule = _held(world, rule.enter), rule.rule
         if type(rule) not in (GlobalSum, PerInstance, Maximum, Relative, FixedCount):
-            raise InputError(f"the exact ball knows no stopping rule {type(rule).__name__}")
+            raise InputError(
+                f"exact arithmetic of the ball does not support the stopping rule {type(rule).__name__}"
+            )
         self.rule, self.max_iter = rule, rule.max_iter
         self.tol = None if isinstance(rule, FixedCount) else _held(world, rule.tol)
 

@@ -122,7 +122,7 @@ def certify(
     own = system.spec.integrator.steps if isinstance(system, BallSystem) else system.steps
     last = own if steps is None else steps
     if last < 1:
-        raise InputError(f"steps = {last}; expected at least 1", remedy="Ask for one step or more")
+        raise InputError(f"steps = {last}; expected at least 1", remedy="Request at least one step")
     if policies is None:
         policies = BALL_POLICIES if is_ball else MD_POLICIES
     wide = dict.fromkeys(ROLES["ball" if is_ball else "md"], "float64")

@@ -192,8 +192,8 @@ def _without_balls(simulation: Simulation) -> InputError | None:
             pull(arb(float(r_cut)) ** 2)
     except TypeError as error:
         return InputError(
-            f"the exact program cannot evaluate {simulation.potential.name!r}: {error}",
-            remedy="Use operations that it has (docs/compiled-loop.md)",
+            f"exact arithmetic cannot evaluate {simulation.potential.name!r}: {error}",
+            remedy="Use supported operations (docs/compiled-loop.md)",
             where="potential.kind",
         )
     return None
@@ -269,7 +269,8 @@ class ExactProgram:
                 failed = run.step
             bits = max(more, bits + bits // 2)
         raise InputError(
-            f"a pair at step {failed} is too close to its cutoff for {bits} bits; it may be exactly there",
+            f"a pair at step {failed} is too close to its cutoff to be decided with {bits} bits; its "
+            "distance may be exactly the cutoff",
             remedy="Change the start by one ulp",
         )
 

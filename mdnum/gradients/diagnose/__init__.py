@@ -126,7 +126,7 @@ def agreement(
     given = [one.found for one in opinions if one.found is not None]
     if not given:
         reasons = "; ".join(f"{one.method}: {one.missing}" for one in opinions)
-        raise InputError(f"no method applies: {reasons}")
+        raise InputError(f"no gradient method is applicable: {reasons}")
     # the method that leaves nothing out, where it is there
     order = ("event-aware", "symmetric") if problem.jumps else ("symmetric", "event-aware")
     there = {one.method: one for one in given}
@@ -278,7 +278,9 @@ def diagnose(
     full = parameters.resolve(problem.simulation, names)
     unknown = [part for part in parts if part not in PARTS]
     if unknown:
-        raise InputError(f"no part {unknown[0]!r} of a diagnosis", remedy=f"There are {', '.join(PARTS)}")
+        raise InputError(
+            f"unknown part {unknown[0]!r} of a diagnosis", remedy=f"Choose from {', '.join(PARTS)}"
+        )
     searched = parameters.resolve(problem.simulation, edges_of) if edges_of else ()
     chosen = _methods(methods)
     plain, why = _first(chosen, Symmetric), ""

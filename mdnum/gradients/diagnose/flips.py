@@ -86,9 +86,9 @@ def flips(
     kept = [name for name in full if name not in skipped]
     if not kept:
         raise InputError(
-            f"contributions of flips by {', '.join(full)}: a tangent for each of {sizes[full[0]]} entries "
-            "would be needed",
-            remedy="Name a parameter of one entry too",
+            f"the contributions of flips to the derivative with respect to {', '.join(full)} need a tangent "
+            "for each of {sizes[full[0]]} entries",
+            remedy="Add a scalar parameter",
         )
     if made is None:
         made = passed(problem, full, guard=guard, progress=progress)
@@ -187,12 +187,15 @@ def edges(
     here = parameters.value(problem.simulation, full)
     if here.shape:
         raise InputError(
-            f"{full} has {here.size} entries; boundaries lie along one number",
-            remedy="Search along a parameter of one entry",
+            f"{full} has {here.size} entries; boundaries are located along a scalar parameter",
+            remedy="Search along a scalar parameter",
         )
     value = float(here)
     if value == 0 or not 0 < reach < 1:
-        raise InputError(f"{full} = {value:g} and reach = {reach:g}; expected a number, and a share below 1")
+        raise InputError(
+            f"{full} = {value:g} and reach = {reach:g}; expected a finite value and a reach "
+            "(relative) below 1"
+        )
     program = MdProgram(problem.simulation)
 
     def at(q: float) -> MdProgram:

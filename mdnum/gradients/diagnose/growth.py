@@ -291,7 +291,9 @@ class Jacobian:
     def __init__(self, tape: RunTape, clock: float):
         check_kick(tape.simulation.integrator)
         if not isinstance(tape.simulation.force, PairForce):
-            raise InputError("the Jacobian of a step is one of pair potentials", where=tape.simulation.name)
+            raise InputError(
+                "the Jacobian of a step is available for pair potentials only", where=tape.simulation.name
+            )
         self.tape, self.clock = tape, clock
         self.force: PairForce = tape.simulation.force
         self.coordinates = 6 * tape.simulation.atoms
@@ -429,7 +431,9 @@ def spectrum(
         log_s, left, right = _svd(there)
         residual = _residual(jacobian, there.basis @ left, start @ right, log_s)
     except FloatingPointError as error:
-        raise NumericalError(f"singular values: {error}", remedy="Ask the detective why") from error
+        raise NumericalError(
+            f"singular values: {error}", remedy="Examine the growth of the gradient with diagnose()"
+        ) from error
     exponents = log_s[:values] / tape.steps
     steps, curve = np.arange(tape.steps + 1), there.stretches[:, :values]
     *_, grows = growth_rate(np.interp(steps, there.steps, curve[:, 0]))

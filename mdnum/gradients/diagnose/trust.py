@@ -298,11 +298,13 @@ def trust(
     kept = [name for name in full if np.size(parameters.value(simulation, name)) <= MOST]
     if not kept:
         raise InputError(
-            f"a trust horizon by {', '.join(full)} would need a tangent for each entry",
-            remedy="Name a parameter of one entry too, such as dynamics.temperature",
+            f"the trust horizon with respect to {', '.join(full)} would need a tangent for each entry",
+            remedy="Add a scalar parameter, such as dynamics.temperature",
         )
     if replicas == 1 or replicas < 0:
-        raise InputError(f"replicas = {replicas}; one start has no standard error", remedy="Give 2 or more")
+        raise InputError(
+            f"replicas = {replicas}; a single start has no standard error", remedy="Give 2 or more"
+        )
     if not 0 < tolerance < 1:
         raise InputError(f"tolerance = {tolerance:g}; expected between 0 and 1")
     at = spread(problem, points)

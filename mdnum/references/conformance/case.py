@@ -29,13 +29,13 @@ def _rows(value: Any) -> ndarray:
 
 def _finite(value: Any) -> ndarray:
     if not np.isfinite(rows := _rows(value)).all():
-        raise ValueError("coordinates that are not finite")
+        raise ValueError("the coordinates are not finite")
     return rows
 
 
 def _vectors(value: Any) -> ndarray:
     if (rows := _finite(value)).shape != (3, 3):
-        raise ValueError("not three lattice vectors")
+        raise ValueError("expected three lattice vectors")
     return rows
 
 

@@ -367,7 +367,7 @@ class Failed:
 
     def __post_init__(self) -> None:
         if not self.failures or any(failure.step >= self.case.steps for failure in self.failures):
-            raise ValueError("no failure at a step of its case")
+            raise ValueError("no failure is recorded at a step of its case")
 
     @property
     def worst(self) -> Failure:
@@ -399,8 +399,9 @@ class CaseAnswers:
         steps += [result.refused[0]] if result.refused is not None else []
         if result.case != case.name or any(step >= case.steps for step in steps):
             raise InputError(
-                f"question {number} was {result.case!r} and is {case.name!r} now, with {case.steps} steps",
-                remedy="Begin again in a new folder: the questions are those of another version",
+                f"case {number} was {result.case!r} when this folder was begun and is {case.name!r} "
+                f"now, with {case.steps} steps",
+                remedy="Begin again in a new folder: this version of mdnum has other cases",
             )
         return result
 

@@ -63,7 +63,7 @@ def test_what_does_not_apply_is_listed_with_the_reason_and_asked_for_what_it_has
     method = FiniteDifferences(relative=1e-6, levels=1)
     shifted = agreement(problem, ("x0", "sigma"), ["event-aware", method], known=known).gradient(method.name)
     assert shifted is not None and list(shifted.gradient) == ["potential.sigma"]
-    with pytest.raises(InputError, match="no method applies"):
+    with pytest.raises(InputError, match="no gradient method is applicable"):
         agreement(problem, ("x0",), ["finite-differences"])
     with pytest.raises(InputError, match="no method 'symetric'"):
         agreement(problem, ("x0",), ["symetric"])

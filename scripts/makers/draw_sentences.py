@@ -1,0 +1,138 @@
+"""Forty sentences of mdnum, drawn with a seed from all kinds of text, for readers who do not know it.
+
+    python scripts/makers/draw_sentences.py --seed 3
+
+Eight sentences each of findings (pages and terminal), help texts, errors, docstrings and documents. A reader
+marks each sentence as clear at first reading or not, with the words that stopped them. `sentences.toml` next to
+this file lists the sentences drawn before and after a revision, with their marks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import random
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+#: Sentences of each kind, and letters that a sentence has at least: shorter ones are labels.
+EACH, SHORTEST = 8, 30
+_END = re.compile(r"(?<=[.?!:])\s+(?=[A-Z`\[*-])")
+_FIELD = re.compile(r"\{(?:[a-z_]*:\?) (\w+) \w+\}|\{(\w+)(?::#? ?([^}]*))?\}")
+#: Keys whose texts are no sentences of a finding.
+_NO_SENTENCE = (
+    "severity",
+    "section",
+    "help",
+    "metavar",
+    "type",
+    "of",
+    "kind",
+    "unit",
+    "calls",
+    "name",
+    "shares",
+)
+
+
+def main() -> None:
+    """Draw and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seed", type=int, default=1)
+    draw = random.Random(parser.parse_args().seed)
+    kinds = {
+        "finding": findings,
+        "help": helps,
+        "error": errors,
+        "docstring": docstrings,
+        "document": documents,
+    }
+    for kind, of in kinds.items():
+        found = sorted({one for one in of() if len(one[1]) >= SHORTEST})
+        for place, sentence in draw.sample(found, EACH):
+            print(f"[[sentence]]\nkind = {kind!r}\nplace = {place!r}\ntext = '''{sentence}'''\n")
+
+
+def findings() -> Iterator[tuple[str, str]]:
+    """Sentences of the text files, fields by an example: a count as 3, a number as its name."""
+    for file in sorted((ROOT / "mdnum").rglob("*.toml")):
+        for text in _texts(tomllib.loads(file.read_text())):
+            yield from _split(file, _FIELD.sub(_example, text))
+
+
+def helps() -> Iterator[tuple[str, str]]:
+    """Help texts of commands and options."""
+    for file in sorted((ROOT / "mdnum").rglob("*.toml")):
+        for text in _texts(tomllib.loads(file.read_text()), only="help"):
+            yield from _split(file, text)
+
+
+def errors() -> Iterator[tuple[str, str]]:
+    """Messages and remedies of exceptions."""
+    for file in sorted((ROOT / "mdnum").rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "").endswith("Error"):
+                parts = [
+                    _literal(one)
+                    for one in [*node.args[:1], *(k.value for k in node.keywords if k.arg != "where")]
+                ]
+                yield from _split(file, ". ".join(part for part in parts if part), whole=True)
+
+
+def docstrings() -> Iterator[tuple[str, str]]:
+    """Sentences of docstrings in the package."""
+    for file in sorted((ROOT / "mdnum").rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (
+                text := ast.get_docstring(node)
+            ):
+                for part in re.split(r"\n\s*\n", text.partition("\nArgs:")[0]):
+                    if not part.startswith((" ", "Example", ">>>")):
+                        yield from _split(file, part)
+
+
+def documents() -> Iterator[tuple[str, str]]:
+    """Sentences of README and docs/, without tables, code and headings."""
+    for file in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        text = re.sub(r"^(```|~~~|\$\$).*?^(```|~~~|\$\$)", "", file.read_text(), flags=re.S | re.M)
+        for part in re.split(r"\n\s*\n", re.sub(r"^(\||#|---|\s*:::).*$", "", text, flags=re.M)):
+            yield from _split(file, part.lstrip("-*>0123456789. "))
+
+
+def _texts(tables: Any, only: str = "") -> Iterator[str]:
+    for key, value in tables.items() if isinstance(tables, dict) else enumerate(tables):
+        if isinstance(value, dict | list):
+            yield from _texts(value, only)
+        elif isinstance(value, str) and (key == only if only else key not in _NO_SENTENCE):
+            yield value
+
+
+def _example(field: re.Match[str]) -> str:
+    word, name, form = field.groups()
+    if word:
+        return word
+    if form and form[0].isalpha() and "{n:#" in field[0].replace(name, "n"):
+        return f"3 {form.split()[0].replace('_', ' ')}s"
+    return f"<{name}>"
+
+
+def _literal(node: ast.expr) -> str:
+    if isinstance(node, ast.Constant):
+        return node.value if isinstance(node.value, str) else ""
+    if isinstance(node, ast.JoinedStr):
+        return "".join(one.value if isinstance(one, ast.Constant) else "…" for one in node.values)  # type: ignore[misc]
+    return ""
+
+
+def _split(file: Path, text: str, whole: bool = False) -> Iterator[tuple[str, str]]:
+    flat = " ".join(text.split())
+    for sentence in [flat] if whole else _END.split(flat):
+        yield str(file.relative_to(ROOT)), sentence.replace("'''", '"')
+
+
+if __name__ == "__main__":
+    main()
