@@ -264,8 +264,8 @@ class PairRecorder:
         decision was made with.
 
         Raises:
-            MdnumError: a flip was recorded for one atom of the pair only, or a margin contradicts its decision:
-                the arithmetic of the compiled program differs from that of the host.
+            MdnumError: a flip was recorded for one atom of a pair only, or a margin contradicts its
+                decision, so the arithmetic of the compiled program differs from that of the host.
         """
         table, changes = segment.table, segment.changes
         replaced = self._replace(segment)
