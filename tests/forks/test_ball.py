@@ -115,7 +115,7 @@ def test_programs_that_decide_different_things_are_refused():
         fork(balls(SPRING, impact, 1.0))
     with pytest.raises(InputError, match="split = 0"):
         fork(balls(SPRING, SPRING, 1.0, steps=10), split=0.0)
-    with pytest.raises(InputError, match="1 balls and 2"):
+    with pytest.raises(InputError, match="1 and 2 balls"):
         fork(balls(SPRING, SPRING, 1.0, [1.0, 1.0]))
 
 
@@ -501,7 +501,7 @@ def test_every_float_of_a_narrow_number_is_run(systems):
     high = float(at + 6 * np.spacing(at))
     found = boundaries(systems["alone"], "contact.k", float(at), high, cells=16, confirm=False)
     assert found.complete and found.evaluations == 7 and found.resolution == np.spacing(at)
-    with pytest.raises(InputError, match=r"'mass' is no number.* k, "):
+    with pytest.raises(InputError, match=r"'mass' is not a parameter.* k, "):
         boundaries(systems["alone"], "mass", 0.0, 1.0)
     with pytest.raises(InputError, match="at least 0"):
         boundaries(systems["alone"], "k", -1.0, 1.0)

@@ -203,13 +203,13 @@ def hover() -> BallProblem:
         ("smoothed", bouncing(1e-2, 1.0), "y0", {"eps": 1e-3}, "does not resolve"),
         ("smoothed", bouncing(1e-2, 1.0), "y0", {"eps": 0.0}, "width"),
         ("randomized", relaxation(1e-3), "k", {"samples": 1}, "2 samples"),
-        ("unrolled", relaxation(1e-2), "damping", {}, "this ball has no parameter 'damping'"),
+        ("unrolled", relaxation(1e-2), "damping", {}, "parameter 'damping'"),
     ],
 )
 def test_what_has_no_such_derivative_is_refused(word, problem, name, options, message):
     with pytest.raises(MdnumError, match=message):
         gradient(word, problem, name, **options)
-    with pytest.raises(InputError, match="no gradient 'adjoint'"):
+    with pytest.raises(InputError, match="gradient 'adjoint'"):
         compare(problem, [name] if name != "damping" else ["k"], ["adjoint"])
     if word == "implicit":
         helped = gradient(word, problem, "k", "y0", regularization=1e-3)

@@ -104,10 +104,10 @@ OWN, PAIR = "epsilon = 0.0103235", "{ sigma = 1.0, epsilon = 1.0 }"
         ),
         ("radius = 8.0", "radius = true", 14, "cutoff.radius = true … expected a number"),
         ('"hard"\nradius = 8.0', '"switched"\nradius = 8.0\nonset = 8.0', 12, "not below the radius"),
-        ("radius = 8.0", "", 12, "[cutoff] … radius missing … in_sigma"),
+        ("radius = 8.0", "", 12, "[cutoff] … radius is missing … in_sigma"),
         ("radius = 8.0", "radius = 8.0\nin_sigma = 2.5", 12, "both given"),
-        ("epsilon = 0.0103235", "", 7, "[potential] … epsilon missing"),
-        (CUTOFF, "", None, "[cutoff] missing … lennard-jones needs"),
+        ("epsilon = 0.0103235", "", 7, "[potential] … missing: epsilon"),
+        (CUTOFF, "", None, "[cutoff] is missing"),
         (LJ, 'kind = "tersoff"', 10, "[cutoff]"),
         (f"[structure]\n{FILE}", "", None, "table [structure] missing"),
         (FILE, 'file = "gone.extxyz"', None, "gone.extxyz: no such structure file"),
@@ -116,7 +116,7 @@ OWN, PAIR = "epsilon = 0.0103235", "{ sigma = 1.0, epsilon = 1.0 }"
         (OWN, f"{OWN}\npairs.Ar-Kr = {PAIR}\npairs.Kr-Ar = {PAIR}", None, "are the same pair"),
         (OWN, f"{OWN}\npairs.Kr-Kr = {{ sgima = 1.0 }}", None, "unknown key 'sgima' in [potential.pair"),
         (FILE, FILE + "\nmasses = { Kr = 80.0 }", None, "structure.masses names Kr"),
-        (FILE, 'builder = "fcc"\nsymbol = "Argon"\nlattice_constant = 5.4', None, "no chemical symbol"),
+        (FILE, 'builder = "fcc"\nsymbol = "Argon"\nlattice_constant = 5.4', None, "not a chemical symbol"),
     ],
 )
 def test_a_mistake_in_the_file(folder: Path, old: str, new: str, line: int | None, words: str):
@@ -192,7 +192,7 @@ def flatten(atoms: Atoms) -> None:
     ("damage", "words"),
     [
         (lambda atoms: place(atoms, _17=[0, np.nan, 0]), "atom 17 (Ar) has positions"),
-        (lambda atoms: place(atoms, _17=[0, np.nan, 0], _40=[np.inf] * 3), ", and 1 more atoms"),
+        (lambda atoms: place(atoms, _17=[0, np.nan, 0], _40=[np.inf] * 3), "of 1 other atoms"),
         (lambda atoms: atoms.set_momenta([[np.nan] * 3] * len(atoms)), "atom 0 (Ar) has momenta"),
         (lambda atoms: place(atoms, _0=atoms.positions[7] + [0.25, 0, 0]), "0.25 Å apart, closer than 1.362"),
         (lambda atoms: place(atoms, _0=[0.05, 1, 1], _9=[21.55, 1, 1]), "0 (Ar) and 9 (Ar) are 0.1 Å apart"),
@@ -240,13 +240,13 @@ def test_unknown_species(folder: Path):
     change(folder, atoms)
     said = refusal(folder)
     assert "the structure holds Ar, Kr" in said
-    assert "no constants for Ar-Ar, Ar-Kr, Kr-Kr" in said
+    assert "no parameters for Ar-Ar, Ar-Kr, Kr-Kr" in said
     with_pairs = """kind = "lennard-jones"
 pairs.Ar-Ar = { sigma = 3.4, epsilon = 0.01 }
 pairs.Kr-Ar = { sigma = 3.5, epsilon = 0.01 }
 """
     edit(folder, LJ, with_pairs)
-    assert "constants for Kr-Kr (it has Ar-Ar, Kr-Ar)" in refusal(folder)
+    assert "parameters for Kr-Kr (it has Ar-Ar, Kr-Ar)" in refusal(folder)
 
 
 def test_silicon_constants_for_argon(folder: Path):

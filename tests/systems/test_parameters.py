@@ -145,7 +145,7 @@ SWITCHED = {"cutoff.kind": "switched", "cutoff.onset": 7.5}
     [
         ("argon/crystal-108", {}, "r_cut", 3.0, "exceeds half"),
         ("argon/crystal-108", {}, "skin", 5.0, "half the smallest"),
-        ("argon/liquid-864", {}, "dynamics.temperature", 1.0, "no parameter 'dynamics.temperature'"),
+        ("argon/liquid-864", {}, "dynamics.temperature", 1.0, "parameter 'dynamics.temperature'"),
         ("argon/liquid-864", SWITCHED, "onset", 9.0, r"9\.0 is not below .*8\.5"),
         ("argon/liquid-864", SWITCHED, "radius", 7.0, r"7\.5 is not below .*7\.0"),
         ("argon/liquid-864", {}, "timestpe", 1.0, r"Did you mean timestep\?"),

@@ -63,9 +63,9 @@ def test_what_does_not_apply_is_listed_with_the_reason_and_asked_for_what_it_has
     method = FiniteDifferences(relative=1e-6, levels=1)
     shifted = agreement(problem, ("x0", "sigma"), ["event-aware", method], known=known).gradient(method.name)
     assert shifted is not None and list(shifted.gradient) == ["potential.sigma"]
-    with pytest.raises(InputError, match="no gradient method is applicable"):
+    with pytest.raises(InputError, match="is applicable"):
         agreement(problem, ("x0",), ["finite-differences"])
-    with pytest.raises(InputError, match="no method 'symetric'"):
+    with pytest.raises(InputError, match="method 'symetric'"):
         agreement(problem, ("x0",), ["symetric"])
 
 
@@ -78,7 +78,7 @@ def test_parts_that_cannot_be_had_say_why():
     assert found.trust is None and found.flips is None and found.growth is None
     assert set(found.failed) == {"trust", "flips", "growth"}
     assert all(found.failed.values())
-    with pytest.raises(InputError, match="no part 'grwth'"):
+    with pytest.raises(InputError, match="part 'grwth'"):
         diagnose(problem, ("v0",), parts=("grwth",))
 
 
