@@ -27,6 +27,7 @@ INSIDE = {
     "_processes.py": {"mdnum.provenance"},
     "learned_gradients.py": {"mdnum.md"},
     "lost_flips.py": {"mdnum.plain"},
+    "measure_documents.py": {"mdnum.provenance"},
     "make_systems.py": {"mdnum.systems.load", "mdnum.systems.structures"},
     "scaling.py": {"mdnum.safe_path"},
 }
