@@ -112,7 +112,7 @@ def _local(workers: int | None) -> _Engine:
 
 def _dask(address: str, workers: int | None) -> _Engine:
     try:
-        from distributed import Client
+        from dask.distributed import Client
     except ImportError:
         remedy = "Run python3 -m pip install distributed"
         raise InputError("dask.distributed is not installed", where=address, remedy=remedy) from None

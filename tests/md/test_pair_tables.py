@@ -204,7 +204,7 @@ def test_more_neighbors_than_atoms_are_an_error():
             atoms = len(positions)
             return np.full((slots, atoms), atoms, np.int32), np.arange(atoms), 2 * slots
 
-    with pytest.raises(CapacityError, match="16 neighbors.* 3 atoms"):
+    with pytest.raises(CapacityError, match=r"16 neighbors.* 3 atoms"):
         VerletList(Broken(), RebuildRule(0.5), 1.0, slots=8).build(np.zeros((3, 3)), Cell.create([9.0] * 3))
 
 
