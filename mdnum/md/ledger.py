@@ -27,6 +27,12 @@ class Columns:
         """Whether all columns are the same to the last bit."""
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
+    def to_pandas(self) -> Any:
+        """A DataFrame of the columns that are known; needs pandas."""
+        from pandas import DataFrame
+
+        return DataFrame({name: column for name, column in vars(self).items() if column is not None})
+
     @classmethod
     def none(cls) -> Any:
         """No row of any column; before the parts that are joined, where there may be none."""

@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
 from html import escape
 from textwrap import fill
 
@@ -16,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, NullLocator, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator, ScalarFormatter
 
 from mdnum.report.section import Figure, Plot, Region, Series
 from mdnum.report.words import MINUS, many, power, typeset
@@ -52,7 +53,8 @@ MARKS = 1500
 def draw(figure: Figure | Plot) -> Canvas:
     """A figure of a page as matplotlib has it."""
     if isinstance(figure, Plot):
-        return canvas(lambda empty: _plot(figure, empty), 3.3 if figure.region else 2.9)
+        height = 2.9 if figure.region is None else 5.6 if figure.y_names else 3.3
+        return canvas(lambda empty: _plot(figure, empty), height)
     return canvas(figure.draw, figure.height)
 
 
@@ -167,6 +169,10 @@ def _plot(plot: Plot, figure: Canvas) -> None:
     ):
         text = f"{typeset(label)} {MINUS} {base!r}" if base else typeset(label)
         setter(fill(text, 90 if setter == axes.set_xlabel else 40))
+    for axis, names in ((axes.xaxis, plot.x_names), (axes.yaxis, plot.y_names)):
+        if names:
+            axis.set_major_locator(MaxNLocator(8, integer=True))
+            axis.set_major_formatter(FuncFormatter(partial(_named, names)))
     # a line alone is named too, unless the axis names it
     if plot.region is not None or any(one.label != plot.y_label for one in plot.series):
         legend(axes)
@@ -259,14 +265,18 @@ def _series(axes: Axes, series: Series, bases: dict[str, float], covered: int) -
 def _region(axes: Axes, region: Region) -> None:
     x, y = (_edges(axis, log == "log") for axis, log in
             ((region.x, axes.get_xscale()), (region.y, axes.get_yscale())))  # fmt: skip
-    for at, (color, word) in enumerate(zip(_CLASSES, region.words, strict=False)):
+    grades = len(region.words) - 1
+    for at, word in enumerate(region.words):
+        color, alpha = (FIRST, at / grades) if region.graded else (_CLASSES[at], 0.5)
+        if not alpha:
+            continue
         inside = (region.value == at).astype(int)
-        axes.plot([], [], "s", color=color, alpha=0.5, label=word)
+        axes.plot([], [], "s", color=color, alpha=alpha, label=word)
         for row, steps in enumerate(np.diff(inside, axis=1, prepend=0, append=0)):
             # neighbors in a row are one rectangle: a cell each would make a page heavy
             starts, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
             bars = list(zip(x[starts], x[ends] - x[starts], strict=True))
-            axes.broken_barh(bars, (y[row], y[row + 1] - y[row]), color=color, alpha=0.5, lw=0)
+            axes.broken_barh(bars, (y[row], y[row + 1] - y[row]), color=color, alpha=alpha, lw=0)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[0], y[-1])
 
@@ -279,6 +289,11 @@ def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
         [centers[:1] - half[:1], (centers[1:] + centers[:-1]) / 2, centers[-1:] + half[-1:]]
     )
     return np.exp(edges) if log else edges
+
+
+def _named(names: tuple[str, ...], value: float, _: int | None = None) -> str:
+    """The word for a place of an axis; nothing between two and beyond the last."""
+    return names[round(value)] if value == round(value) and 0 <= value < len(names) else ""
 
 
 def _decade(value: float, _: int | None = None) -> str:

@@ -164,6 +164,7 @@ class Region:
     y: np.ndarray
     value: np.ndarray  # class of each cell, shape (rows, columns)
     words: tuple[str, ...]  # what each class means, in the order 0, 1, 2, ...
+    graded: bool = False  # whether classes are grades of one thing, from none of it on
 
 
 @dataclass(frozen=True)
@@ -183,6 +184,9 @@ class Plot:
     # verticals, horizontals: marked values with a word for each
     verticals: tuple[tuple[float, str], ...] = ()
     horizontals: tuple[tuple[float, str], ...] = ()
+    # x_names, y_names: what is at 0, 1, 2, ... of an axis, in words; empty where numbers are meant
+    x_names: tuple[str, ...] = ()
+    y_names: tuple[str, ...] = ()
 
     @property
     def alt(self) -> str:

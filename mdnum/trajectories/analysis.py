@@ -26,9 +26,11 @@ from mdnum.md.ledger import FlipTable, Members
 from mdnum.reading import FrameError, UnreadableFrame
 from mdnum.trajectories.collective import Collective
 from mdnum.trajectories.frame import Box, Frame, FrameCheck
+from mdnum.trajectories.history import Contacts, History, contacts
 from mdnum.trajectories.lattice import shortest
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
 from mdnum.trajectories.repeats import RepeatedFrames, digest
+from mdnum.trajectories.residues import ByResidue, Occupancy, ResidueTracker
 from mdnum.trajectories.resolution import FLOAT32, Resolution, infer
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
 from mdnum.trajectories.topology import AtomTable, formats_of
@@ -47,6 +49,8 @@ class RuleResult:
     min_margin: Float[np.ndarray, "frames"]  # smallest |margin|, per frame, length
     initial: Members  # the pairs inside at the first frame
     last: Members  # and at the last
+    contacts: Contacts  # every stay inside, with the frames at which it begins and ends
+    occupancy: Occupancy  # the share of the frames that each pair was inside
 
     @property
     def ambiguous(self) -> float:
@@ -98,7 +102,9 @@ class NeighborFlips(AnalysisBase):
     """Which pairs entered or left a cutoff between the frames of a trajectory.
 
     After `run`, `results` has for one rule all that `RuleResult` has (`flips`, `pairs`, `near`, `min_margin`,
-    `initial`, `last`), and for several the same in each of `results.rules`; `results.resolution` says how
+    `initial`, `last`, `contacts`, `occupancy`), and for several the same in each of `results.rules`; tables
+    among them have `to_pandas()`. With by="residue" a pair is one of residues, i and j are rows of
+    `results.residues`, and `results.left_out` counts atoms that were left out; `results.resolution` says how
     finely the file tells where atoms are and `results.bound` what that does to a distance, per frame;
     `results.repeats` which frames repeat earlier ones (see `repeats.RepeatedFrames`); `results.other_box` why
     and as what the first frame's box may be read otherwise (see `Trajectory.other_box`), None for neither.
@@ -112,14 +118,16 @@ class NeighborFlips(AnalysisBase):
         r_cut: the cutoff, Å; {("O", "H"): 2.5} for pairs of species; a list of them for several at once.
         other: with it, pairs of one atom of each group; atoms may be in both.
         rule: any membership rule or several, in the place of r_cut or beside it.
+        by: "residue" for contacts between residues: inside while their smallest distance is below the cutoff.
+        hydrogens: whether hydrogens and virtual sites count in contacts between residues.
         bound: how far a distance can be off, Å; None for what the resolution of the file gives, as it is
             before transformations.
         verbose: show progress.
 
     Raises:
         InputError: an empty or changing group, groups of two universes, no rule or none that can be, a
-            species that no atom has, a bound below 0. By `run` without a bound: transformations change
-            distances, or were made in memory.
+            species that no atom has, no residues, a bound below 0. By `run` without a bound: transformations
+            change distances, or were made in memory.
 
     Error: MDAnalysis hands coordinates over in float32; from there on everything is float64.
     """
@@ -138,6 +146,8 @@ class NeighborFlips(AnalysisBase):
         *,
         other: Any = None,
         rule: Rule | Sequence[Rule] | None = None,
+        by: str = "atom",
+        hydrogens: bool = False,
         bound: float | None = None,
         verbose: bool = False,
     ):
@@ -160,6 +170,13 @@ class NeighborFlips(AnalysisBase):
             for one in self.rules:
                 # refuses a species that no atom has
                 one.table(self._species)
+        self._residues = None
+        if by == "residue":
+            table, groups = AtomTable.of(group.universe.atoms), (self._first, self._second)
+            self._residues = ByResidue.make(table, groups, hydrogens, self.rules)
+            self._first, self._second = self._residues.groups
+        elif by != "atom":
+            raise InputError(f"by = {by!r}", remedy="Give 'atom' or 'residue'")
         seen = atoms_of((self._first, self._second))
         self._check = FrameCheck(seen, radius=smallest_radius(self.rules), bits=32)
         if bound is not None and not (math.isfinite(bound) and bound >= 0):
@@ -170,7 +187,7 @@ class NeighborFlips(AnalysisBase):
         self._other_box: tuple[str, Box] | None = None
         self._numbers = np.zeros(0, np.int64)
         self._at = 0
-        self._trackers: list[Tracker] = []
+        self._trackers: list[Tracker | ResidueTracker] = []
         self._library: LibraryFrames | None = None
         self._to_the_end = False
 
@@ -275,8 +292,12 @@ class NeighborFlips(AnalysisBase):
         return copy(self)
 
     def _prepare(self) -> None:
+        bound = self._bound or 0.0
         self._trackers = [
-            Tracker(rule, self._first, self._second, self._species, self._bound or 0.0) for rule in self.rules
+            Tracker(rule, self._first, self._second, self._species, bound)
+            if self._residues is None
+            else self._residues.tracker(rule, self._species, bound)
+            for rule in self.rules
         ]
         self.results.parts = [[_ProcessPart() for _ in self.rules]]
         self.results.bounds, self.results.digests = [[]], [[]]
@@ -338,6 +359,8 @@ class NeighborFlips(AnalysisBase):
             del results[name]
         results.failure = failures[failed[0]] if failed else self._behind_the_last()
         results.rules, results.bound, results.resolution = found, bound, self._resolution
+        if self._residues is not None:
+            results.residues, results.left_out = self._residues.names, self._residues.left_out
         if len(found) == 1:
             for name, value in vars(found[0]).items():
                 results[name] = value
@@ -388,7 +411,9 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
     rows = np.array([row for part in parts for row in part.rows], float).reshape(-1, 3)
     initial, none = parts[0].first if parts else None, Members.none()
     pairs, near = rows[:, :2].T.astype(np.int64)
-    return RuleResult(rule, table, pairs, near, rows[:, 2], initial or none, last or none)
+    stays = contacts(History.of(table, initial or none, max(done, 1)))
+    occupancy = Occupancy.of(stays, done)
+    return RuleResult(rule, table, pairs, near, rows[:, 2], initial or none, last or none, stays, occupancy)
 
 
 def _group_of(atoms: Any, name: str) -> AtomGroup:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from mdnum.trajectories.history import crossings
 from mdnum.trajectories.images import NARROW, ImageFlips
 from mdnum.trajectories.lattice import Placed, lattice_of
 from mdnum.trajectories.repeats import RepeatedFrames
+from mdnum.trajectories.residues import ByResidue, ResidueTracker
 from mdnum.trajectories.resolution import Resolution
 from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs, smallest_radius
 from mdnum.trajectories.search import image_distances
@@ -38,6 +40,7 @@ from mdnum.trajectories.separation import (
 )
 from mdnum.trajectories.tracker import Groups, Tracker, atoms_of
 from mdnum.trajectories.trajectory import Trajectory
+from mdnum.trajectories.unwrapping import Unwrapping
 
 Pair = tuple[int, int, int]
 #: Takes rows of a table: its name and equally long columns.
@@ -138,7 +141,7 @@ class Followed:
     """One rule on its way through the frames."""
 
     rule: Rule
-    tracker: Tracker  # of it
+    tracker: Tracker | ResidueTracker  # of it
     neighbors: NeighborCounts | None = None  # known from the first frame on
     flux: list[tuple[int, float]] = field(default_factory=list)  # (flips, moment) where velocities were used
     reach: float = float("nan")  # the usual distance of a pair at the threshold, length; nan without one
@@ -164,9 +167,12 @@ class Pass:
 
 
 def follow(
-    trajectory: Trajectory, rules: Sequence[Rule], groups: Groups, resolution: Resolution, sink: Sink
-) -> Iterator[Pass]:
-    """Reads the frames once, handing rows of "members", "flips" and "frames" to the sink as they come.
+    trajectory: Trajectory, rules: Sequence[Rule], groups: Groups, resolution: Resolution, sink: Sink,
+    residues: ByResidue | None = None,
+) -> Iterator[Pass]:  # fmt: skip
+    """Reads the frames once, handing rows of "members", "flips", "frames" and "motion" to the sink.
+
+    With residues pairs are theirs, of the atoms that they hold; the groups are still of atoms.
 
     Yields the same `Pass` after each frame, and can be left then. Memory is that of one frame and the
     trackers', however many frames there are. A frame that cannot be read or used ends it; what came before
@@ -176,8 +182,13 @@ def follow(
         InputError: the first frame cannot be read or used: there is nothing to keep.
     """
     species = [str(one) for one in trajectory.species]
-    found = Pass([Followed(rule, Tracker(rule, *groups, species)) for rule in rules])
+    made, size = (lambda rule: Tracker(rule, *groups, species)), (trajectory.atoms, groups)
+    if residues is not None:
+        groups, size = residues.groups, (len(residues.table), residues.sides)
+        made = partial(residues.tracker, species=species)
+    found = Pass([Followed(rule, made(rule)) for rule in rules])
     atoms, last = atoms_of(groups), None
+    unwrapping = Unwrapping(atoms)
     # frames whose velocities are used: spread over the file, or ever fewer if its end is not known
     count, measured = trajectory.count, {0, *(2**n for n in range(_FLUX_FRAMES - 1))}
     if count is not None:
@@ -200,9 +211,12 @@ def follow(
             if (far := leap(last, frame, atoms)) is not None:
                 found.leaps.append({"frame": frame.index, "atom": far[0], "distance": far[1]})
         last = frame
+        if (row := unwrapping.see(frame)) is not None:
+            row |= {"frame": found.frames, "number": frame.index, "time": frame.time}
+            sink("motion", {name: np.array([value]) for name, value in row.items()})
         for number, (one, new) in enumerate(zip(found.rules, stepped, strict=True)):
-            _hand_on(sink, number, one, new, frame, found.frames, (trajectory.atoms, groups))
-            if found.frames in measured:
+            _hand_on(sink, number, one, new, frame, found.frames, size)
+            if found.frames in measured and residues is None:
                 _measure_flux(one, frame, groups, species)
         found.frames += 1
         yield found
@@ -216,14 +230,15 @@ def _hand_on(
         members = one.tracker.members()
         one.neighbors = NeighborCounts(members, *size, one.rule.directed)
         one.reach, one.ranked = _threshold(one.rule, members)
-        if not one.rule.directed and lattice_of(frame.box).narrowest < NARROW * one.rule.reach:
+        narrow = lattice_of(frame.box).narrowest < NARROW * one.rule.reach
+        if narrow and isinstance(one.tracker, Tracker) and not one.rule.directed:
             one.images = ImageFlips()
         sink("members", {"rule": np.full(len(members), number), **vars(members)})
     else:
         one.neighbors.step(flips)
     if len(flips):
         sink("flips", flips.columns(number))
-    if one.images is not None and (rows := one.images.step(frame, one.tracker)) is not None:
+    if one.images is not None and (rows := one.images.step(frame, one.tracker.members())) is not None:
         same = {"rule": number, "frame": at}
         sink("images", {**{name: np.full(len(rows["i"]), value) for name, value in same.items()}, **rows})
     fewest, mean, most = one.neighbors.count()

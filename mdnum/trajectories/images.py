@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from mdnum.md.ledger import Members
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.tracker import Tracker
 
 #: Width of a box over the reach below which pairs are followed by shift; above 2, since a box may shrink.
 NARROW = 2.2
@@ -66,9 +66,9 @@ class ImageFlips:
     def __init__(self) -> None:
         self._before: tuple[Frame, np.ndarray] | None = None
 
-    def step(self, frame: Frame, tracker: Tracker) -> dict[str, Any] | None:
-        """Columns of the flips of a frame, None without any; the tracker is that of a symmetric rule."""
-        pairs, (matrix, inverse) = tracker.members(), cell_of(frame)
+    def step(self, frame: Frame, pairs: Members) -> dict[str, Any] | None:
+        """Columns of the flips of a frame, None without any; pairs inside are those of a symmetric rule."""
+        matrix, inverse = cell_of(frame)
         now = np.column_stack([pairs.i, pairs.j, image_shifts(frame, pairs)])
         known, self._before = self._before, (frame, now)
         if known is None:

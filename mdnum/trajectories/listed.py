@@ -20,6 +20,7 @@ from mdnum.trajectories.arrays import host
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.images import cell_of, image_shifts
 from mdnum.trajectories.lattice import Placed, lattice_of
+from mdnum.trajectories.residues import ResidueTracker
 from mdnum.trajectories.rules import Rule
 from mdnum.trajectories.search import image_distances
 from mdnum.trajectories.tracker import Tracker
@@ -199,7 +200,12 @@ class ListCheck:
         return self._newest
 
     def step(
-        self, frame: Frame, at: int, tracker: Tracker, flips: Mapping[str, np.ndarray], now: GivenList
+        self,
+        frame: Frame,
+        at: int,
+        tracker: Tracker | ResidueTracker,
+        flips: Mapping[str, np.ndarray],
+        now: GivenList,
     ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """(what is known of the list at a frame, rows of pairs that were missing up to the one before).
 

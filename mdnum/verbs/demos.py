@@ -179,7 +179,7 @@ def _plots(document: Mapping[str, Any], curves: Mapping[str, np.ndarray]) -> Ite
             series.append(Series(x=curves["x"][at], y=curves["y"][at], **one))
         region = stored["region"]
         if region is not None:
-            arrays = {key: np.array(region[key]) for key in ("x", "y", "value")}
+            arrays: dict[str, Any] = {key: np.array(region[key]) for key in ("x", "y", "value")}
             region = Region(words=tuple(region["words"]), **arrays)
         marks = {key: tuple(map(tuple, stored[key])) for key in ("verticals", "horizontals")}
         name = f"{document['name']}-{stored['name']}"

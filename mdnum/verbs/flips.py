@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Pass
     from mdnum.trajectories.history import History
     from mdnum.trajectories.lost import FrameMotion
+    from mdnum.trajectories.residues import ByResidue
     from mdnum.trajectories.rules import Rule
     from mdnum.trajectories.statistics import Classes, Statistics
     from mdnum.trajectories.topology import AtomTable
@@ -39,6 +40,8 @@ _SECONDS = {"fs": 1e-15, "ps": 1e-12, "ns": 1e-9, "μs": 1e-6, "s": 1.0}
 _SHORTEST, _LONGEST = 1e-19, 1e-2
 # rows of the ledger that are worked on at once, and such parts that are held, at 22 bytes a row
 _PART_ROWS, _PARTS_HELD = 1_500_000, 10
+# places at which frames are missing that are named
+_GAPS = 6
 # an odd number, so that the parts of a crystal's regular labels are alike
 _SPREAD = 1_000_003
 # files that hold positions and nothing on what the atoms are
@@ -69,6 +72,8 @@ def flips(
     nearest: int | Sequence[int] = (),
     most: int | None = None,
     between: tuple[str, str] | None = None,
+    by: str = "atom",
+    hydrogens: bool = False,
     window: int = WINDOW,
     format: str | None = None,
     drop_repeats: bool = False,
@@ -97,6 +102,8 @@ def flips(
         nearest: numbers of neighbors, a rule each: the k nearest of every atom.
         most: neighbors an atom can have inside a cutoff; the nearest are kept.
         between: two selections in MDAnalysis's language; only pairs with an atom in each are examined.
+        by: what pairs are of, "atom" or "residue"; two residues are inside while their smallest distance is.
+        hydrogens: whether hydrogens and virtual sites count in contacts between residues.
         window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
             overlooked in an intermittent contact.
         format: of the files, where their names do not tell.
@@ -114,6 +121,10 @@ def flips(
 
     if window < 1:
         raise InputError(f"window = {window}; expected at least 1 frame")
+    if by not in ("atom", "residue"):
+        raise InputError(f"by = {by!r}", remedy="Write atom or residue")
+    if by == "atom":
+        refuse({"hydrogens": hydrogens}, "of contacts between residues", "Add --by residue, or leave it out")
     files = {"other": other is not None, "topology": topology is not None, "format": format is not None}
     arrays: dict[str, Any] = {
         "cell": cell, "box": box, "pbc": pbc, "fractional": fractional, "species": species,
@@ -130,6 +141,7 @@ def flips(
         if other is not None:
             from mdnum.verbs.flips_compare import compare
 
+            refuse({"by": by != "atom"}, "of one trajectory", "Leave it out, or examine each by itself")
             _refuse_topology_first(trajectory, other, topology)
             a, b = map(open_one, (trajectory, other))
             a.drop_repeats = b.drop_repeats = drop_repeats
@@ -137,7 +149,8 @@ def flips(
         reach = max((one.reach for one in asked), default=0.0)
         opened = ArrayFrames.of(trajectory, reach, **arrays) if in_memory else open_one(trajectory)
         opened.drop_repeats = drop_repeats
-        with examining(opened, asked or _default_rules(opened), between, window, **keep) as one:
+        asked, light = asked or _default_rules(opened), hydrogens if by == "residue" else None
+        with examining(opened, asked, between, window, hydrogens=light, **keep) as one:
             of = opened.count or 0
             one.interrupted = one.rows.drain(one.answer.folder, one.passes, one.found, of, one.answer.log)
     return one.answer.outcome
@@ -157,28 +170,39 @@ class FrameExamination:
 @contextmanager
 def examining(
     opened: Trajectory, asked: tuple[Rule, ...], between: tuple[str, str] | None, window: int,
-    live: bool = False, **keep: Unpack[Keep],
+    live: bool = False, hydrogens: bool | None = None, **keep: Unpack[Keep],
 ) -> Iterator[FrameExamination]:  # fmt: skip
     """A new folder whose tables are filled inside, with what follows from them; arguments as of `flips`.
 
     Args:
         live: whether frames are those of a program that runs: their numbers are steps, between which it
             decides nothing, and it may be killed, so that rows are kept in part files.
+        hydrogens: whether they count in contacts between residues; None for pairs of atoms.
     """
     from mdnum.trajectories.follow import follow
     from mdnum.trajectories.lost import FrameMotion
+    from mdnum.trajectories.residues import ByResidue
     from mdnum.trajectories.resolution import grid_effect, infer
+    from mdnum.trajectories.unwrapping import told as told_of_motion
 
-    groups = selected(opened, between)
-    sample = opened.sample()
+    groups, residues = selected(opened, between), None
+    if hydrogens is not None:
+        residues = ByResidue.make(opened.table, groups, hydrogens, asked)
+        groups = residues.groups
+    sample, moving = (
+        opened.sample(),
+        opened.atoms
+        if groups[0] is None
+        else len(np.union1d(groups[0], groups[0] if groups[1] is None else groups[1])),
+    )
     resolution = infer(sample, opened.bits, opened.format)
     rows = HeldRows(opened)
-    passes = follow(opened, asked, groups, resolution, rows.add)
+    passes = follow(opened, asked, groups, resolution, rows.add, residues)
     # no folder for a file whose first frame cannot be used
     found, began = next(passes), time.perf_counter()
     with answering("flips", f"flips-{stem(opened)}", **keep) as answer:
         folder, log = answer.folder, answer.log
-        folder.in_parts, atoms = live, opened.table.columns
+        folder.in_parts, atoms = live, (residues or opened).table.columns
         for end in "ij":
             folder.look_up("flips", end, {f"{name}_{end}": values for name, values in atoms.items()})
         yield (one := FrameExamination(answer, rows, passes, found))
@@ -188,14 +212,21 @@ def examining(
         timed = steps["timed"] and found.odd is None
         motion = FrameMotion.of(sample, resolution, *groups, timed=timed)
         told: list[dict[str, Any]] = [
-            _rule_told(folder, number, rule, found, frames, steps, opened, groups, window, motion, log)
-            | {"grid": grid_effect(resolution, sample, rule.reach, *groups, ranked=rule.ranked)}
+            _rule_told(
+                folder, number, rule, found, frames, steps, opened, residues or groups, window, motion, log
+            )
+            | {
+                "grid": None
+                if residues
+                else grid_effect(resolution, sample, rule.reach, *groups, ranked=rule.ranked)
+            }
             for number, rule in enumerate(found.rules)
         ]
         if live and (np.diff(frames["number"][frames["rule"] == 0]) == 1).all():
             told = [each | {"stride": {**each["stride"], "between": None}} for each in told]
         answer.result, answer.summary = found, {
             **about(opened, "flips", between),
+            **({"by": "residue", "left_out": residues.left_out} if residues else {}),
             "box": sample[0].box.plain(),
             "frames": found.frames,
             **steps,
@@ -204,8 +235,9 @@ def examining(
             "rules": told,
             "flight": found.odd,
             "leaps": {"frames": len(found.leaps), **found.leaps[0]} if found.leaps else None,
-            "alternative_box": _with_other_box(opened, sample[0], found, groups),
+            "alternative_box": _with_other_box(opened, sample[0], found, residues or groups),
             "repeats": opened.repeats.plain(),
+            "unwrapping": told_of_motion(folder.read("motion"), moving, steps["timed"]),
             "retyped": opened.check.retyped,
             "cut_short": _cut_short(found.stopped, opened),
             **ending(found.stopped, one.interrupted, opened.in_memory),
@@ -316,13 +348,19 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
 # ---- the ledger, and what is counted from it
 
 
-def _with_other_box(trajectory: Trajectory, frame: Any, found: Pass, groups: Groups) -> dict[str, Any] | None:
+def _with_other_box(
+    trajectory: Trajectory, frame: Any, found: Pass, of: Groups | ByResidue
+) -> dict[str, Any] | None:
     """The pairs of each rule in a frame with another box that it may be taken to have; None without one."""
     from mdnum.trajectories.tracker import Tracker
 
     if (other := trajectory.other_box(frame.index)) is None:
         return None
-    trackers = [Tracker(one.rule, *groups, list(map(str, trajectory.species))) for one in found.rules]
+    species = list(map(str, trajectory.species))
+    trackers: list[Any] = [
+        Tracker(one.rule, *of, species) if isinstance(of, tuple) else of.tracker(one.rule, species)
+        for one in found.rules
+    ]
     for one in trackers:
         one.step(replace(frame, box=other[1]))
     pairs = [one.pairs for one in trackers]
@@ -346,6 +384,7 @@ def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str
     times = frames["time"][frames["rule"] == 0]
     steps = np.diff(times)
     interval = float((times[-1] - times[0]) / len(steps)) if len(steps) else math.nan
+    numbers = frames["number"][frames["rule"] == 0]
     backward = int(np.count_nonzero(steps <= 0))
     seconds = abs(interval) * _SECONDS.get(trajectory.time, math.nan)
     absurd, swapped = bool(seconds > _LONGEST or 0 < seconds < _SHORTEST), interval * trajectory.swapped
@@ -360,7 +399,26 @@ def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str
         "interval": interval,
         "even": bool(np.all(np.abs(steps - interval) <= 1e-3 * abs(interval))) if len(steps) else True,
         "backward": backward,
+        "missing": _missing(numbers, times) if timed and not backward else None,
     }
+
+
+def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
+    """Where frames are missing, if any are: most are evenly spaced, others whole multiples of that apart."""
+    steps = np.diff(times)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    ratio = steps / usual if usual > 0 else np.ones_like(steps)
+    whole = np.rint(ratio)
+    if not len(steps) or (np.abs(ratio - whole) > 0.01).any() or 4 * (whole > 1).sum() > len(steps):
+        return None
+    places = [
+        {"after": int(numbers[k]), "lost": int(whole[k]) - 1, "time": float(times[k])}
+        for k in np.flatnonzero(whole > 1)
+    ]
+    total = sum(one["lost"] for one in places)
+    return (
+        {"frames": total, "usual": usual, "gaps": len(places), "places": places[:_GAPS]} if places else None
+    )
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
@@ -404,16 +462,22 @@ def _rule_told(
     frames: Mapping[str, np.ndarray],
     steps: Mapping[str, Any],
     trajectory: Trajectory,
-    groups: Groups,
+    of: Groups | ByResidue,
     window: int,
     motion: FrameMotion | None,
     log: Progress,
 ) -> dict[str, Any]:
     """What one rule's ledger says, worked out pair by pair; its tables go into the folder."""
+    from mdnum.trajectories.residues import Occupancy, contacts_over_time
     from mdnum.trajectories.statistics import Labels, Statistics
 
     assert one.neighbors is not None
-    labels, total = Labels.of(trajectory.table), None
+    residues = None if isinstance(of, tuple) else of
+    table, groups = (trajectory.table, of) if isinstance(of, tuple) else (of.table, of.sides)
+    labels, total, moments = Labels.of(table), None, None
+    if residues is not None:
+        # the species of a residue is its name
+        labels = replace(labels, residue_names=None)
 
     def append(table: str, columns: Mapping[str, Any]) -> None:
         length = len(next(iter(columns.values())))
@@ -422,6 +486,12 @@ def _rule_told(
     for part, parts, history in histories(folder, number, found.frames):
         total, stays = Statistics.of(history, labels, one.rule.directed, window, total)
         append("contacts", vars(stays))
+        if residues is not None:
+            pairs = Occupancy.of(stays, found.frames)
+            words = {name: _words(table, end) for name, end in (("first", pairs.i), ("second", pairs.j))}
+            append("occupancy", {**vars(pairs), **words})
+            begin, now = contacts_over_time(stays, len(table), found.frames)
+            moments = now if moments is None else moments + now
         log(part + 1, parts, {"phase": "counting contacts", "unit": "parts"})
     assert total is not None, "there is at least one part"
     rows = {name: values[frames["rule"] == number] for name, values in frames.items()}
@@ -429,8 +499,14 @@ def _rule_told(
     append("neighbors", {"neighbors": seen, "counted": one.neighbors.seen[seen]})
     append("lifetimes", total.curves(rows["pairs"], steps["interval"]))
     busiest = vars(total.busiest)
-    first, second = (_atom_words(trajectory.table, busiest[of]) for of in "ij")
+    first, second = (_words(table, busiest[end]) for end in "ij")
     append("busiest", {**busiest, "first": first, "second": second})
+    if moments is not None and moments.any():
+        ever = np.flatnonzero(moments.any(axis=1))
+        columns = {"residue": np.array(_words(table, ever), object), "index": ever}
+        columns = {name: np.repeat(values, len(begin)) for name, values in columns.items()}
+        when = {"frame": np.tile(begin, len(ever)), "time": np.tile(rows["time"][begin], len(ever))}
+        append("moments", {**columns, **when, "contacts": moments[ever].ravel()})
     if total.residues is not None and labels.residues is not None:
         between, within = total.residues.between, total.residues.within
         busy = np.flatnonzero(between + within)
@@ -454,7 +530,7 @@ def _rule_told(
             "most": int(rows["most"].max()),
         },
         "flux": (flux := _flux(one, entered + left, steps, found)),
-        **_counted(total, motion, flux, one.reach),
+        **_counted(total, motion, flux, one.reach if residues is None else None),
     }  # fmt: skip
     for name, coded in (("by_species", labels.species), ("by_residue_name", labels.residue_names)):
         if coded is not None:
@@ -463,14 +539,15 @@ def _rule_told(
 
 
 def _counted(
-    total: Statistics, motion: FrameMotion | None, flux: Mapping[str, Any] | None, reach: float
+    total: Statistics, motion: FrameMotion | None, flux: Mapping[str, Any] | None, reach: float | None
 ) -> dict[str, Any]:
-    """Plain values of what was counted, lengths of time in frames."""
+    """Plain values of what was counted, lengths of time in frames; what is lost is estimated with a reach."""
     from mdnum.trajectories.lost import lost_flips
     from mdnum.trajectories.statistics import Lifetime
 
     durations, chatter = total.durations, total.chatter
-    between = lost_flips(total.strides, motion, flux, reach)
+    # how well it is estimated was measured of pairs of atoms alone
+    between = None if reach is None else lost_flips(total.strides, motion, flux, reach)
     return {
         "pairs_flipped": total.pairs,
         "images": total.images,
@@ -490,10 +567,10 @@ def _counted(
     }  # fmt: skip
 
 
-def _atom_words(table: AtomTable, atoms: np.ndarray) -> list[str]:
-    """What atoms are called: "GLY 12 CA", or their names where there are no residues."""
+def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
+    """What atoms are called: "GLY 12 CA", or their names where there are no residues; residues "GLY 12"."""
     rows = ((table.residue_names[at], table.residue_ids[at], table.names[at]) for at in atoms)
-    return [f"{residue} {number} {name}" if residue else str(name) for residue, number, name in rows]
+    return [f"{residue} {number} {name}".rstrip() if residue else str(name) for residue, number, name in rows]
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:

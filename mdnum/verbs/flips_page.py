@@ -11,11 +11,15 @@ import numpy as np
 
 from mdnum.report.browse import Browse
 from mdnum.report.finding import Finding, Verdict, conclude
-from mdnum.report.section import Page, Plot, Section, Series, Table, curves, pairs, table_of
+from mdnum.report.section import Page, Plot, Region, Section, Series, Table, curves, pairs, table_of
 from mdnum.report.words import count, listed, many, number, percent, plain
 from mdnum.verbs import flips_loop
 from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, in_python, repeating, resolution
 
+#: Motion at a frame over that around it from which on a seam is one of motion.
+SEAM = 5.0
+#: Residues in a map of contacts.
+SHOWN = 300
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
 UNDECIDED = 0.02
 #: The same for flips lost between frames, and for those that are reversed at once.
@@ -28,6 +32,8 @@ FEW = 20
 _HARDLY = 1e-3
 # rules with evidence, and with figures of their own; rows of a table; frames from which on flips are averaged
 _TOLD, _DRAWN, _ROWS, _DENSE = 3, 4, 15, 400
+# frames that do not follow others and are named
+_SEAMS = 4
 _ORDER = ("error", "warning", "info")
 
 Rule = Mapping[str, Any]
@@ -61,7 +67,13 @@ def _headline(view: FlipsView) -> str:
         code = "no_flips" if any(one["pairs_most"] for one in every) else "no_contact"
         return TEXTS(code, frames=summary["frames"], rule=view.rule(every[0]))
     frames, rule = summary["frames"], view.rule(one)
-    parts = [TEXTS("flips", flips=one["flips"], pairs=one["pairs_flipped"], frames=frames, rule=rule)]
+    values = {
+        "flips": one["flips"],
+        "pairs": one["pairs_flipped"],
+        "entered": one["entered"],
+        "left": one["left"],
+    }
+    parts = [TEXTS("flips_residue" if view.by_residue else "flips", **values, frames=frames, rule=rule)]
     if one["flips"] >= FEW:
         between = one["stride"]["between"]
         if between and (between["lost"] or 0.0) > LOST:
@@ -74,6 +86,9 @@ def _headline(view: FlipsView) -> str:
 
 def _evidence(view: FlipsView) -> Iterator[str]:
     yield resolution(view.summary["resolution"], view.unit)
+    if view.by_residue:
+        without = [many(count, what.removesuffix("s")) for what, count in view.summary["left_out"].items()]
+        yield TEXTS("by_residue", without=listed(without) if without else "nothing")
     if (lists := view.summary.get("lists")) and not lists["lost"]:
         yield TEXTS("none_lost", **lists)
     for place, one in enumerate(view.summary["rules"][:_TOLD]):
@@ -188,6 +203,13 @@ def _others(view: FlipsView) -> Iterator[Finding]:
         told = "; ".join(TEXTS("box_pairs", **one) for one in counts)
         yield TEXTS.finding(other["code"], *same, pairs=told, **values)
     yield from view.repeated(summary.get("repeats"))
+    if across := summary.get("unwrapping"):
+        if seams := across["seams"]:
+            kinds = ["moved" if one["times"] > SEAM else "wrapped" for one in seams[:_SEAMS]]
+            told = [TEXTS(f"seam_{kind}", **one) for kind, one in zip(kinds, seams, strict=False)]
+            yield TEXTS.finding("RESTART_SEAM", seams=len(seams), places="; ".join(told))
+        if across["not_whole"]:
+            yield TEXTS.finding("JUMPS_NOT_WHOLE", **across)
     if summary.get("retyped"):
         yield TEXTS.finding("TYPES_CHANGE", **dict(zip(("frame", "atom"), summary["retyped"], strict=True)))
     if leaps:
@@ -210,6 +232,18 @@ def _others(view: FlipsView) -> Iterator[Finding]:
             yield TEXTS.finding("TIMES_ODD", *["swapped"] * bool(swapped), **values)
         elif summary["backward"]:
             yield _time_goes_back(view)
+        elif missing := summary.get("missing"):
+            told = [
+                TEXTS("missing_at", **one | {"time": view.time(plain(one["time"], 9))})
+                for one in missing["places"]
+            ]
+            rest = missing["gaps"] - len(told)
+            values: dict[str, Any] = {
+                "places": listed(told),
+                "more": f", and {many(rest, 'other gap')}" if rest else "",
+            }
+            usual = view.time(plain(missing["usual"], 6))
+            yield TEXTS.finding("MISSING_FRAMES", frames=missing["frames"], usual=usual, **values)
         elif not summary["even"]:
             yield TEXTS.finding("UNEVEN_FRAMES", interval=view.duration(1))
     axes = repeating(summary["box"])
@@ -251,9 +285,12 @@ def page(view: FlipsView, verdict: Verdict) -> Page:
     sections = [Section("Rules", [_rules(view)], terminal=True), *flips_loop.sections(view)]
     for place, one in enumerate(summary["rules"]):
         sections += _rule_sections(view, place, one)
+    if across := summary.get("unwrapping"):
+        sections.append(_across(view, across))
     if (browsed := _busiest(view)) is not None:
         sections.append(Section("The busiest pairs", [browsed]))
-    sections.append(Section("What was read", [pairs(_input(view, size)), TEXTS("files")]))
+    files = [TEXTS("files"), *([TEXTS("files_residue")] if view.by_residue else [])]
+    sections.append(Section("What was read", [pairs(_input(view, size)), *files]))
     about = f"{size}; {summary['format']}, read by {summary['reader']}"
     one = summary["rules"][0]
     keys = TEXTS.keys(**{
@@ -275,6 +312,21 @@ def _input(view: FlipsView, size: str) -> list[tuple[str, str]]:
     return TEXTS.rows("input", **{**summary, **values})
 
 
+def _across(view: FlipsView, across: Mapping[str, Any]) -> Section:
+    """Jumps between cells of the box, and diffusion with them undone and not."""
+    diffusion, time = across["diffusion"] or {}, view.summary["time"]
+    values = {"raw": None, "undone": None, "error": None, **across, **diffusion}
+    values["too_far"] = TEXTS("too_far") if across["too_far"] else None
+    values["off"] = across["off"] if across["split"] else None
+    parts: list[Any] = [pairs(TEXTS.rows("across", unit=f"{view.unit}²/{time}", **values))]
+    if not across["too_far"]:
+        rows = view.table("motion")
+        label, x = view.axis(rows)
+        lines = {"jumps undone": rows["undone"], "as in the file": rows["raw"]}
+        parts.append(TEXTS.plot("across", curves(x, lines, log=False), along=label, unit=view.unit))
+    return Section("Across the box", parts)
+
+
 def _rules(view: FlipsView) -> Table:
     return table_of(view.summary["rules"], {
         "rule": view.rule,
@@ -294,16 +346,19 @@ def _rule_sections(view: FlipsView, place: int, one: Rule) -> Iterator[Section]:
         return Section(_title(title, view, one), [*parts, *plots.get(title, [])], level=level)
 
     yield section("Pairs and flips", pairs(_numbers(view, one)), level=2)
+    if view.by_residue and (lasting := _lasting(view, place)) is not None:
+        yield section("Contacts between residues", lasting)
     yield section("How long contacts last", pairs(_lifetimes(view, one)))
     lost = list(_lost(view, one))
     yield section("Between the frames", *([pairs(lost)] if lost else []))
-    tables = [_classes(view, "species", one["by_species"])]
+    tables = [_classes(view, "residues by name" if view.by_residue else "species", one["by_species"])]
     if one["by_residue_name"]:
         tables.append(_classes(view, "residues by name", one["by_residue_name"]))
     if len(rows := np.flatnonzero(view.table("residues")["rule"] == place)[:_ROWS]):
         table = view.table("residues")
         told = [(str(table["residue"][k]), int(table["between"][k]), int(table["within"][k])) for k in rows]
-        tables.append(Table(("residue", "flips with others", "within itself"), told))
+        heads, kept = ("residue", "flips with others", "within itself"), 2 if view.by_residue else 3
+        tables.append(Table(heads[:kept], [row[:kept] for row in told]))
     yield section("Who flips", *tables)
     if "Neighbors" in plots:
         yield section("Neighbors")
@@ -315,6 +370,7 @@ def _numbers(view: FlipsView, one: Rule) -> list[tuple[str, str]]:
         **one, **around, **one["chatter"], "per_frame": number(one["flips_per_frame"], 4),
         "neighbors": average(around["mean"]), "mean": average(one["pairs_mean"]),
         "closest": None if closest is None else view.length(closest),
+        "of": "a residue" if view.by_residue else "an atom",
     }  # fmt: skip
     return TEXTS.rows("numbers", **values)
 
@@ -390,6 +446,7 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
 
     frames, moving = rows("frames"), view.summary["frames"] > 1
     label, x = view.axis(frames)
+    of = "a residue" if view.by_residue else "an atom"
     if moving:
         inside = Series("pairs inside", x, frames["pairs"].astype(float))
         yield plot("Pairs and flips", "pairs", [inside], along=label)
@@ -429,13 +486,65 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         back = {"left again": counts["inside"], "entered again": counts["outside"]}
         lines = {label: np.array(values[1:], float) for label, values in back.items()}
         yield plot("Between the frames", "chatter", curves(after, lines, "line+points", log=False))
+    if view.by_residue:
+        for name, x_names, y_names, region in _maps(view, rows("occupancy"), rows("moments"), x):
+            section, made = plot("Contacts between residues", name, (), along=label)
+            yield section, replace(made, region=region, x_names=x_names, y_names=y_names)
     if moving and np.any(frames["fewest"] != frames["most"]):
         around = {"mean": "neighbors", "most": "most", "fewest": "fewest"}
         lines = {label: frames[name].astype(float) for label, name in around.items()}
-        yield plot("Neighbors", "neighbors", curves(x, lines, log=False), along=label)
+        yield plot("Neighbors", "neighbors", curves(x, lines, log=False), along=label, of=of)
     table = rows("neighbors")
     if len(table["neighbors"]) > 1:
         numbers = np.arange(table["neighbors"].min(), table["neighbors"].max() + 1)
         share = np.zeros(len(numbers))
         share[table["neighbors"] - numbers[0]] = table["counted"] / table["counted"].sum()
-        yield plot("Neighbors", "distribution", [Series("", numbers, share, mark="line+points")])
+        distribution = [Series("", numbers, share, mark="line+points")]
+        yield plot("Neighbors", "distribution", distribution, of=of)
+
+
+def _lasting(view: FlipsView, place: int) -> Table | None:
+    """The pairs of residues that were in contact most of the time; None where none ever was."""
+    table, frames = view.table("occupancy"), view.summary["frames"]
+    rows = np.flatnonzero(table["rule"] == place)
+    # those throughout are most often neighbors along a chain
+    order = np.lexsort((-table["share"][rows], -(table["formed"] + table["broken"])[rows]))
+    picked = [{name: values[k] for name, values in table.items()} for k in rows[order][:_ROWS]]
+    return None if not picked else table_of(picked, {
+        "residues": lambda one: f"{one['first']} – {one['second']}",
+        "in contact": lambda one: percent(one["inside"] / frames),
+        "formed": "formed", "broken": "broken",
+    })  # fmt: skip
+
+
+def _maps(
+    view: FlipsView, pairs: Mapping[str, np.ndarray], moments: Mapping[str, np.ndarray], x: np.ndarray
+) -> Iterator[tuple[str, tuple[str, ...], tuple[str, ...], Region]]:
+    """(name, words along x and y, map) of the contact matrix and of contacts over time."""
+    index, first = np.unique(moments["index"], return_index=True)
+    if not len(index):
+        return
+    words = moments["residue"][first].astype(str)
+    # in large systems those whose contacts change most
+    changes = np.zeros(index[-1] + 1, np.int64)
+    for end in "ij":
+        np.add.at(changes, pairs[end], pairs["formed"] + pairs["broken"])
+    kept = np.sort(np.argsort(-changes[index], kind="stable")[:SHOWN])
+    place = np.full(index[-1] + 1, -1)
+    place[index[kept]] = np.arange(len(kept))
+    names = tuple(words[kept].tolist())
+    i, j = place[pairs["i"]], place[pairs["j"]]
+    both = (i >= 0) & (j >= 0)
+    grades = np.zeros((len(kept), len(kept)), np.int64)
+    grades[i[both], j[both]] = grades[j[both], i[both]] = np.ceil(4 * pairs["share"][both]).astype(np.int64)
+    steps, at = ("never", "up to 25 % of frames", "to 50 %", "to 75 %", "more"), np.arange(len(kept))
+    yield "matrix", names, names, Region(at, at, grades, steps, graded=True)
+    mine = np.isin(moments["index"], index[kept])
+    counts = moments["contacts"][mine].reshape(len(kept), -1)
+    if counts.shape[1] < 2:
+        return
+    top = max(counts.max(), 1.0)
+    grades = np.ceil(4 * counts / top).astype(np.int64)
+    steps = ("none", *(f"up to {number(top * k / 4, 2)}" for k in range(1, 5)))
+    when = x[moments["frame"][mine][: counts.shape[1]]]
+    yield "moments", (), names, Region(when, at, grades, steps, graded=True)

@@ -154,6 +154,11 @@ class FlipsView(View):
         return bool(self.summary["timed"] and self.summary["interval"])
 
     @property
+    def by_residue(self) -> bool:
+        """Whether pairs are of residues."""
+        return self.summary.get("by") == "residue"
+
+    @property
     def unit(self) -> str:
         """The unit of length."""
         return self.summary["length"]

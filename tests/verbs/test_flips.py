@@ -239,7 +239,7 @@ def test_one_frame_no_flips_and_odd_times(examined) -> None:
     assert single.summary["frames"] == 1 and single.summary["rules"][0]["flips"] == 0
     assert examined("gas.extxyz", frames, cutoffs=[1e-3]).summary["rules"][0]["flips"] == 0
     assert "TIME_GOES_BACK" in codes(examined("twice.extxyz", frames[:15] + frames[10:]))
-    assert "UNEVEN_FRAMES" in codes(examined("uneven.extxyz", frames[:10] + frames[12:]))
+    assert "MISSING_FRAMES" in codes(examined("missing.extxyz", frames[:10] + frames[12:]))
 
 
 def test_a_coarse_file_is_one(examined) -> None:

@@ -1,0 +1,265 @@
+"""Contacts between residues: two are in contact where their nearest atoms are within the cutoff.
+
+A pair of residues is inside while any of its pairs of atoms is, so that the decisions are those on atoms; the
+ledger has the smallest distances. Hydrogens and virtual sites are left out unless they are wanted: where they
+are depends on constraints and on who wrote the file, and the cutoffs in use are meant for heavy atoms.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mdnum.errors import InputError
+from mdnum.md.ledger import Columns, FlipTable, Members
+from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.history import Contacts
+from mdnum.trajectories.lattice import Placed, lattice_of
+from mdnum.trajectories.rules import Rule
+from mdnum.trajectories.search import image_distances
+from mdnum.trajectories.topology import AtomTable
+from mdnum.trajectories.tracker import Groups, Tracker
+
+# sites that no atom is at, by the names of GROMACS, AMBER and CHARMM; the last two of water alone
+_VIRTUAL = re.compile(r"MW\d*|EPW?\d*|LP[A-Z]?\d*|MCH3|MNH3|DUM\w*")
+_OF_WATER, _WATER = frozenset({"M", "OM"}), re.compile(r"HOH|WAT|SOL|H2O|TIP\w*|TP\w*|OPC\w*")
+#: Points in time of a map of contacts.
+MOMENTS = 200
+# pairs of residues whose atoms are examined together
+_TOGETHER = 20_000
+
+
+@dataclass(frozen=True)
+class ByResidue:
+    """Residues in the place of atoms."""
+
+    of: Int[np.ndarray, "atoms"]  # residue of each atom of the file
+    table: AtomTable  # of the residues, an entry each
+    groups: Groups  # atoms on either side, without those that are left out
+    left_out: dict[str, int]  # atoms by why
+
+    @classmethod
+    def make(cls, table: AtomTable, groups: Groups, hydrogens: bool, rules: Sequence[Rule]) -> ByResidue:
+        """The residues of a file; `hydrogens` keeps hydrogens and virtual sites.
+
+        Raises:
+            InputError: the file has no residues, no atom is left, or a rule knows no pairs of residues.
+        """
+        if len(table) and not any(table.residue_names):
+            remedy = "Give a topology that has residues with -s TOPOLOGY"
+            raise InputError("the file has no residues to look for contacts between", remedy=remedy)
+        if directed := [one.name for one in rules if one.directed]:
+            remedy = "Use --cutoff, or --pairs for cutoffs by species"
+            raise InputError(f"{directed[0]} is a rule for atoms, not for residues", remedy=remedy)
+        light, virtual = left_out(table)
+        kept = np.ones(len(table), bool) if hydrogens else ~(light | virtual)
+        every = np.arange(len(table)) if groups[0] is None else groups[0]
+        sides = [None if side is None else side[kept[side]] for side in (every, groups[1])]
+        if any(side is not None and not len(side) for side in sides):
+            remedy = "Add --hydrogens, or select other atoms"
+            raise InputError("no atom is left without hydrogens and virtual sites", remedy=remedy)
+        chosen = np.union1d(every, every if groups[1] is None else groups[1])
+        counts = {"hydrogens": light[chosen], "virtual sites": virtual[chosen]}
+        told = {} if hydrogens else {name: int(some.sum()) for name, some in counts.items() if some.any()}
+        return cls(table.residues, of_residues(table), (sides[0], sides[1]), told)
+
+    @property
+    def names(self) -> ResidueNames:
+        """What the residues are called."""
+        table = self.table
+        return ResidueNames(table.residues, table.residue_names, table.residue_ids, table.segments)
+
+    @property
+    def sides(self) -> Groups:
+        """Residues on either side."""
+        first, second = (None if side is None else np.unique(self.of[side]) for side in self.groups)
+        return first, second
+
+    def tracker(self, rule: Rule, species: Sequence[str] | None, bound: float = 0.0) -> ResidueTracker:
+        """Who follows the contacts by a rule."""
+        return ResidueTracker(rule, self, species, bound)
+
+
+def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarray, "atoms"]]:
+    """(which atoms are hydrogens, by their element; which are virtual sites, by their name)."""
+    water = {str(name) for name in np.unique(table.residue_names.astype(str)) if _WATER.fullmatch(str(name))}
+    virtual = [
+        _VIRTUAL.fullmatch(str(name)) is not None or (name in _OF_WATER and residue in water)
+        for name, residue in zip(table.names, table.residue_names, strict=True)
+    ]
+    dummy = np.isin(table.species.astype(str), ["DUMMY", "EP"])
+    return np.isin(table.species.astype(str), ["H", "D"]), np.array(virtual, bool) | dummy
+
+
+def of_residues(table: AtomTable) -> AtomTable:
+    """A table with an entry for each residue, whose species is the residue's name."""
+    at = np.unique(table.residues, return_index=True)[1]
+    names, blank = table.residue_names[at], np.full(len(at), "", object)
+    ids, segments = table.residue_ids[at], table.segments[at]
+    return AtomTable(blank, names, names, ids, np.arange(len(at)), segments)
+
+
+class ResidueTracker:
+    """Contacts between residues from frame to frame, with what a `Tracker` offers of pairs of atoms.
+
+    Atoms of one residue make no contact. `near` counts pairs of atoms, of which each pair of residues within
+    the bound has one or more; the smallest margin is not searched for (inf).
+
+    Args:
+        rule: who is in contact, of atoms.
+        residues: which atoms count.
+        species: of each atom of the file; needed by rules that ask for it.
+        bound: how far a distance can be off through the resolution of the file, length.
+
+    Error: smallest distances are rounded as distances of atoms are.
+    """
+
+    min_margin = np.inf
+
+    def __init__(self, rule: Rule, residues: ByResidue, species: Sequence[str] | None, bound: float = 0.0):
+        self.rule, self._residues = rule, residues
+        self._atoms = Tracker(rule, *residues.groups, species, bound)
+        self._count = len(residues.table)
+        # pairs of residues as numbers, ascending, and how many pairs of atoms are inside in each
+        self._pairs, self._inside = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._last: Frame | None = None
+        first, second = residues.groups
+        sides = (first, first if second is None else second)
+        self._sides = [_by_residue(one, residues.of, self._count) for one in sides]
+        kinds = np.zeros(len(residues.of), str) if species is None else np.asarray(species, str)
+        self._species, self._radii = rule.table(kinds)
+
+    @property
+    def pairs(self) -> int:
+        """Pairs of residues in contact at the last frame."""
+        return len(self._pairs)
+
+    @property
+    def near(self) -> int:
+        """Pairs of atoms at the last frame with a |margin| of at most the bound."""
+        return self._atoms.near
+
+    @property
+    def bound(self) -> float:
+        """How far a distance can be off at the last frame, length."""
+        return self._atoms.bound
+
+    def step(self, frame: Frame, bound: float | None = None) -> FlipTable:
+        """The contacts that formed or broke since the frame before; see `Tracker.step`."""
+        flips, before = self._atoms.step(frame, bound), self._last
+        i, j, sign = flips.i, flips.j, np.where(flips.entered, 1, -1)
+        if before is None:
+            members = self._atoms.members()
+            i, j, sign = members.i, members.j, np.ones(len(members), np.int64)
+        first, second = np.sort(self._residues.of[np.array([i, j])], axis=0)
+        other = first != second
+        codes = np.concatenate([self._pairs, (first * self._count + second)[other]])
+        codes, where = np.unique(codes, return_inverse=True)
+        old = np.bincount(where[: len(self._pairs)], self._inside, len(codes)).astype(np.int64)
+        now = old + np.bincount(where[len(self._pairs) :], sign[other], len(codes)).astype(np.int64)
+        self._pairs, self._inside, self._last = codes[now > 0], now[now > 0], frame
+        changed = codes[(old > 0) != (now > 0)]
+        if before is None or not len(changed):
+            return FlipTable.none()
+        i, j = np.divmod(changed, self._count)
+        near, was = self._closest(frame, i, j), self._closest(before, i, j)
+        margin, margin_before = near[1] - near[0], was[1] - was[0]
+        off = self._atoms.bound + max(self._placed(one).rounding for one in (before, frame))
+        return FlipTable(
+            i=i, j=j, rank=np.zeros_like(i), entered=(now > 0)[(old > 0) != (now > 0)], distance=near[0],
+            margin=margin, bound=np.full(len(i), off), decided_by="positions",
+            ambiguous=(np.abs(margin) <= off) | (np.abs(margin_before) <= off),
+            frame=np.full(len(i), self._atoms.frames - 1), before=was[0], margin_before=margin_before,
+        )  # fmt: skip
+
+    def members(self) -> Members:
+        """The pairs of residues in contact at the last frame, with their smallest distances."""
+        if self._last is None:
+            return Members.none()
+        i, j = np.divmod(self._pairs, self._count)
+        return Members(i, j, np.zeros_like(i), self._closest(self._last, i, j)[0])
+
+    def _closest(self, frame: Frame, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(distance, threshold) of the pair of atoms that is furthest inside, or least outside, length."""
+        placed, found = self._placed(frame), np.full((2, len(i)), np.inf)
+        for begin in range(0, len(i), _TOGETHER):
+            part = slice(begin, begin + _TOGETHER)
+            # an atom may be on both sides
+            ends = [(i[part], j[part])] + [(j[part], i[part])] * (self._residues.groups[1] is not None)
+            rows = [(np.arange(len(a)), a, b) for a, b in ends]
+            row, a, b = np.concatenate(rows, axis=1)
+            (first, starts), (second, others) = self._sides
+            long, wide = np.diff(starts)[a], np.diff(others)[b]
+            which = np.repeat(np.arange(len(row)), long * wide)
+            place = np.arange(len(which)) - np.repeat(np.cumsum(long * wide) - long * wide, long * wide)
+            p = first[starts[a[which]] + place // wide[which]]
+            q = second[others[b[which]] + place % wide[which]]
+            p, q, row = np.minimum(p, q), np.maximum(p, q), row[which]
+            distance = image_distances(placed, p, q, np.zeros_like(p))
+            radius = self._radii[self._species[p], self._species[q]]
+            # with one cutoff for all, the last of each row is the nearest
+            order = np.lexsort((np.where(radius > 0, radius - distance, -np.inf), row))
+            last = order[np.append(np.diff(row[order]) != 0, True)] if len(row) else order
+            found[:, begin + row[last]] = distance[last], radius[last]
+        return found[0], found[1]
+
+    def _placed(self, frame: Frame) -> Placed:
+        lattice = lattice_of(frame.box)
+        x = np.ascontiguousarray(frame.positions, np.float64)
+        return Placed(x, lattice, lattice.rounding(frame.furthest, self.rule.reach))
+
+
+def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(the atoms among these in the order of their residues, where those of each begin and the last end)."""
+    atoms = np.arange(len(of)) if atoms is None else atoms
+    order = atoms[np.argsort(of[atoms], kind="stable")]
+    return order, np.searchsorted(of[order], np.arange(count + 1))
+
+
+@dataclass(frozen=True)
+class Occupancy(Columns):
+    """How much of the time each pair was in contact, sorted by (i, j): the entries of a contact matrix."""
+
+    i: Int[np.ndarray, "pairs"]  # the pair
+    j: Int[np.ndarray, "pairs"]
+    inside: Int[np.ndarray, "pairs"]  # frames in contact
+    share: Float[np.ndarray, "pairs"]  # of all frames
+    formed: Int[np.ndarray, "pairs"]  # times that a contact was seen to begin, and to end
+    broken: Int[np.ndarray, "pairs"]
+
+    @classmethod
+    def of(cls, stays: Contacts, frames: int) -> Occupancy:
+        """Sums over the stays of each pair in so many frames."""
+        new = np.append(True, (np.diff(stays.i) != 0) | (np.diff(stays.j) != 0))[: len(stays)]
+        heads, where = np.flatnonzero(new), np.cumsum(new) - 1
+        weights = (stays.length, stays.began, stays.ended)
+        inside, *ends = (np.bincount(where, one, len(heads)).astype(np.int64) for one in weights)
+        return cls(stays.i[heads], stays.j[heads], inside, inside / max(frames, 1), *ends)
+
+
+@dataclass(frozen=True)
+class ResidueNames(Columns):
+    """What residues are called, an entry each."""
+
+    residue: Int[np.ndarray, "residues"]  # its number from 0, by which tables name it
+    name: np.ndarray
+    number: Int[np.ndarray, "residues"]  # as the file has it
+    segment: np.ndarray
+
+
+def contacts_over_time(
+    stays: Contacts, residues: int, frames: int
+) -> tuple[Int[np.ndarray, "moments"], Float[np.ndarray, "residues moments"]]:
+    """(first frame of each of up to `MOMENTS` stretches, mean number of contacts of each residue then)."""
+    edges = np.unique(np.linspace(0, frames, min(frames, MOMENTS) + 1).astype(np.int64))
+    found = np.zeros((residues, len(edges) - 1))
+    for k, (low, high) in enumerate(pairwise(edges)):
+        share = np.clip(np.minimum(stays.end, high) - np.maximum(stays.begin, low), 0, None) / (high - low)
+        for end in (stays.i, stays.j):
+            found[:, k] += np.bincount(end, share, residues)
+    return edges[:-1], found
