@@ -84,6 +84,29 @@ def test_a_claim_of_a_killed_process_is_followed_by_another(tmp_path):
     assert not place.claims() and place.result(address) is not None
 
 
+def test_a_claim_is_released_alone(tmp_path):
+    """One that came later is of a process that took the first for gone, and stays."""
+    place, address = Workspace(tmp_path), "3" * 32
+    later = place.place / f".{address}.claim.1"
+    with place.claimed(address) as mine:
+        assert mine
+        later.write_text((place.place / f".{address}.claim.0").read_text())
+    assert place.claims() == [(later, 1)]
+
+
+def test_a_claim_that_found_no_room_is_removed(tmp_path):
+    place, resource = Workspace(tmp_path), pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # as on a full disk, a file can be made and nothing be written into it
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
+    try:
+        with pytest.raises(FolderError), place.claimed("4" * 32):
+            pass
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(place.place.iterdir())
+
+
 def test_another_machine_is_gone_after_a_while(tmp_path):
     claim = tmp_path / "claim"
     claim.write_text(json.dumps({"host": "elsewhere", "boot": "", "pid": 1, "since": ""}))

@@ -1,0 +1,109 @@
+"""Engines: what comes back from a worker, and what ends with whom."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from mdnum.errors import InputError
+from mdnum.sweeps.engines import computed
+from mdnum.verbs.sweep_worker import Task, work
+
+
+class Twice(Exception):
+    """Is pickled, and cannot be read again."""
+
+    def __init__(self, one: str, other: str):
+        super().__init__(one + other)
+
+
+def wrong(task: int) -> int:
+    if task == 1:
+        raise KeyError("of the work")
+    if task == 2:
+        raise Twice("read by ", "nobody")
+    return task
+
+
+def test_an_exception_of_the_work_is_an_answer():
+    """The task is not begun again, nor does it count as lost."""
+    lost: list[object] = []
+    with ThreadPoolExecutor(1) as pool:
+        found = dict(computed(wrong, range(4), on=pool, lost=lambda task, why: bool(lost.append(task))))
+    assert (found[0], found[3], lost) == (0, 3, [])
+    assert isinstance(found[1], KeyError) and found[1].args == ("of the work",)
+    assert isinstance(found[2], RuntimeError) and str(found[2]) == "Twice: read by nobody"
+
+
+def test_a_worker_of_other_code_computes_nothing(tmp_path):
+    point = {"address": "0" * 32, "state": {"code": "another", "system": {}}, "settings": {}}
+    with pytest.raises(InputError, match="another mdnum"):
+        work(Task(str(tmp_path), (point,), "argon/crystal-108", {}, ("energy",), False, False))
+    assert not list((tmp_path / "workspace").iterdir())
+
+
+SWEEP = """
+import os, sys, time
+from mdnum.sweeps.engines import computed
+
+def asleep(file):
+    with open(file, "w") as opened:
+        opened.write(str(os.getpid()) + "\\n")
+    time.sleep(60)
+
+list(computed(asleep, [sys.argv[1]], workers=1))
+"""
+
+
+@pytest.mark.nightly
+def test_a_worker_ends_with_its_killed_sweep(tmp_path):
+    file = tmp_path / "worker"
+    sweep = subprocess.Popen([sys.executable, "-c", SWEEP, str(file)])
+    try:
+        _until(lambda: file.exists() and file.read_text().endswith("\n"))
+        worker = int(file.read_text())
+        assert worker != sweep.pid and _lives(worker)
+    finally:
+        sweep.send_signal(signal.SIGKILL)
+        sweep.wait()
+    _until(lambda: not _lives(worker))
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+        # one that has ended has its number until somebody looks
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def _until(true: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def noted(folder: str) -> None:
+    Path(folder, str(time.time_ns())).touch()
+
+
+@pytest.mark.nightly
+def test_equal_tasks_are_two_to_dask(tmp_path):
+    """To dask alone they are one, of which the second finds the answer of the first."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        1, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address=":0"
+    ) as cluster:
+        tasks = [str(tmp_path)] * 2
+        assert len(list(computed(noted, tasks, on=cluster.scheduler_address))) == 2
+    assert len(list(tmp_path.iterdir())) == 2
