@@ -1,4 +1,4 @@
-"""The bouncing ball in closed form: its motion, and the derivative of it by every parameter.
+"""The bouncing ball in closed form: its motion, and its derivative with respect to every parameter.
 
 A ball above a floor at height 0, with gravity g, starts at (y0, v0). It reaches the floor with speed
 s = sqrt(v0² + 2 g y0) at t_1 = (v0 + s) / g. With restitution e, impact n has speed e^(n-1) s, and the time
@@ -45,7 +45,7 @@ Parameters = Mapping[str, complex]
 
 
 class _Motion:
-    """What both motions check of a start, their derivatives, and their height and velocity one by one.
+    """Checks of the start, derivatives, height and velocity, shared by both kinds of motion.
 
     Source: derivatives by the complex step, in which nothing cancels (Squire & Trapp, SIAM Review 40 (1998)
     110).
@@ -292,7 +292,7 @@ def _arc(p: Parameters, s: complex, tau):
 
 
 def _end(p: Parameters, s: complex) -> complex | None:
-    """How long a contact entered with speed s lasts; None for ever."""
+    """Duration of a contact entered with speed s, s; None if the contact never ends."""
     half = p["damping"].real / 2
     if half * half > p["k"].real:
         return None

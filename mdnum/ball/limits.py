@@ -1,4 +1,4 @@
-"""What the formats of the ball can hold, and the smallest tolerance that its solver can meet; without jax."""
+"""Largest numbers of the ball's formats and smallest tolerance that its solver can meet; without jax."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def rounded(value: float, name: str) -> float:
 
 
 def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") -> dict[str, float]:
-    """The smallest tolerance that a solver can meet, m, by the role whose format asks for it.
+    """The smallest tolerance that a solver can meet, m, for each role whose format limits the tolerance.
 
     A penetration so small that its share `gain` rounds to nothing no longer shrinks, and a tolerance that is
     no number of a format is another tolerance. The largest of the values is the smallest usable tolerance.
@@ -56,7 +56,7 @@ def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") ->
 
 
 def _stuck(name: str, gain: float) -> float:
-    """The smallest number of a format below which a penetration may be that no longer shrinks."""
+    """The smallest number above every penetration that an iteration may leave unchanged by rounding."""
     if name == "float16":
         # of n grains the iteration takes gain * n, which rounds to none up to one half
         return (math.floor(0.5 / gain) + 1) * smallest(name)

@@ -21,10 +21,10 @@ START = ("y0", "v0")  # parameters of the start rather than of the world; a valu
 
 
 class BallLoss(Protocol):
-    """A sum over steps and a term of the end; both shape (), in the dtype they are given."""
+    """A loss: a sum over steps and a final term, both of shape () and in the dtype of their input."""
 
     def step(self, state: BallState, record: BallRecord, dtype: Any) -> Float[Array, ""]:
-        """What the step that made this state adds."""
+        """Contribution of the step that made this state."""
         ...
 
     def end(self, state: BallState, steps: int, total: Float[Array, ""]) -> Float[Array, ""]:
@@ -33,12 +33,12 @@ class BallLoss(Protocol):
 
 
 class FinalHeight(eqx.Module):
-    """Mean height at the end, m; with a target the mean squared distance to it, m²."""
+    """Loss: mean final height, m; with a target, the mean squared distance to the target, m²."""
 
     target: float | None = eqx.field(static=True, default=None)
 
     def step(self, state, record, dtype):
-        """Nothing."""
+        """Contribution of a step: none."""
         return jnp.zeros((), dtype)
 
     def end(self, state, steps, total):
@@ -50,19 +50,19 @@ class FinalHeight(eqx.Module):
 
 
 class MeanHeight(eqx.Module):
-    """Height averaged over balls and steps, m."""
+    """Loss: height averaged over balls and steps, m."""
 
     def step(self, state, record, dtype):
         """The mean over the batch."""
         return jnp.mean(state.y.astype(dtype), dtype=dtype)
 
     def end(self, state, steps, total):
-        """Divided by the number of steps."""
+        """The sum over steps, divided by the number of steps."""
         return total / max(steps, 1)
 
 
 class ResidualPenetration(eqx.Module):
-    """What the contact model leaves of the penetration, summed over steps, averaged over balls."""
+    """Loss: penetration that the contact model leaves, summed over steps and averaged over balls."""
 
     power: int = eqx.field(static=True, default=2)  # 2 for squares, m²; 1 for the penetration itself, m
 
@@ -115,7 +115,7 @@ class BallProblem:
         return float(_loss(problem.bare, problem.world, *problem.start_arrays, imposed))
 
     def origin(self, names: Sequence[str]) -> dict[str, Array]:
-        """Where it is, as `loss_at` takes it: parameters by value, the start by how far it is moved, 0.
+        """Point at which `loss_at` differentiates: values of the parameters, and displacement 0 of the start.
 
         Raises:
             InputError: there is no parameter of a name.
@@ -144,12 +144,12 @@ class BallProblem:
         return float(made.value), {name: float(made.gradient[name]) for name in names}
 
     def run(self, **options: Any) -> BallRun:
-        """Simulate it; see `simulate`."""
+        """Simulate the problem; see `simulate`."""
         return simulate(self.world, self.world.start(self.y0, self.v0), self.steps, **options)
 
     @property
     def bare(self) -> tuple[int, BallLoss]:
-        """Number of steps, and loss."""
+        """Number of steps and loss, without the world."""
         return self.steps, self.loss
 
     @property
@@ -214,7 +214,7 @@ def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
-    """Heights after a number of steps and the derivative of the program by a parameter, by forward mode.
+    """Heights after a number of steps, and their derivative with respect to one parameter, by forward mode.
 
     One compilation serves all step sizes and numbers of steps.
     """

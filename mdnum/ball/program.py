@@ -34,7 +34,7 @@ class ImposedDecision:
 
 @dataclass(frozen=True)
 class BallProgram:
-    """World, start and steps of a ball, and how they are compared with another's."""
+    """World, start and steps of a ball, and their comparison with another program's."""
 
     problem: BallProblem  # the program
     # its balls are those of the other program in this order; None where they are the same
@@ -49,12 +49,12 @@ class BallProgram:
 
     @property
     def steps(self) -> int:
-        """That the system's own run makes."""
+        """Number of steps of the system's own run."""
         return self.problem.steps
 
     @property
     def timestep(self) -> float:
-        """Seconds."""
+        """Time step, s."""
         return float(self.problem.world.integrator.h)
 
     @property
@@ -69,12 +69,12 @@ class BallProgram:
 
     @property
     def ulp(self) -> float:
-        """Of the largest start height."""
+        """One ulp of the largest start height, m."""
         return spacing(float(np.abs(np.asarray(self.problem.y0)).max()), self.problem.world.policy.state)
 
     @property
     def streams(self) -> bool:
-        """Every step that was asked for is compared, and none beyond."""
+        """Always False: exactly the requested steps are compared."""
         return False
 
     @property
@@ -83,7 +83,7 @@ class BallProgram:
         return None
 
     def check(self, other: BallProgram) -> None:
-        """Check that both decide the same things of the same number of balls.
+        """Check that both programs make the same kinds of decisions for the same number of balls.
 
         Raises:
             InputError: they do not.
@@ -245,7 +245,7 @@ class BallProgram:
         )
 
     def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
-        """What a run decides (see `Program.history`); its loss is that of the problem."""
+        """The decisions of a run (see `Program.history`), with the loss of the problem."""
         problem = replace(self.problem, steps=steps)
         run = problem.run(keep=False)
         contact, counts = run.contact, run.iterations.reshape(steps, -1)

@@ -28,7 +28,7 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """A finished rollout; row s of what belongs to a step is the step that made state s + 1.
+    """A finished rollout; in arrays with a row for each step, row s is the step that made state s + 1.
 
     Attributes:
         world: the program.
@@ -62,7 +62,7 @@ class BallRun:
 
     @property
     def kept(self) -> bool:
-        """Whether every state is there."""
+        """Whether every state was kept."""
         return len(self.y) == self.steps + 1
 
     @property
@@ -92,7 +92,7 @@ class BallRun:
         return energy(self.world, self.y, self.v)
 
     def ended(self) -> dict[str, int]:
-        """How many solves ended for which reason."""
+        """Number of solves that ended for each reason."""
         codes, counts = np.unique(self.reason, return_counts=True)
         return {Reason(code).word: int(n) for code, n in zip(codes, counts, strict=True)}
 
@@ -178,7 +178,7 @@ _COUNTS: dict[tuple[Any, int], tuple[int, ...]] = {}
 
 
 def undecided(world: World, start: BallState, steps: int) -> BallDecisions:
-    """Imposed decisions that leave every one to the world: -1 throughout, leading axis steps."""
+    """Imposed decisions that impose nothing: -1 throughout, leading axis steps."""
     kind = jax.tree.structure(world), len(start.y)
     if kind not in _COUNTS:
         solve = eqx.filter_eval_shape(lambda world, start: world.advance(start)[1].solve, world, start)
@@ -261,7 +261,7 @@ def residual_bound(world: World, residual: Any, terms: int) -> Any:
 
 
 class CrossDecision(NamedTuple):
-    """A decision that two runs made differently."""
+    """A decision on which two runs differ."""
 
     step: int  # from 1
     channel: str  # "contact" or "stop"
@@ -279,7 +279,7 @@ class CrossDecision(NamedTuple):
 
     @property
     def run(self) -> str:
-        """The run that decided yes: in which the ball touches, or the solver stops first."""
+        """The run that decided yes: the one in which the ball touches, or whose solver stops first."""
         return "A" if (self.a > self.b) == (self.channel == "contact") else "B"
 
 
@@ -388,7 +388,7 @@ def _at(values: np.ndarray, row: np.ndarray, ball: np.ndarray) -> np.ndarray:
 def overridden(
     run: BallRun, last: int | None = None
 ) -> tuple[Int[np.ndarray, "times"], Float[np.ndarray, "times"]]:
-    """How many imposed decisions a run would have made otherwise, and how far it was from them.
+    """Number of imposed decisions that differ from the run's own, and their distance to the threshold.
 
     Args:
         run: under imposed decisions.

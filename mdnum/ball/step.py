@@ -36,7 +36,7 @@ class BallState(NamedTuple):
 
 
 class BallDecisions(NamedTuple):
-    """Everything that a step decides; or what is imposed on a step, in part or in whole."""
+    """All decisions of a step; also used to impose some or all decisions on a step."""
 
     # whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1, and a negative
     # number where the step is to decide by itself
@@ -48,7 +48,7 @@ class BallDecisions(NamedTuple):
 
 
 class BallRecord(NamedTuple):
-    """What a step leaves."""
+    """Record of a step."""
 
     height: Float[Array, "balls"]  # what the contact decision compared with zero, m, shape (balls,)
     contact: Bool[Array, "balls"]  # the decision, shape (balls,)
@@ -73,7 +73,7 @@ class Rounding(eqx.Module):
 
 
 class Motion(NamedTuple):
-    """What a contact model is given for one step."""
+    """Input of a contact model for one step."""
 
     # y, v, carried: height, velocity and the acceleration that velocity Verlet carries, in the dtype of
     # arithmetic
@@ -109,7 +109,7 @@ Pull = Callable[[Balls, Balls, Touching], Balls]
 
 
 class Scheme(Protocol):
-    """The contract of a scheme."""
+    """Base class of the integration schemes."""
 
     h: Any  # time step, s
 
@@ -258,7 +258,7 @@ class EventLocated(eqx.Module):
 
 
 class Contact(Protocol):
-    """What happens at the floor."""
+    """Base class of the contact models."""
 
     def move(self, motion: Motion) -> Moved:
         """One step."""

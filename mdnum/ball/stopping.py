@@ -1,4 +1,4 @@
-"""Iterative solvers: rules that say when to stop, the loop they stop, and its derivatives.
+"""Iterative solvers: stopping rules, the loop that they stop, and derivatives of the loop.
 
 A rule turns the terms of a residual (one per ball) into the quantity that is compared with a threshold. A sum
 over the batch couples balls that have nothing to do with one another, and its last bits depend on the order
@@ -28,7 +28,7 @@ Map = Callable[[tuple, Any], tuple[tuple, Any]]
 
 
 class Reason(IntEnum):
-    """What ended the solver of a step."""
+    """Reason for which the solver of a step ended."""
 
     NONE = 0
     TOLERANCE = 1
@@ -59,7 +59,7 @@ class Solve(NamedTuple):
 
 
 class StopRule(Protocol):
-    """The contract of a stopping rule."""
+    """Base class of the stopping rules."""
 
     max_iter: int  # the cap: the solver gives up after so many iterations
 
@@ -113,7 +113,7 @@ class Maximum(_ToleranceRule):
 
 
 class Relative(GlobalSum):
-    """The sum, compared with the tolerance times the sum before the first iteration."""
+    """Stops when the sum of the residual terms is below the tolerance times the first sum."""
 
     def threshold(self, first, iteration):
         """tol times the first residual; a residual that starts at zero is below any tolerance."""
@@ -173,7 +173,7 @@ def iterate(
     imposed: Int[Array, "..."] | None = None,
     history: bool = False,
 ) -> tuple[Any, Solve]:
-    """Update until the rule stops it, its cap ends it, or the imposed number of iterations is reached.
+    """Update until the rule stops the loop, its cap ends the loop, or the imposed iterations have been made.
 
     Args:
         rule: when to stop.

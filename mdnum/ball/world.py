@@ -1,4 +1,4 @@
-"""The bouncing ball as a program: decide outside, act inside."""
+"""The bouncing ball as a program: the decisions are made in one place and acted on in another."""
 
 from __future__ import annotations
 

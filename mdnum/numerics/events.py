@@ -15,7 +15,7 @@ INCLUSIVE = {"<": False, "<=": True}
 
 @dataclass(frozen=True)
 class Threshold:
-    """A number that a computed quantity is compared with, and how.
+    """A number that a computed quantity is compared with, and the comparison that is used.
 
     The comparison is part of the physics: codes that agree on a cutoff still disagree on `<` against `<=`
     and on comparing r or r², and then on pairs that sit at the cutoff.
@@ -125,11 +125,11 @@ class Ledger:
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "flips"]:
-        """Flips whose date another legitimate rounding could have moved: |margin| within the bound."""
+        """Whether another valid rounding could change the step of each flip: |margin| within the bound."""
         return np.abs(self.margin) <= self.bound
 
     def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:
-        """How many decisions turned yes and no at each step 0..steps."""
+        """Number of decisions that turned yes, and that turned no, at each step 0..steps."""
         entered = np.bincount(self.step[self.entered], minlength=steps + 1)
         left = np.bincount(self.step[~self.entered], minlength=steps + 1)
         return entered, left

@@ -40,7 +40,7 @@ def _through_integers(x, zero):
 
 @jax.custom_jvp
 def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
-    """x, opaque to fused multiply-add contraction: XLA sees an integer operation with a runtime zero.
+    """x, protected from contraction into a fused multiply-add: XLA sees an exclusive-or with a runtime zero.
 
     It also forces the rounding to float16 and bfloat16: XLA may keep the float32 in which it computed (a
     bfloat16 product that is widened at once is never rounded on a CPU), but an integer needs the bits.
@@ -158,7 +158,7 @@ def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
 
 
 def rounded(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
-    """The function with every sixteen-bit result in it rounded, one operation after the other.
+    """The function with every sixteen-bit result rounded, one operation after the other.
 
     XLA on a CPU computes in float32 what is written in float16 or bfloat16, and may leave out the roundings
     between two operations. Here a fence stands behind each: numpy with ml_dtypes then gives the same bits,

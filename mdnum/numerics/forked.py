@@ -1,4 +1,4 @@
-"""A process forked from one in which jax computes: there jax waits for threads that no fork copies."""
+"""Detection of forked processes: in a fork of a process that used jax, jax hangs waiting for lost threads."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _forked = False
 
 
 def check_not_forked() -> None:
-    """To be called before jax is asked for anything.
+    """Check that this process may use jax; to be called before the first use of jax.
 
     Raises:
         InputError: this process is a fork of one in which jax had been used.

@@ -77,7 +77,7 @@ FORMATS: Mapping[str, FloatFormat] = {
 
 
 def format_of(name: str) -> FloatFormat:
-    """The format of a name.
+    """The floating-point format of a given name.
 
     Raises:
         InputError: no format is called that.
@@ -219,7 +219,7 @@ def scaled_gradient(function: Callable[..., Any], scale: float | Array, *args: A
 
 
 def check_scale(scale: float) -> None:
-    """That scaling by this factor is exact.
+    """Check that scaling by this factor is exact.
 
     Raises:
         InputError: it is no power of two.

@@ -1,4 +1,4 @@
-"""What a traced program says of its arithmetic: single precision in it, and where numbers become infinite."""
+"""Arithmetic of a traced program: its single-precision operations, and where numbers become infinite."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def narrows(closed: Any) -> bool:
 
 
 def held_numbers(closed: Any, least: int = 10) -> int:
-    """How many numbers a program holds in arrays of some size: weights that a function closed over."""
+    """Number of entries in a program's large constant arrays, such as weights that a function closed over."""
     consts = [one for program in _programs(closed) for one in getattr(program, "consts", ())]
     return sum({id(one): one.size for one in consts if is_inexact(one) and one.size >= least}.values())
 

@@ -1,4 +1,4 @@
-"""Floats as integers, and how far a computed distance can be from the exact distance of the positions.
+"""Floats as integers, and bounds on the rounding error of distances computed from positions.
 
 A displacement is x_j - x_i, less a lattice vector or none along each periodic axis, with a rounding after
 every subtraction; squares are added in a row. What each rounding can lose goes by the size of the result
@@ -76,7 +76,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Reach:
-    """What a displacement between any two positions in a box is made of, as far as its rounding goes."""
+    """Sizes of the intermediate results of a displacement between any two positions in a box."""
 
     # vectors of the periodic axes in the order in which they are taken off, length
     lattice: tuple[Vector, ...] = ()

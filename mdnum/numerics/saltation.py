@@ -37,7 +37,7 @@ def time_shift(
     normal: Float[Any, "*batch state"],
     threshold_rate: Any = 0.0,
 ) -> Float[Any, "*batch"]:
-    """How the time of the event moves with the tangent: -(n · dx + dc) / (n · F-).
+    """Derivative of the time of the event along the tangent: -(n · dx + dc) / (n · F-).
 
     Args:
         tangent: dx, the perturbation just before the event.

@@ -104,7 +104,7 @@ class Reduction:
         return np.asarray((factor if factor >= 0 else np.inf) * np.abs(terms.astype(np.float64)).sum(axis=0))
 
     def depth(self, n: int) -> int:
-        """The most additions that one of n terms goes through."""
+        """The largest number of additions that one of n terms passes through."""
         return max(n - 1, 0)
 
 

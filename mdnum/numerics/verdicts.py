@@ -1,4 +1,4 @@
-"""Two runs that differ in one choice: their dates, how fast they diverge, and what a flip had to do with it.
+"""Two runs that differ in one choice: when and how fast they diverge, and whether flips are the cause.
 
 The verdict compares two separations from the first run: of the second run, and of the second run's
 arithmetic under the first run's decisions. Only the latter can tell whether the flips did it. Where it splits
@@ -32,7 +32,7 @@ _ALIKE = 4
 
 @dataclass(frozen=True)
 class Delay:
-    """When one pair splits, free and under the first run's decisions."""
+    """The steps at which one pair of runs splits, free and under the first run's decisions."""
 
     # free, imposed: steps of the two splits; None for one that was not seen
     free: int | None
@@ -60,7 +60,7 @@ class Delay:
 
 @cache
 def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
-    """After how many pairs to look, and how many of them must agree: (pairs, agreeing) of each look.
+    """Numbers of pairs after which the test is evaluated, and how many must agree: (pairs, agreeing) of each.
 
     The error is spent in proportion to the pairs (Lan and DeMets, Biometrika 70, 659, 1983): up to each look
     the exact probability that fair coins have stopped on one given side is at most that share of it.
@@ -97,7 +97,7 @@ FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
 
 @dataclass(frozen=True)
 class Count:
-    """How many pairs were delayed."""
+    """Number of pairs whose split was delayed."""
 
     pairs: int  # that were run, the pair itself among them
     later: int  # that were delayed by more than asked for
@@ -111,7 +111,7 @@ class Count:
 
     @property
     def delayed(self) -> bool | None:
-        """Whether most pairs are delayed, at a look; None where these do not tell."""
+        """Whether most pairs are delayed; None if these pairs do not decide it."""
         need = dict(looks(self.most)).get(self.pairs)
         if need is None:
             return None
@@ -181,7 +181,7 @@ _HALF = 3.0
 
 @dataclass(frozen=True)
 class Dates:
-    """When two runs part; None where they do not within the horizon."""
+    """The steps at which two runs diverge; None where they do not within the horizon."""
 
     first_bit: int | None  # first step whose state bits differ
     fork: int | None  # first step whose decisions differ
@@ -307,7 +307,7 @@ def expected(
 
 @dataclass(frozen=True)
 class ForkVerdict:
-    """Whether the flips caused a split, accelerated it, or only came along."""
+    """Whether the flips caused the split, accelerated it, or were only bystanders."""
 
     # "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon, or no
     # counterfactual that was followed far enough), "cause" (without the flips no split), "accelerated" (most
@@ -490,7 +490,7 @@ SERIES: Mapping[tuple[Name, Name, Name], str] = {
 
 @dataclass(frozen=True)
 class SplitCell:
-    """When one run splits from another."""
+    """The step at which one run splits from another."""
 
     # arithmetic, decisions: whose they are in the run
     arithmetic: Name
@@ -501,13 +501,13 @@ class SplitCell:
 
     @property
     def same(self) -> bool:
-        """Whether this is the reference itself."""
+        """Whether the run is the reference itself."""
         return self.arithmetic == self.decisions == self.reference
 
 
 @dataclass(frozen=True)
 class Share:
-    """How much of a split one difference is worth: by how much it comes later without it."""
+    """Contribution of one difference to a split: how much later the split comes without it."""
 
     what: What  # the difference that is taken away; the other one stays
     reference: Name  # the run that is compared with

@@ -1,4 +1,4 @@
-"""What the tables of a run say: chatter, stays, busiest pairs, margins in roundings, and its energies."""
+"""Analysis of a run's tables: chatter, stays, busiest pairs, margins in roundings, and energies."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Stays:
         return int(self.inside.sum() + self.outside.sum())
 
     def undone_within(self, steps: int) -> int:
-        """Chatter: flips that the same pair takes back within so many steps."""
+        """Number of flips that the same pair reverses within `steps` steps (chatter)."""
         return int(self.inside[: steps + 1].sum() + self.outside[: steps + 1].sum())
 
 
 def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
-    """The median length, of how many last 0, 1, 2, ... steps; None of none."""
+    """The median stay from the number of stays of 0, 1, 2, ... steps; None if there are no stays."""
     total = int(counts.sum())
     if not total:
         return None
@@ -64,7 +64,7 @@ class PairCounts:
 
 
 class Scan:
-    """What a table of flips says, of a table that is larger than memory, seen a part at a time.
+    """Statistics of a table of flips that may be larger than memory, read block by block.
 
     Kept are a row for each pair, a count for each step and length of a stay, the rows nearest to their
     threshold, and of each flip one number: its margin.
@@ -195,7 +195,7 @@ class Scan:
 
 
 def scan(flips: Flips, steps: int | None = None, nearest: int = 0) -> Scan:
-    """A table of flips that is in memory, seen at once."""
+    """Statistics of a table of flips that fits in memory."""
     made = Scan(int(np.max(flips["step"], initial=-1)) + 1 if steps is None else steps, nearest)
     made.take(flips)
     return made
@@ -214,7 +214,7 @@ def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
 
 
 def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
-    """Flips one expects within their rounding bound, were the margins spread evenly near zero.
+    """Expected number of flips within their rounding bound if the margins were spread evenly near zero.
 
     They are where atoms move freely through the cutoff. The density is taken from the lower
     quarter of the margins; many more ambiguous flips than this mean that something holds pairs
@@ -245,7 +245,7 @@ def algebra_holds(series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]
 
 @dataclass(frozen=True)
 class Conservation:
-    """How well a run keeps what it should conserve, over its second half."""
+    """How well a run conserves energy over its second half."""
 
     fluctuation: float  # standard deviation of the conserved energy over that of what moves
     drift: float  # of the conserved energy over the whole run, energy

@@ -37,7 +37,7 @@ class Column:
 
     @property
     def missing(self) -> str:
-        """What stands for no value."""
+        """Text shown for a missing value."""
         return "∞" if self.kind == "ratio" else "–"
 
     @property
@@ -95,7 +95,7 @@ class Browse:
 
     @cached_property
     def search(self) -> dict[str, Any]:
-        """What can be typed into the search box, and which value of a row it is about."""
+        """The search box's keywords, and the column that each of them searches."""
         found: dict[str, Any] = {"words": {}, "ranges": {}, "subjects": [], "nouns": [], "ambiguous": None}
         for at, one in self.placed:
             if one.kind == "word":
@@ -112,7 +112,7 @@ class Browse:
 
     @property
     def spec(self) -> Markup:
-        """What the script has to know, for a script element."""
+        """Description of the table for the script of the page, as JSON for a script element."""
         columns = [
             {
                 "at": at, "kind": "number" if one.kind == "ratio" else one.kind, "digits": one.digits,

@@ -1,4 +1,4 @@
-"""Findings, their sentences, and the verdict that they add up to: one of each for every verb.
+"""Findings, their sentences, and the verdict that summarizes them; every verb uses them.
 
 Code decides (code, values); a text file beside the verb has the sentences, by code, with named fields:
 
@@ -65,7 +65,7 @@ _ORDER = ("error", "warning", "info")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing a person should know about a result."""
+    """One result that the reader should know about."""
 
     code: str  # stable name, for scripts
     # error: do not use the numbers; warning: look before you do; info: good to know, which changes neither
@@ -245,7 +245,7 @@ def fill(text: str, values: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What to think of a result."""
+    """Overall verdict on a result."""
 
     # the worst severity; with neither error nor warning "good", or "info" where nothing was to be good
     tone: Tone
@@ -273,7 +273,7 @@ def conclude(
     best: Tone = "info",
     judged: bool = False,
 ) -> Verdict:
-    """The verdict on findings: its tone is that of the worst, which its headline names.
+    """The verdict on findings: its tone is that of the most severe finding, which the headline names.
 
     Args:
         found: in the order in which they are to be read, whatever their severity.
@@ -296,7 +296,7 @@ def conclude(
 
 
 def restore(kept: Mapping[str, Any]) -> Finding:
-    """A finding that was written into summary.json."""
+    """Read a finding that was written into summary.json."""
     severity: Any = kept.get("severity") if kept.get("severity") in _ORDER else "info"
     named = ("code", "title", "text", "remedy", "section", "cause")
     texts = {name: str(kept.get(name) or "") for name in named}

@@ -1,4 +1,4 @@
-"""What every page shares: its template environment, its look, and figures for wide and narrow screens."""
+"""Shared parts of all pages: template environment, style, and figures for wide and narrow screens."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _anchor(title: str) -> str:
 
 
 def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Finding]]]:
-    """Findings that stand by themselves, each with those that name it as their cause."""
+    """Findings that have no cause among the others, each with the findings that name it as their cause."""
     findings = list(findings)
     codes = {finding.code for finding in findings}
     below: dict[str, list[Finding]] = {}
@@ -120,7 +120,7 @@ def _render(template: str, **content: Any) -> str:
 
 
 def _policy() -> str:
-    """What a browser lets a page do: show itself and run its one script, whatever else got into it."""
+    """Content security policy: a page may show itself and run its one script, whatever text it contains."""
     digest = base64.b64encode(hashlib.sha256(_text("report.js").encode()).digest()).decode()
     return (
         "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; style-src 'unsafe-inline'; "

@@ -1,4 +1,4 @@
-"""What every page and every terminal answer is made of: sections of text, tables and figures.
+"""Building blocks of every page and terminal answer: sections of text, tables and figures.
 
 Nothing here draws or prints: `page` renders sections as HTML, `cli.output` prints them.
 """
@@ -118,7 +118,7 @@ ROLES: tuple[Role, ...] = ("first", "second", "third", "bad", "ink", "muted")
 
 
 def positive(values: np.ndarray) -> np.ndarray:
-    """Gaps where a logarithmic axis has no place: at zero, below it, and where there is no number."""
+    """Values with NaN wherever a logarithmic axis cannot show them: values ≤ 0 or not finite."""
     values = np.asarray(values, float)
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
@@ -169,7 +169,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure that is declared: values against values."""
+    """A figure declared as data: values plotted against values."""
 
     name: str  # of figures/<name>.svg, unique on its page
     title: str  # what is seen, a phrase
@@ -190,7 +190,7 @@ class Plot:
 
     @property
     def alt(self) -> str:
-        """What the figure shows, in words and numbers, for who cannot see it."""
+        """Text alternative of the figure, in words and numbers, for readers who cannot see it."""
         parts = [f"{self.title}: {self.y_label} against {self.x_label}."]
         for series in self.series:
             y = np.asarray(series.y, float)
@@ -231,7 +231,7 @@ Part = Any  # str | Table | Browse | Code | Plot | Figure
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with what stands below it, in order."""
+    """A heading with its contents, in order."""
 
     title: str  # also what a finding names that this section shows
     parts: Sequence[Part] = ()  # paragraphs, tables, code, plots and figures
@@ -241,7 +241,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Key:
-    """A number that stands above everything else."""
+    """A headline number shown at the top of a page."""
 
     label: str
     value: str

@@ -1,4 +1,4 @@
-"""Numbers as people read them."""
+"""Formatting of numbers for people."""
 
 from __future__ import annotations
 
@@ -89,12 +89,12 @@ def _as_power(found: re.Match[str]) -> str:
 
 
 def heading(text: str) -> str:
-    """With a capital, unless its first word is a name of a program or a letter of a formula."""
+    """A heading, capitalized unless its first word is a program's name or a formula's letter."""
     first = text.split(" ", 1)[0]
     plain = first == "a" or (len(first) > 1 and first.isalpha() and first.islower())
     return text[:1].upper() + text[1:] if plain else text
 
 
 def listed(items: Sequence[str]) -> str:
-    """a, b and c."""
+    """Words joined as "a, b and c"."""
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
