@@ -147,7 +147,7 @@ def bounds(count: int, of: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Planted:
-    """What the rule said of a planted change."""
+    """Result of the test for one deliberately introduced change."""
 
     change: str  # what it is
     must_fail: bool  # whether it is another model; else only other rounding
@@ -326,7 +326,7 @@ def _windows(simulation: Simulation, start: Start | None) -> list[int]:
 
 @result
 class Benign:
-    """Whether B's runs belong to A's ensemble."""
+    """Whether B's runs are statistically consistent with the ensemble of A."""
 
     passed: bool  # whether they do
     window: int  # step of the comparison

@@ -44,7 +44,7 @@ _ROOT_BITS = 400
 
 @dataclass(frozen=True)
 class Horizon:
-    """Decisions of one run against their own rounding."""
+    """Ambiguity of one run's decisions with respect to the rounding error of the run."""
 
     # the last one before the first ambiguous decision; the last one followed where there is none, -1 where
     # the start is ambiguous
@@ -156,7 +156,7 @@ class AmbiguousDecision:
 
 @dataclass(frozen=True)
 class CertifiedHorizon:
-    """What is certain about the decisions of one run, from its own states."""
+    """Which decisions of one run are certain, given the states of that run."""
 
     # first step with an ambiguous decision; every decision before it would have come out the same in exact
     # arithmetic from the same states. None where there is none

@@ -69,7 +69,7 @@ class StoredFlip:
 
 @dataclass(frozen=True)
 class FolderFork:
-    """What two run folders hold about where their runs diverge."""
+    """Where two runs diverge, as read from their folders."""
 
     # world, a, b: "md" or "ball", and the folders
     world: str

@@ -51,7 +51,7 @@ FLIPS_KEPT = 100_000
 
 @result
 class Fork:
-    """What became of a pair of runs.
+    """Result of following a pair of runs.
 
     Attributes:
         twin: the pair.
@@ -319,7 +319,7 @@ def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
 
 @result
 class Screened:
-    """What one choice did within the horizon."""
+    """Effect of one choice within the horizon."""
 
     choice: str  # its name
     difference: str  # one line; why it does not apply where it does not

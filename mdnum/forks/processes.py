@@ -84,7 +84,7 @@ VARIANTS: tuple[Variant, ...] = (
 
 @dataclass(frozen=True)
 class Ran:
-    """What became of a variant."""
+    """Result of running a variant."""
 
     variant: Variant  # which
     hashes: tuple[str, ...]  # of the positions at steps 1, 2, ..., hexadecimal; empty where it failed

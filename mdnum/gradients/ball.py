@@ -30,7 +30,7 @@ from mdnum.registry import Registry
 
 
 class Use(NamedTuple):
-    """Whether the run used a parameter on the way to the loss, and the answer in words."""
+    """Whether the run used a parameter to compute the loss, with a description in words."""
 
     depends: bool
     note: str

@@ -52,7 +52,7 @@ _TRIES = 4
 
 
 class Differentiated(NamedTuple):
-    """A derivative from values."""
+    """A derivative computed from function values."""
 
     value: float  # the derivative
     error: float  # what truncation and noise leave uncertain: the disagreement of the last two extrapolations
@@ -270,7 +270,7 @@ class ShadowDifferences(Method):
 
 @dataclass(frozen=True)
 class Replicas:
-    """Starts that differ by chance alone."""
+    """Starts that differ only by random numbers."""
 
     count: int = 8  # how many
     seed: int = 0  # of the first one; the others count on from there

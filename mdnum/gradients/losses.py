@@ -40,7 +40,7 @@ class LossFrame(NamedTuple):
 
 
 class LossContext(NamedTuple):
-    """What a loss may know beside a frame; the box is that of the frame."""
+    """Quantities that a loss may use besides a frame; the box is that of the frame."""
 
     masses: Float[Array, "atoms"]  # of the atoms
     matrix: Float[Array, "3 3"]  # lattice vectors as rows, length
@@ -79,7 +79,7 @@ class Loss(eqx.Module):
         return cls(**options)
 
     def looks_at(self, steps: Int[np.ndarray, "rows"], last: int) -> Bool[np.ndarray, "rows"]:
-        """Which steps it looks at, of a run up to the last one."""
+        """Steps whose frames the loss uses, for a run with a given last step."""
         return (steps >= self.first) & ((steps - self.first) % self.every == 0)
 
     @abstractmethod
@@ -96,7 +96,7 @@ class Loss(eqx.Module):
 
 
 class _OfLast(Loss):
-    """Of the last step alone."""
+    """A loss that uses only the last step."""
 
     def looks_at(self, steps, last):
         return steps == last
@@ -343,12 +343,12 @@ class RadialDistribution(Loss):
 
     @property
     def width(self) -> float:
-        """Of a bin, length."""
+        """Width of a bin, length."""
         return self.r_max / self.bins
 
     @property
     def centers(self) -> Float[Array, "bins"]:
-        """Of the bins, length."""
+        """Centers of the bins, length."""
         return (jnp.arange(self.bins, dtype=jnp.float64) + 0.5) * self.width
 
     def reason_unavailable(self, around: LossContext) -> str | None:

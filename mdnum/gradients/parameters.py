@@ -36,7 +36,7 @@ _INTEGERS = {
 
 @dataclass(frozen=True)
 class Cotangents:
-    """Derivatives of a loss by everything that a rollout is made of."""
+    """Derivatives of a loss with respect to all inputs of a rollout."""
 
     model: Any  # by the quantities of the force (`quantities`)
     integrator: Integrator  # by the leaves of the integrator that are numbers

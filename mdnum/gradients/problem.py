@@ -1,4 +1,4 @@
-"""What a derivative of a rollout is asked for and answered with, and what every method is."""
+"""Definition of a derivative of a rollout: the problem, the result, and the base class of the methods."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Problem:
             object.__setattr__(self, "parts", tuple(replace(self, loss=one) for one in parts))
 
     def at(self, values: Values) -> Problem:
-        """The same loss of a rollout with other parameters."""
+        """The same loss for a rollout with other parameter values."""
         return replace(self, simulation=parameters.with_values(self.simulation, values)) if values else self
 
     def value(self, values: Values | None = None) -> Any:
@@ -197,7 +197,7 @@ _SPELLINGS = {"epochs": "unrolled", "recursive": "unrolled"}
 
 
 def method(name: str) -> Method:
-    """The method of that name, with its defaults.
+    """The method of a given name, with its default options.
 
     Example:
         >>> mdnum.method("symmetric")
@@ -228,7 +228,7 @@ def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: boo
 
 
 def pairs_only(simulation: Simulation, *, any_step: bool = False) -> str | None:
-    """Why the reverse pass of pairs does not apply; None where it does.
+    """Reason why the reverse pass for pair potentials does not apply; None where it does.
 
     Args:
         any_step: whether it is for any integrator.

@@ -62,7 +62,7 @@ class TapeStretch:
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes."""
+        """Memory that the stretch occupies, bytes."""
         kept = ([getattr(self, name) for name in _COLUMNS], self.x_before, self.table.index)
         return sum(array.nbytes for array in jax.tree.leaves(kept))
 
@@ -84,7 +84,7 @@ class TapeStretch:
 
     @property
     def steps(self) -> Int[np.ndarray, "room"]:
-        """Step of each row."""
+        """Step number of each row."""
         return self.first + np.arange(len(self.x))
 
     @property
@@ -120,7 +120,7 @@ def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) 
 
 
 class Pace(NamedTuple):
-    """How often a loss looks."""
+    """How often a loss uses a frame."""
 
     between: Int[Array, ""]  # steps from one frame to the next; 0 where they are not a series at equal times
     first: Int[Array, ""]  # step of the first frame

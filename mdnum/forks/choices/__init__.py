@@ -1,4 +1,4 @@
-"""What can be varied, one numerical choice at a time, of either world."""
+"""Numerical choices that can be varied one at a time, for molecular dynamics and for the ball."""
 
 from __future__ import annotations
 

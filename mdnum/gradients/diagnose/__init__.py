@@ -54,7 +54,7 @@ _ERRORS = 5.0
 
 @dataclass(frozen=True)
 class Opinion:
-    """What one method gives."""
+    """The gradient that one method gives."""
 
     method: str  # its name
     description: str  # which derivative it gives, one sentence
@@ -65,7 +65,7 @@ class Opinion:
 
 @dataclass(frozen=True)
 class GradientDifference:
-    """The derivatives of two methods by one parameter."""
+    """Comparison of two methods' derivatives with respect to one parameter."""
 
     name: str  # full name of the parameter
     # method, reference: names of the two methods
@@ -91,7 +91,7 @@ class Agreement:
     comparisons: tuple[GradientDifference, ...]
 
     def gradient(self, method: str) -> Gradient | None:
-        """What a method found."""
+        """The gradient that a given method found."""
         return next((one.found for one in self.opinions if one.method == method), None)
 
 

@@ -1,4 +1,4 @@
-"""How far a gradient can be trusted, and what ends the trust.
+"""The longest horizon at which a gradient can be trusted, and what limits the horizon.
 
 Five things do: the rounding errors of the run have grown until another precision gives another gradient;
 half the time step gives another gradient; a pair turned around so near its cutoff that another time step
@@ -208,7 +208,7 @@ def first_difference(a: Horizons, b: Horizons) -> int | None:
 
 @dataclass(frozen=True)
 class Limit:
-    """One of the things that end trust in a gradient."""
+    """One of the limits on the horizon of a trustworthy gradient."""
 
     what: str  # ROUNDING, STEP, NEAR, FLIPS, AMBIGUOUS or SCATTER
     # the longest horizon, in steps, at which it did no harm; None where it was not examined
@@ -220,7 +220,7 @@ class Limit:
 
 @dataclass(frozen=True)
 class Judgment:
-    """How far derivatives can be trusted: by one parameter, or by all of them together."""
+    """The trustworthy horizon of derivatives, with respect to one parameter or to all of them together."""
 
     # "trusted" where every limit was examined and none was met, "limited" where one was met, else "undecided"
     verdict: str
