@@ -44,7 +44,7 @@ _ROOT_BITS = 400
 
 @dataclass(frozen=True)
 class Horizon:
-    """Ambiguity of one run's decisions with respect to the rounding error of the run."""
+    """Last step before the first ambiguous decision of a run, and the number of ambiguous decisions."""
 
     # the last one before the first ambiguous decision; the last one followed where there is none, -1 where
     # the start is ambiguous

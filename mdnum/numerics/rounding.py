@@ -76,7 +76,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Reach:
-    """Sizes of the intermediate results of a displacement between any two positions in a box."""
+    """Lattice vectors and largest coordinates of a box, which bound the rounding of a displacement."""
 
     # vectors of the periodic axes in the order in which they are taken off, length
     lattice: tuple[Vector, ...] = ()

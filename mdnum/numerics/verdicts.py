@@ -97,7 +97,7 @@ FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
 
 @dataclass(frozen=True)
 class Count:
-    """Number of pairs whose split was delayed."""
+    """Numbers of pairs whose split was delayed, and of pairs whose split was not."""
 
     pairs: int  # that were run, the pair itself among them
     later: int  # that were delayed by more than asked for
