@@ -736,7 +736,7 @@ def test_a_loop_is_told_nothing_about_files_and_commands(tmp_path, at):
     told = str(raised.value)
     if at:
         found, evidence = one.outcome.findings, one.outcome.verdict.evidence
-        assert {"STOPPED", "CENSORED", "READING", "UNEVEN_FRAMES"} <= codes(one.outcome)
+        assert {"STOPPED", "CENSORED", "READING", "MISSING_FRAMES"} <= codes(one.outcome)
         told += " ".join([*evidence, *(text for x in found for text in (x.title, x.text, x.remedy))])
     assert f"frame {115 if at else 50}" in told
     assert not re.search(r"\bfile|@|--", told)
