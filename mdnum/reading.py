@@ -195,7 +195,7 @@ def first_line(error: BaseException) -> str:
         # how a reader stumbles over an end is its own business, unless a word is no number
         text = []
     if (not text and isinstance(error, StopIteration | EOFError)) or (text and _ENDS in text[0]):
-        return "the file ends within this frame"
+        return "the file ends early"
     said = text[0].rstrip(".") if text else ""
     # the message of some is no more than a key or a number
     said = said if " " in said else f"{type(error).__name__}: {said}" if said else type(error).__name__

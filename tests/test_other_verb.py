@@ -253,7 +253,7 @@ def test_its_folder_is_one_clear_line_without_the_package(site, capsys):
     python = [sys.executable, "-P"]
     done = subprocess.run([*python, "-m", "mdnum", "report", "out"], env=environment(), stderr=-1, text=True)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
-    assert "makes folders of kind 'spread'" in done.stderr
+    assert "writes folders of kind 'spread'" in done.stderr
     code = "from mdnum.store import RunFolder; print(RunFolder.open('out').read('values')['value'].tolist())"
     read = subprocess.run([*python, "-c", code], env=environment(), stdout=-1, text=True)
     assert read.stdout.strip() == "[1.25, 2.0, 3.5]"
@@ -291,7 +291,7 @@ def test_a_folder_of_before_is_one_clear_line_and_its_tables_can_be_read(site, c
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "an earlier version" in error
     assert RunFolder.open("out").read("values")["value"].tolist() == [1.25, 2.0, 3.5]
-    with pytest.raises(FolderError, match="holds no table 'series'"):
+    with pytest.raises(FolderError, match="no table 'series'"):
         RunFolder.open("out").read("series")
 
 

@@ -145,7 +145,7 @@ def test_a_checkpoint_names_tables_and_no_files(tmp_path, killed, name):
     state, store = checkpoint.read(killed / "checkpoint.npz")
     # a checkpoint is listed as it is written
     checkpoint.write(killed / "checkpoint.npz", state, {**store, "rows": {**store["rows"], name: 0}}, {})
-    with pytest.raises(FolderError, match=r"checkpoint\.npz: counts what no folder"):
+    with pytest.raises(FolderError, match=r"checkpoint\.npz: counts rows of a table"):
         RunFolder.open(killed).resume()
     assert (tmp_path / "precious.parquet").read_bytes() == PRECIOUS
 
@@ -154,7 +154,7 @@ def test_a_checkpoint_unpacks_to_no_more_than_itself(tmp_path):
     path = tmp_path / "checkpoint.npz"
     np.savez_compressed(path, large=np.zeros(1 << 22))
     assert path.stat().st_size < 1 << 16
-    with pytest.raises(FolderError, match="it is packed"):
+    with pytest.raises(FolderError, match="is compressed"):
         checkpoint.read(path)
     np.savez(path, small=np.zeros(7))
     data = path.read_bytes()
@@ -197,12 +197,12 @@ def test_what_is_gone_or_foreign_is_told(finished):
         RunFolder.open(finished).read("epochs")
     pq.write_table(pa.table({"step": ["a", "b"]}), finished / "series.parquet")
     manifest.update(finished, {"series.parquet": [manifest.digest(finished / "series.parquet")]})
-    with pytest.raises(FolderError, match=r"series\.parquet: .* series \(column 'step' .*string\)"):
+    with pytest.raises(FolderError, match=r"series\.parquet: .* 'series' \(column 'step' .*string\)"):
         RunFolder.open(finished).read("series")
     (finished / "manifest.json").unlink()
     # nobody says what it was to hold
     assert RunFolder.open(finished).read("series")["step"].tolist() == ["a", "b"]
-    with pytest.raises(FolderError, match="holds no table 'epochs'"):
+    with pytest.raises(FolderError, match="no table 'epochs'"):
         RunFolder.open(finished).read("epochs")
     for text in ("[]", "3", "[" * 50_000, "\x00"):
         (finished / "summary.json").write_text(text)

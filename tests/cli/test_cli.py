@@ -300,7 +300,7 @@ def test_plain_makes_json_of_what_a_run_holds():
         "a": np.float64("inf"), "b": np.arange(3), "c": Path("x"), "d": (True, None), "e": np.bool_(True)
     }  # fmt: skip
     assert plain(document) == {"a": None, "b": [0, 1, 2], "c": "x", "d": [True, None], "e": True}
-    with pytest.raises(TypeError, match=r"object .*no plain form"):
+    with pytest.raises(TypeError, match=r"object .*plain data"):
         plain(object())
 
 

@@ -136,11 +136,11 @@ def test_what_cannot_be_judged_is_refused(hot):
     harmless = [change for change in planted(hot) if not change.must_fail]
     for message, call in (
         ("108 and 864 atoms", lambda: benign(pair(hot, build("argon/liquid-864"), "another system"))),
-        ("different noise", lambda: benign(pair(noisy, replace(noisy, integrator=other), "noise"))),
+        ("different random noise", lambda: benign(pair(noisy, replace(noisy, integrator=other), "noise"))),
         ("members = 5 are too few", lambda: calibrate(hot, members=5)),
         ("steps = 0", lambda: calibrate(hot, steps=0)),
         ("tries = 0", lambda: calibrate(hot, tries=0)),
-        ("no planted change", lambda: calibrate(hot, steps=100, changes=harmless)),
+        ("planted changes", lambda: calibrate(hot, steps=100, changes=harmless)),
     ):
         with pytest.raises(InputError, match=message):
             call()

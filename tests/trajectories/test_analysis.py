@@ -252,7 +252,7 @@ def test_an_atom_that_is_not_looked_at_spoils_nothing_and_widens_no_bound():
             {"atoms": lambda water: water.select_atoms("around 3 protein", updating=True)},
             "changes from frame",
         ),
-        ({"other": lambda water: moving().atoms}, "two universes"),
+        ({"other": lambda water: moving().atoms}, "different universes"),
         ({"atoms": lambda water: water.trajectory}, "Universe or an AtomGroup"),
     ],
 )

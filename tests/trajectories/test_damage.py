@@ -97,17 +97,17 @@ def test_what_is_not_there_is_told_as_what_it_is(tmp_path):
     for path in ("nowhere.xtc", "nowhere.xtc@3:"):
         refuse("no such file", path)
     refuse(r"nowhere.gro: no such file", datafiles.XTC, "nowhere.gro")
-    refuse("it is a folder", tmp_path)
+    refuse("is a folder", tmp_path)
     for world, said in (("flips", "holds results, and no trajectory"), ("md", "--save-every 1")):
         (tmp_path / "summary.json").write_text(json.dumps({"world": world}))
         refuse(said, tmp_path)
     path = written(tmp_path, "traj", images())
-    with pytest.raises(InputError, match=r"'name OW' names no atom .*9; .* Ar"):
+    with pytest.raises(InputError, match=r"'name OW' matches none of 9 .* Ar"):
         select(open_trajectory(path), "name OW")
-    with pytest.raises(InputError, match="no frame is left"):
+    with pytest.raises(InputError, match="contains no frame"):
         select(open_trajectory(f"{path}@9:"), "name Ar")
     assert list(open_trajectory(f"{path}@9:").frames()) == []
-    refuse("named twice", f"{path}@9:", slice=":2")
+    refuse("selected twice", f"{path}@9:", slice=":2")
 
 
 @pytest.mark.parametrize("kind", ["traj", "extxyz", "lammpstrj"])
@@ -152,12 +152,12 @@ def test_the_guard_takes_every_real_file():
 @pytest.mark.parametrize(
     ("kind", "damage", "said"),
     [
-        ("xtc", "cut", "file ends in it"),
+        ("xtc", "cut", "file ends within"),
         ("xtc", "hole", "damaged"),
         ("dcd", "cut", r"file ends after [\d,]+ bytes"),
-        ("trr", "cut", "file ends in it"),
-        ("trr", "head", "file ends in it"),
-        ("trr", "hole", "damaged: no head"),
+        ("trr", "cut", "file ends within"),
+        ("trr", "head", "file ends within"),
+        ("trr", "hole", "damaged: a frame header"),
     ],
 )
 def test_a_file_that_was_cut_or_damaged_is_read_up_to_there(tmp_path, small, kind, damage, said):
@@ -205,7 +205,7 @@ def test_an_amber_file_that_ends_early_is_read_up_to_there(tmp_path, name):
         cut.write_bytes(data[: begin + head.record // 2])
         opened = open_trajectory(cut)
         assert opened.reader == "mdnum" and opened.count == kept + 1
-        found = ends(cut, kept, f"head tells of {head.told} frames")
+        found = ends(cut, kept, f"header announces {head.told} frames")
         for one, good in zip(found, whole[:kept], strict=True):
             assert (one.index, one.time) == (good.index, good.time)
             np.testing.assert_array_equal(one.positions, good.positions)
@@ -236,7 +236,7 @@ def test_amber_files_without_a_whole_frame_or_with_more_than_their_head_names(
 def test_a_traj_that_was_cut_is_read_as_far_as_it_goes(tmp_path):
     path = written(tmp_path, "traj", images())
     path.write_bytes(path.read_bytes()[:-300])
-    ends(path, 4, "file ends in it")
+    ends(path, 4, "file ends early")
 
 
 # ---- text

@@ -110,7 +110,7 @@ def test_a_run_and_its_trajectory_write_one_table(tmp_path: Path) -> None:
     for outcome, lacking in zip((run, found), unknown, strict=True):
         folder = RunFolder.open(outcome.folder)
         assert folder.read("flips").keys() - set(named) == set(mine.column_names) - lacking
-        with pytest.raises(FolderError, match="has gaps"):
+        with pytest.raises(FolderError, match="missing values"):
             folder.read("flips", [*lacking])
 
 

@@ -267,11 +267,11 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch, name):
         ("argon/crystal-108", "precision", {"split": -1.0}, "split = -1"),
         ("argon/crystal-108", "precision", {"repeats": -1}, "repeats = -1"),
         ("argon/crystal-108", "precision", {"overrides": {"cutoff.knd": 1}}, "knd"),
-        ("argon/crystal-108", "precision", {"pin": "3-108"}, "no pair 3-108"),
-        ("argon/crystal-108", "precision", {"repeats": 2}, "repeats = 2; expected 0, or 4"),
+        ("argon/crystal-108", "precision", {"pin": "3-108"}, "pair 3-108"),
+        ("argon/crystal-108", "precision", {"repeats": 2}, "repeats = 2; expected 0 or at least 4"),
         # what would be left undone, and was without a word
         ("argon/crystal-108", "precision", {"repeats": 4, "counterfactual": False}, "repeats = 4"),
-        ("argon/crystal-108", "precision", {"back": True, "counterfactual": False}, "A under B's decisions"),
+        ("argon/crystal-108", "precision", {"back": True, "counterfactual": False}, "with B's decisions"),
         ("silicon/tersoff-512", "precision", {"repeats": 4}, "many-body"),
         ("ball/drop", "start", {"repeats": 4, "counterfactual": False}, "repeats = 4"),
         ("ball/drop", "all", {"split": 0.1, "repeats": 4}, "split and repeats"),
@@ -293,7 +293,7 @@ def test_overrides_of_a_loaded_system_and_used_folders_are_refused(tmp_path, fil
         mdnum.fork("pair/at-cutoff", "precision", steps=3, out=tmp_path)
     unfinished = RunFolder.create(tmp_path / "unfinished", frame.layout("fork"))
     unfinished.finalize()
-    with pytest.raises(FolderError, match="holds no answer"):
+    with pytest.raises(FolderError, match="holds no result"):
         frame.finish(unfinished)
 
 
