@@ -25,6 +25,7 @@ DOCUMENTED = set(re.findall(r"`(mdnum(?:\.[a-z]+)+)`", PAGE))
 INSIDE = {
     "accelerator.py": {"mdnum.md"},
     "_processes.py": {"mdnum.provenance"},
+    "killed_sweeps.py": {"mdnum.sweeps", "mdnum.sweeps.measures", "mdnum.verbs"},
     "learned_gradients.py": {"mdnum.md"},
     "lost_flips.py": {"mdnum.plain"},
     "measure_documents.py": {"mdnum.provenance"},

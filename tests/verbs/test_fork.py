@@ -268,7 +268,7 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch, name):
         ("argon/crystal-108", "precision", {"repeats": -1}, "repeats = -1"),
         ("argon/crystal-108", "precision", {"overrides": {"cutoff.knd": 1}}, "knd"),
         ("argon/crystal-108", "precision", {"pin": "3-108"}, "pair 3-108"),
-        ("argon/crystal-108", "precision", {"repeats": 2}, "repeats = 2; expected 0 or at least 4"),
+        ("argon/crystal-108", "precision", {"repeats": 2}, "repeats = 2"),
         # what would be left undone, and was without a word
         ("argon/crystal-108", "precision", {"repeats": 4, "counterfactual": False}, "repeats = 4"),
         ("argon/crystal-108", "precision", {"back": True, "counterfactual": False}, "with B's decisions"),
