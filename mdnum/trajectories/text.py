@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import io
 import re
-import tomllib
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -31,7 +30,8 @@ from ase.io.trajectory import TrajectoryReader
 from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.reading import ase_images, ignored_velocities, reading, whole_text, with_elements
+from mdnum.reading import ase_images, ignored_velocities, reading, with_elements
+from mdnum.store import RunFolder
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.topology import AtomTable, Topology, topology_universe
 from mdnum.trajectories.trajectory import Trajectory
@@ -133,10 +133,9 @@ def format_of(path: Path) -> str:
 
 def _units(path: Path) -> Units:
     """Units of the mdnum run that a file belongs to; else ASE's Å, and ps for times and velocities."""
-    system = path.parent / "system.toml"
-    if path.name != "trajectory.traj" or not system.exists():
+    if path.name != "trajectory.traj":
         return METAL
-    return units_named(str(tomllib.loads(whole_text(system, system)).get("units", "metal")))
+    return units_named(str(RunFolder(path.parent).system.get("units", "metal")))
 
 
 # ---- text

@@ -198,9 +198,12 @@ def test_ase_files_keep_every_digit(tmp_path, name):
             np.testing.assert_allclose(frame.velocities, image.get_velocities() * 1e3 * units.fs, rtol=1e-12)
 
 
-def test_a_run_of_mdnum_has_its_units(tmp_path):
+@pytest.mark.parametrize(
+    ("file", "text"), [("system.toml", 'units = "lj"\n'), ("simulation.json", '{"units": "lj"}')]
+)
+def test_a_run_of_mdnum_has_its_units(tmp_path, file, text):
     ase.io.write(tmp_path / "trajectory.traj", argon())
-    (tmp_path / "system.toml").write_text('units = "lj"\n')
+    (tmp_path / file).write_text(text)
     trajectory = open_trajectory(tmp_path)
     assert (trajectory.length, trajectory.time) == ("σ", "τ")
     np.testing.assert_allclose(next(trajectory.frames()).velocities, argon()[0].get_velocities())
