@@ -436,7 +436,7 @@ def test_what_has_no_history_is_refused():
         running_sum_table(np.zeros(0))
     with pytest.raises(InputError, match="not finite"):
         running_sum_table([1.0, math.inf])
-    with pytest.raises(InputError, match=r"^Exact\(\) .*not a sequential loop.*reversed"):
+    with pytest.raises(InputError, match=r"^Exact\(\) .*sequential loop.*reversed"):
         running_sum_table([1.0], BY_NAME["exact"])
 
 

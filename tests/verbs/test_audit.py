@@ -195,8 +195,8 @@ def test_a_calculator_that_fails_is_a_finding_with_its_structure(make, why, tmp_
     ("asked", "message"),
     [
         ({"checks": ","}, "no check was given"),
-        ({"structure": Atoms()}, "without atoms"),
-        ({"calculator": 7}, "that is a int"),
+        ({"structure": Atoms()}, "has no atoms"),
+        ({"calculator": 7}, "is a int"),
         ({"time": 0.0}, "--time"),
     ],
 )
@@ -413,7 +413,7 @@ def test_a_deadline_ends_an_audit_and_the_rest_is_resumed(tmp_path, monkeypatch)
     Spent.looks = 3
     less = ask(planted.Good, time=1.0, resume=tmp_path / "cut", report=False)
     assert less.summary["headline"] == cut.summary["headline"]
-    with pytest.raises(InputError, match="has no name"):
+    with pytest.raises(InputError, match="without a name"):
         ask(resume=tmp_path / "cut")
     done = ask(planted.Good, resume=tmp_path / "cut", report=False)
     assert without_times(done.summary) == without_times(whole.summary)
