@@ -297,6 +297,9 @@ def test_a_folder_of_before_is_one_clear_line_and_its_tables_can_be_read(site, c
 
 def test_a_kind_that_nobody_declares_is_refused_before_a_folder_is_made(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=r"no verb .* kind 'nothing'"), frame.answering("nothing", "x"):
+    with (
+        pytest.raises(InputError, match=r"installed verb .* kind 'nothing'"),
+        frame.answering("nothing", "x"),
+    ):
         pass
     assert not list(tmp_path.iterdir())

@@ -65,7 +65,7 @@ def test_a_name_with_and_without_its_argument(rules):
     assert "fixed" in rules and "fixt" not in rules
     told = [rules.description(name) for name in ("plain", "fixed")]
     assert told == ["A rule. More of it", "Seven"]
-    with pytest.raises(ValueError, match="two values"):
+    with pytest.raises(ValueError, match="registered twice"):
         rules.add("plain", Rule)
 
 
