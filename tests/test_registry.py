@@ -73,7 +73,7 @@ def test_a_name_with_and_without_its_argument(rules):
     ("text", "message"),
     [
         ("fixd", "'fixd' … fixed? … plain, strict"),
-        ("x" * 10_000, "no rule"),
+        ("x" * 10_000, "unknown rule"),
         ("fixed=3", "takes no argument"),
         ("made=3", "takes no argument"),
         ("strict", "needs an argument: strict=..."),
@@ -116,12 +116,12 @@ def test_a_package_cannot_take_a_name_that_is_there(rules, installed):
     installed("first-rules", {}, {GROUP: {"plain": "anything:Rule"}})
     assert rules["plain"] is Rule
     for looked_up in (lambda: list(rules), lambda: rules["unknown"]):
-        with pytest.raises(InputError, match=r"first-rules adds .*'plain', .*mdnum has"):
+        with pytest.raises(InputError, match=r"first-rules adds .*'plain', .*mdnum already"):
             looked_up()
 
 
 def test_two_packages_cannot_add_the_same_name(rules, installed):
     installed("first-rules", {}, {GROUP: {"wide": "first:Rule"}})
     installed("second-rules", {}, {GROUP: {"wide": "second:Rule"}})
-    with pytest.raises(InputError, match=r"-rules adds .*'wide', .*-rules has"):
+    with pytest.raises(InputError, match=r"-rules adds .*'wide', .*-rules already"):
         rules.parse("wide")

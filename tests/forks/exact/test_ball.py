@@ -60,7 +60,7 @@ def test_exact_numbers(a, b, c):
 
 
 def test_a_number_that_is_none():
-    with pytest.raises(ValueError, match="no number"):
+    with pytest.raises(ValueError, match="not a number"):
         exact.exactly(float("nan"))
 
 
