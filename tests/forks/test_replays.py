@@ -91,7 +91,7 @@ def test_words_name_a_decision():
 
 def test_what_cannot_be_pinned_is_refused(found):
     for bad in ((5, 5), (3, 108)):
-        with pytest.raises(InputError, match=f"no pair {bad[0]}-{bad[1]}"):
+        with pytest.raises(InputError, match=f"pair {bad[0]}-{bad[1]}"):
             pinned(found, [bad])
     with pytest.raises(InputError, match="do not fork"):
         pinned(replace(found, decision=None))
