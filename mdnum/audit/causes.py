@@ -24,7 +24,7 @@ def _codes(names: Sequence[str], code: str) -> Iterator[str]:
         yield from group[group.index(code) + 1 :] if code in group else group
 
 
-_ROWS = beside(__file__)
+_ROWS = dict(beside(__file__))
 _GROUPS: dict[str, list[str]] = _ROWS.pop("groups")
 #: What separates causes that look alike, by the name under which a check reports that it has been done.
 TESTS: dict[str, str] = _ROWS.pop("tests")

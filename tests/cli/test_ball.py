@@ -126,7 +126,7 @@ def test_a_demonstration_for_people(demo: dict[str, Demo], capsys: pytest.Captur
     assert lines[-1] == "wrote page/report.html"
     page = Path("page/report.html").read_text(encoding="utf-8")
     first, rest = page.split('<figure id="figure-fork-line">')
-    assert first.index('<p class="headline">It is −1.5') < first.index("1 check held") < first.index("Why?")
+    assert first.index('<p class="headline">It is −1.5') < first.index("passed") < first.index("Why?")
     assert "&lt;b&gt;" in rest and "large first" in rest and "<table" not in first
     assert "&lt;b&gt;" in page and f": {demo['fork'].in_md}" in page
     names = {path.name for path in Path("page").rglob("*")}
