@@ -334,7 +334,7 @@ def test_a_killed_run_is_judged_up_to_its_checkpoint_and_none_without_a_step(tmp
     assert RunFolder.open(folder.path).resume() == {"step": 30}
     empty = RunFolder.create(tmp_path / "empty", frame.layout("md"))
     write_text(empty.path / "system.toml", 'units = "lj"')
-    with pytest.raises(FolderError, match="empty: .*no step"):
+    with pytest.raises(FolderError, match=r"empty: .*no step"):
         frame.finish(empty)
 
 
