@@ -3,8 +3,8 @@
     python scripts/makers/draw_sentences.py --seed 3
 
 Eight sentences each of findings (pages and terminal), help texts, errors, docstrings and documents. A reader
-marks each as clear at first reading or not, with the words that stopped them. `sentences.toml` next to this
-file lists the sentences drawn before and after a revision, with their marks.
+marks each as clear at first reading or not, with the words that stopped them. `sentences.toml` next to
+this file lists sentences that were drawn, with the marks of a reader.
 """
 
 from __future__ import annotations
