@@ -198,7 +198,7 @@ def test_the_tangent_is_the_difference_of_two_runs():
 def test_bad_input_is_refused():
     zero = np.zeros_like(crystal().positions)
     for words, call in (
-        ("nothing", lambda: forecast(crystal(), 10, dx=zero)),
+        ("is zero", lambda: forecast(crystal(), 10, dx=zero)),
         ("shape of the start", lambda: forecast(crystal(), 10, dx=zero[:5])),
         ("many-body", lambda: forecast(build("copper/eam-500"), 10)),
         ("too few", lambda: lyapunov(crystal(), 40)),

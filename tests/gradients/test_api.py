@@ -80,7 +80,7 @@ def test_what_is_no_loss_or_cannot_be_traced_or_named_is_refused(problem):
         (lambda: loss({"epsilon": 1.0}), "is not a parameter"),
         (lambda: value_and_grad(problem, ("sigma",), "symetric"), "Did you mean symmetric"),
         (lambda: value_and_grad(problem, ("seed",)), "seed"),
-        (lambda: loss({"sigma": jnp.asarray(np.nan)}), "expected finite numbers"),
+        (lambda: loss({"sigma": jnp.asarray(np.nan)}), "expected finite real"),
         (lambda: Problem(simulation, vector, STEPS), "shape \\(3,\\)"),
         (lambda: Problem(simulation, count, STEPS), "int.*varies"),
     ):
