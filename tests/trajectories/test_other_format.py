@@ -104,7 +104,7 @@ def test_a_frame_that_it_cannot_decode_ends_the_reading(site):
     [
         (READER.replace("def decoded", "def decode"), "strange-dots.*decoded"),
         (READER.replace("class Dots(Trajectory)", "class Dots"), "'dots' of package strange-dots"),
-        (READER.replace("super().__init__", "raise KeyError"), "strange-dots cannot open it"),
+        (READER.replace("super().__init__", "raise KeyError"), "strange-dots cannot open"),
     ],
     indirect=["site"],
 )
