@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 
 import pytest
+from programs import module_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -14,12 +14,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(scope="module")
 def maker():
     """scripts/makers/measure_documents.py as a module."""
-    path = ROOT / "scripts" / "makers" / "measure_documents.py"
-    place = importlib.util.spec_from_file_location("measure_documents", path)
-    assert place is not None and place.loader is not None
-    module = importlib.util.module_from_spec(place)
-    place.loader.exec_module(module)
-    return module
+    return module_of("scripts/makers/measure_documents.py")
 
 
 @pytest.fixture

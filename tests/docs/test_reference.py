@@ -6,7 +6,6 @@ options in what `--help` prints, keys in the system files that are shipped and i
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import json
 import re
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from command_line import call
+from programs import module_of
 
 import mdnum
 
@@ -26,11 +26,7 @@ VERBS = sorted((ROOT / "mdnum" / "verbs").glob("*.toml"))
 @pytest.fixture(scope="module")
 def reference():
     """The maker of the pages, an extension of Sphinx that needs none of it."""
-    place = importlib.util.spec_from_file_location("reference", ROOT / "docs" / "_ext" / "reference.py")
-    assert place is not None and place.loader is not None
-    module = importlib.util.module_from_spec(place)
-    place.loader.exec_module(module)
-    return module
+    return module_of("docs/_ext/reference.py")
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from ase import Atoms
 from ase.build import bulk
 from ase.neighborlist import neighbor_list
 from oracles_manybody import L, embedded_atom, energy_and_forces, stillinger_weber, tersoff
+from programs import module_of
 
 import mdnum
 from mdnum.errors import InputError
@@ -207,13 +208,7 @@ def test_a_density_off_the_table_is_never_silent():
 
 
 def test_the_table_is_the_published_form():
-    import importlib.util
-
-    script = Path(__file__).parents[2] / "scripts" / "makers" / "make_eam_table.py"
-    spec = importlib.util.spec_from_file_location("make_eam_table", script)
-    assert spec is not None and spec.loader is not None
-    form = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(form)
+    form = module_of("scripts/makers/make_eam_table.py")
     found = form.properties(form.pair, form.density, form.embedding)
     digits = {"a (Å)": 5e-4, "E (eV/atom)": 5e-3, "C11 (GPa)": 0.05, "C12 (GPa)": 0.05, "C44 (GPa)": 0.05}
     for name, published in form.PAPER.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -11,17 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from programs import module_of
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "campaigns" / "foreign_files.py"
 
 
 @pytest.fixture
 def script() -> Any:
-    spec = importlib.util.spec_from_file_location("foreign_files", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_of("scripts/campaigns/foreign_files.py")
 
 
 @pytest.fixture

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Any
 
 import pytest
 from command_line import call
+from programs import module_of
 
 from mdnum.errors import InputError, MdnumError, printable
 from mdnum.report.finding import Finding
 from mdnum.systems import load, toml
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "campaigns" / "malformed_input.py"
-
 
 @pytest.fixture(scope="module")
 def campaign() -> Any:
     """The script, whose whole campaign takes minutes."""
-    spec = importlib.util.spec_from_file_location("malformed_input", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_of("scripts/campaigns/malformed_input.py")
 
 
 def test_a_short_campaign(campaign: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
