@@ -378,12 +378,8 @@ def names_page() -> str:
 
 
 def _about(registry: Any, name: str) -> str:
-    value = registry[name]
-    said = (
-        registry._descriptions.get(name) or getattr(value, "description", "") or getattr(value, "title", "")
-    )
-    said = said if isinstance(said, str) and said else inspect.getdoc(value) or ""
-    return said.split("\n")[0]
+    # a measure has a title in the place of a description
+    return getattr(registry[name], "title", "") or registry.description(name)
 
 
 def python_page() -> str:

@@ -119,5 +119,12 @@ def _seams(number: np.ndarray, step: np.ndarray, jumps: np.ndarray, atoms: int) 
         far, wrapped = step[k] > _SEAM * step[around].max(), jumps[k] > _SEAM * max(jumps[around].max(), 1)
         if far or (wrapped and jumps[k] > max(_FEW, 0.02 * atoms)):
             times = float(step[k] / max(step[around].mean(), np.finfo(float).tiny))
-            found.append({"number": int(number[k]), "times": times, "jumps": float(jumps[k] / atoms)})
+            found.append(
+                {
+                    "number": int(number[k]),
+                    "moved": bool(far),
+                    "times": times,
+                    "jumps": float(jumps[k] / atoms),
+                }
+            )
     return found

@@ -183,18 +183,15 @@ def examining(
     from mdnum.trajectories.lost import FrameMotion
     from mdnum.trajectories.residues import ByResidue
     from mdnum.trajectories.resolution import grid_effect, infer
+    from mdnum.trajectories.tracker import atoms_of
     from mdnum.trajectories.unwrapping import told as told_of_motion
 
     groups, residues = selected(opened, between), None
     if hydrogens is not None:
         residues = ByResidue.make(opened.table, groups, hydrogens, asked)
         groups = residues.groups
-    sample, moving = (
-        opened.sample(),
-        opened.atoms
-        if groups[0] is None
-        else len(np.union1d(groups[0], groups[0] if groups[1] is None else groups[1])),
-    )
+    sample, seen = opened.sample(), atoms_of(groups)
+    moving = opened.atoms if seen is None else len(seen)
     resolution = infer(sample, opened.bits, opened.format)
     rows = HeldRows(opened)
     passes = follow(opened, asked, groups, resolution, rows.add, residues)

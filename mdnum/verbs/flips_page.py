@@ -16,8 +16,6 @@ from mdnum.report.words import count, listed, many, number, percent, plain
 from mdnum.verbs import flips_loop
 from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, in_python, repeating, resolution
 
-#: Motion at a frame over that around it from which on a seam is one of motion.
-SEAM = 5.0
 #: Residues in a map of contacts.
 SHOWN = 300
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
@@ -205,7 +203,7 @@ def _others(view: FlipsView) -> Iterator[Finding]:
     yield from view.repeated(summary.get("repeats"))
     if across := summary.get("unwrapping"):
         if seams := across["seams"]:
-            kinds = ["moved" if one["times"] > SEAM else "wrapped" for one in seams[:_SEAMS]]
+            kinds = ["moved" if one["moved"] else "wrapped" for one in seams[:_SEAMS]]
             told = [TEXTS(f"seam_{kind}", **one) for kind, one in zip(kinds, seams, strict=False)]
             yield TEXTS.finding("RESTART_SEAM", seams=len(seams), places="; ".join(told))
         if across["not_whole"]:
@@ -370,7 +368,7 @@ def _numbers(view: FlipsView, one: Rule) -> list[tuple[str, str]]:
         **one, **around, **one["chatter"], "per_frame": number(one["flips_per_frame"], 4),
         "neighbors": average(around["mean"]), "mean": average(one["pairs_mean"]),
         "closest": None if closest is None else view.length(closest),
-        "of": "a residue" if view.by_residue else "an atom",
+        "of": view.one,
     }  # fmt: skip
     return TEXTS.rows("numbers", **values)
 
@@ -446,7 +444,6 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
 
     frames, moving = rows("frames"), view.summary["frames"] > 1
     label, x = view.axis(frames)
-    of = "a residue" if view.by_residue else "an atom"
     if moving:
         inside = Series("pairs inside", x, frames["pairs"].astype(float))
         yield plot("Pairs and flips", "pairs", [inside], along=label)
@@ -493,14 +490,14 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
     if moving and np.any(frames["fewest"] != frames["most"]):
         around = {"mean": "neighbors", "most": "most", "fewest": "fewest"}
         lines = {label: frames[name].astype(float) for label, name in around.items()}
-        yield plot("Neighbors", "neighbors", curves(x, lines, log=False), along=label, of=of)
+        yield plot("Neighbors", "neighbors", curves(x, lines, log=False), along=label, of=view.one)
     table = rows("neighbors")
     if len(table["neighbors"]) > 1:
         numbers = np.arange(table["neighbors"].min(), table["neighbors"].max() + 1)
         share = np.zeros(len(numbers))
         share[table["neighbors"] - numbers[0]] = table["counted"] / table["counted"].sum()
         distribution = [Series("", numbers, share, mark="line+points")]
-        yield plot("Neighbors", "distribution", distribution, of=of)
+        yield plot("Neighbors", "distribution", distribution, of=view.one)
 
 
 def _lasting(view: FlipsView, place: int) -> Table | None:

@@ -159,6 +159,11 @@ class FlipsView(View):
         return self.summary.get("by") == "residue"
 
     @property
+    def one(self) -> str:
+        """Whose neighbors are counted, in words."""
+        return "a residue" if self.by_residue else "an atom"
+
+    @property
     def unit(self) -> str:
         """The unit of length."""
         return self.summary["length"]
