@@ -310,7 +310,7 @@ def judged(place: Path, journal: Path, seeds: int) -> dict[str, int]:
 
 def main() -> None:
     """Kill, start again, and judge what is there."""
-    arguments = parser(__file__, __doc__)
+    arguments = parser(__doc__)
     arguments.add_argument("--points", type=int, default=1000, help="a multiple of 4")
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--pause", type=float, default=1.5, help="mean seconds between two kills")

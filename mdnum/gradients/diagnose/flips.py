@@ -87,7 +87,7 @@ def flips(
     if not kept:
         raise InputError(
             f"the contributions of flips to the derivative with respect to {', '.join(full)} need a tangent "
-            "for each of {sizes[full[0]]} entries",
+            f"for each of {sizes[full[0]]} entries",
             remedy="Add a scalar parameter",
         )
     if made is None:
