@@ -47,7 +47,7 @@ def moving(atoms=40, frames=4, seed=0):
         (datafiles.XTC, datafiles.GRO, "grid", 0.01),
         pytest.param(datafiles.TRR, datafiles.GRO, "float32", 0.0, marks=pytest.mark.nightly),
         (datafiles.DCD, datafiles.PSF, "float32", 0.0),
-        (datafiles.GRO, None, "grid", 0.01),
+        pytest.param(datafiles.GRO, None, "grid", 0.01, marks=pytest.mark.nightly),
         (datafiles.PDB_small, None, "grid", 0.001),
         # this one was made from text with three decimals, which its floats still show
         (datafiles.NCDF, datafiles.PRMncdf, "grid", 0.001),
