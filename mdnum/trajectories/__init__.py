@@ -1,6 +1,6 @@
-"""Anybody's trajectory: which pairs entered or left a cutoff between the frames of a file.
+"""Flips in any trajectory: the pairs that entered or left a cutoff between the frames of a file.
 
-`NeighborFlips` is an MDAnalysis analysis class; `mdnum flips` is the same for the command line.
+`NeighborFlips` is an MDAnalysis analysis class; the command `mdnum flips` does the same analysis.
 """
 
 from __future__ import annotations

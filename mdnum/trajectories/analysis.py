@@ -1,8 +1,8 @@
 """Flips as an MDAnalysis analysis: `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
 
-Frames may be spread over processes. A flip belongs to two frames, so that a process whose frames begin in the
-middle examines the frame before its first one too: nothing is lost between two parts, and the results are
-those of one process to the last bit. What two parts found at the frame that both examined is compared.
+Frames may be distributed over processes. A flip compares two successive frames, so each process also examines
+the frame before its first one: no flip is lost between two parts, and the results equal those of a single
+process bit for bit. The pairs that two processes find at a shared frame are compared.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mdnum.trajectories.trajectory import SAMPLE
 
 @dataclass(frozen=True)
 class RuleResult:
-    """What one membership rule gave."""
+    """Pairs, flips and contacts found with one membership rule."""
 
     rule: Rule
     flips: FlipTable  # a row per decision that differs from the frame before
@@ -54,15 +54,15 @@ class RuleResult:
 
     @property
     def ambiguous(self) -> float:
-        """Share of the flips that the file cannot tell; nan without flips."""
+        """Share of the flips that the resolution of the file leaves undecided; nan without flips."""
         return float(self.flips.ambiguous.mean()) if len(self.flips) else float("nan")
 
     def entered(self) -> Int[np.ndarray, "frames"]:
-        """Pairs that entered, per frame."""
+        """Return the number of pairs that entered at each frame."""
         return self._per_frame(self.flips.entered)
 
     def left(self) -> Int[np.ndarray, "frames"]:
-        """Pairs that left, per frame."""
+        """Return the number of pairs that left at each frame."""
         return self._per_frame(~self.flips.entered)
 
     def _per_frame(self, rows: Bool[np.ndarray, "flips"]) -> Int[np.ndarray, "frames"]:
@@ -71,7 +71,7 @@ class RuleResult:
 
 @dataclass
 class _ProcessPart:
-    """What one process found with one rule, frames counted from the first that it examined."""
+    """Results of one process for one rule; frame numbers count from the first frame it examined."""
 
     flips: list[FlipTable] = field(default_factory=lambda: [FlipTable.none()])  # of frames that have any
     rows: list[tuple[int, int, float]] = field(default_factory=list)  # (pairs, near, smallest margin)
@@ -79,13 +79,13 @@ class _ProcessPart:
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
 
     def end(self, last: Members) -> None:
-        """After its last frame; one table is sent to the parent faster than many."""
+        """Store the pairs inside at the last frame, and join the flips to one table, which is sent faster."""
         self.last, self.flips = last if self.rows else None, [FlipTable.concatenate(self.flips)]
 
 
 @dataclass
 class _Guarded:
-    """Frames of a trajectory one after the other, each checked before the library reads it."""
+    """Iterator over frames of a trajectory; each frame is checked before MDAnalysis reads it."""
 
     analysis: NeighborFlips
     numbers: np.ndarray
@@ -99,44 +99,45 @@ class _Guarded:
 
 
 class NeighborFlips(AnalysisBase):
-    """Which pairs entered or left a cutoff between the frames of a trajectory.
+    """Analysis of the pairs that enter or leave a cutoff between successive frames of a trajectory.
 
-    After `run`, `results` has for one rule all that `RuleResult` has (`flips`, `pairs`, `near`, `min_margin`,
-    `initial`, `last`, `contacts`, `occupancy`), and for several the same in each of `results.rules`; tables
-    among them have `to_pandas()`. With by="residue" a pair is one of residues, i and j are rows of
-    `results.residues`, and `results.left_out` counts atoms that were left out; `results.resolution` says how
-    finely the file tells where atoms are and `results.bound` what that does to a distance, per frame;
-    `results.repeats` which frames repeat earlier ones (see `repeats.RepeatedFrames`); `results.other_box` why
-    and as what the first frame's box may be read otherwise (see `Trajectory.other_box`), None for neither.
-    `frames` and `times` are those of the frames examined; `FlipTable.frame` counts among them.
+    After `run` with one rule, `results` has all attributes of `RuleResult` (`flips`, `pairs`, `near`,
+    `min_margin`, `initial`, `last`, `contacts`, `occupancy`); with several rules, each element of
+    `results.rules` has them. Tables have a method `to_pandas()`. With by="residue", pairs are pairs of
+    residues, i and j are rows of `results.residues`, and `results.left_out` counts the atoms that were left
+    out. `results.resolution` is the resolution of positions in the file, and `results.bound` the resulting
+    error bound of a distance, per frame. `results.repeats` lists the frames that repeat earlier ones (see
+    `repeats.RepeatedFrames`). `results.other_box` gives another possible reading of the first frame's box and
+    the reason for it (see `Trajectory.other_box`), or None. `frames` and `times` are those of the frames
+    examined; `FlipTable.frame` is an index into them.
 
-    When a frame cannot be read or holds what cannot be right, the results of the frames before it are kept
-    and the error names it.
+    If a frame cannot be read or holds impossible values, the error names the frame, and the results of the
+    frames before it are kept.
 
     Args:
-        universe_or_atomgroup: atoms of which pairs are made.
-        r_cut: the cutoff, Å; {("O", "H"): 2.5} for pairs of species; a list of them for several at once.
-        other: with it, pairs of one atom of each group; atoms may be in both.
-        rule: any membership rule or several, in the place of r_cut or beside it.
+        universe_or_atomgroup: the atoms that form pairs.
+        r_cut: the cutoff, Å; {("O", "H"): 2.5} for pairs of species; a list of cutoffs for several rules.
+        other: a second group; pairs then have one atom in each group, and an atom may be in both groups.
+        rule: one membership rule or several, instead of r_cut or in addition to it.
         by: "residue" for contacts between residues: inside while their smallest distance is below the cutoff.
-        hydrogens: whether hydrogens and virtual sites count in contacts between residues.
-        bound: how far a distance can be off, Å; None for what the resolution of the file gives, as it is
-            before transformations.
-        verbose: show progress.
+        hydrogens: True if hydrogens and virtual sites count in contacts between residues.
+        bound: the largest error of a distance, Å; None for the value that follows from the resolution of the
+            file before transformations.
+        verbose: True to show progress.
 
     Raises:
-        InputError: an empty or changing group, groups of two universes, no rule or none that can be, a
-            species that no atom has, no residues, a bound below 0. By `run` without a bound: transformations
-            change distances, or were made in memory.
+        InputError: a group is empty or changing, the groups belong to two universes, there is no valid rule,
+            no atom has a requested species, there are no residues, or the bound is negative. Raised by `run`
+            without a bound: transformations change distances, or were applied in memory.
 
-    Error: MDAnalysis hands coordinates over in float32; from there on everything is float64.
+    Error: MDAnalysis provides coordinates in float32; all later operations use float64.
     """
 
     _analysis_algorithm_is_parallelizable = True
 
     @classmethod
     def get_supported_backends(cls) -> tuple[str, ...]:
-        """Where frames can be spread to."""
+        """Return the names of the backends to which frames can be distributed."""
         return ("serial", "multiprocessing", "dask")
 
     def __init__(
@@ -192,13 +193,14 @@ class NeighborFlips(AnalysisBase):
         self._to_the_end = False
 
     def run(self, *args: Any, **kwargs: Any) -> NeighborFlips:
-        """As MDAnalysis's: start, stop, step, frames, verbose, backend, n_workers, n_parts.
+        """Run the analysis with MDAnalysis's arguments (start, stop, step, frames, verbose, backend, ...).
 
         Raises:
-            InputError: the frames asked for go backward or one is there twice; other processes cannot have a
-                transformation of the trajectory.
-            UnreadableFrame: a frame cannot be read; `results`, `frames` and `times` have those before it.
-            FrameError: likewise, a frame that holds what cannot be right.
+            InputError: the requested frames are not in ascending order, or a transformation of the trajectory
+                cannot be sent to other processes.
+            UnreadableFrame: a frame cannot be read; `results`, `frames` and `times` hold the frames before
+                it.
+            FrameError: a frame holds impossible values; the frames before it are kept in the same way.
         """
         super().run(*args, **kwargs)
         if (failure := self.results.failure) is not None:
@@ -207,7 +209,7 @@ class NeighborFlips(AnalysisBase):
         return self
 
     def _configure_backend(self, backend: Any, *args: Any, **kwargs: Any) -> Any:
-        """MDAnalysis's, which ends at a transformation that is a plain function."""
+        """Configure MDAnalysis's backend; reject transformations that cannot be sent to worker processes."""
         if backend != "serial":
             for one in getattr(self._trajectory, "transformations", ()):
                 if not getattr(one, "parallelizable", False):
@@ -223,7 +225,7 @@ class NeighborFlips(AnalysisBase):
     def _setup_computation_groups(
         self, n_parts: int, start: Any = None, stop: Any = None, step: Any = None, frames: Any = None
     ) -> list[np.ndarray]:
-        """MDAnalysis's, and what all parts must agree on: done once, before frames are spread."""
+        """Split the frames as MDAnalysis does, and determine once the properties that all parts share."""
         groups = super()._setup_computation_groups(n_parts, start, stop, step, frames)
         # who names the frames gets those
         self._to_the_end = frames is None and (stop is None or stop > len(self._trajectory))
@@ -268,7 +270,7 @@ class NeighborFlips(AnalysisBase):
 
     @property
     def library(self) -> LibraryFrames:
-        """The frames as the library reads them, opened when they are asked for in this process."""
+        """Frames as MDAnalysis reads them; the reader is opened at its first use in this process."""
         if self._library is None:
             self._library = LibraryFrames(self._trajectory)
             self._check.labels = self._library.labels(0)
@@ -318,7 +320,7 @@ class NeighborFlips(AnalysisBase):
         self.results.digests[0].append(self._digest)
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
-        """(how far a distance can be off, flips of each rule) at a timestep."""
+        """Return (error bound of a distance, flips of each rule) at a timestep."""
         frame = self._check(self.library.frame(ts, int(ts.frame)))
         self._digest = digest(frame)
         bound = self._bound_of(frame) if self._bound is None else self._bound
@@ -326,7 +328,7 @@ class NeighborFlips(AnalysisBase):
         return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
 
     def _bound_of(self, frame: Frame) -> float:
-        """How far a distance in the frame that was just read can be off, length."""
+        """Return the error bound of a distance in the frame that was read last, length."""
         if self._resolution is None:
             return 0.0
         atoms, raw = self._check.atoms, self.library.raw
@@ -370,7 +372,7 @@ class NeighborFlips(AnalysisBase):
         return str(getattr(self._trajectory, "filename", None) or "the trajectory")
 
     def _behind_the_last(self) -> FrameError | None:
-        """A frame behind the last one that the library has, which it leaves out."""
+        """Return an error if the file continues after the last frame that MDAnalysis lists, or None."""
         rest = left_over(self._trajectory) if self._to_the_end and len(self._numbers) else None
         count, where = int(self._trajectory.n_frames), self._where
         said = f"frame {count} cannot be read ({rest})"
@@ -378,9 +380,9 @@ class NeighborFlips(AnalysisBase):
 
 
 def _changed(before: Frame, after: Frame) -> float:
-    """How much distances between successive atoms differ that transformations should have kept, length.
+    """Return the largest change of a distance between successive atoms due to transformations, length.
 
-    Kept is one up to lattice vectors, or in a rotation.
+    Shifts of atoms by lattice vectors and rotations of the system do not count as changes.
     """
     if before is after:
         return 0.0
@@ -391,10 +393,10 @@ def _changed(before: Frame, after: Frame) -> float:
 
 
 def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
-    """The parts one after the other, frames counted from the first of all.
+    """Concatenate the results of all parts; frame numbers count from the first frame of the first part.
 
     Raises:
-        InputError: two processes found other pairs at the frame between them: the file changed meanwhile.
+        InputError: two processes found different pairs at a shared frame, because the file changed meanwhile.
     """
     tables, done, last = [FlipTable.none()], 0, None
     for part in parts:
@@ -417,7 +419,7 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
 
 
 def _group_of(atoms: Any, name: str) -> AtomGroup:
-    """The group; refuses one that is none, is empty, or changes from frame to frame."""
+    """Return the group; reject other objects, empty groups, and groups that change from frame to frame."""
     if isinstance(atoms, UpdatingAtomGroup):
         raise InputError(
             f"the group {name} changes from frame to frame; a pair that leaves the group would be "
@@ -435,7 +437,7 @@ def _group_of(atoms: Any, name: str) -> AtomGroup:
 
 
 def _rules_of(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
-    """Membership rules from what `NeighborFlips` takes for them."""
+    """Return the membership rules that the arguments r_cut and rule of `NeighborFlips` define."""
     rules: list[Rule] = []
     if r_cut is not None:
         several = isinstance(r_cut, list | tuple) or (isinstance(r_cut, np.ndarray) and r_cut.ndim)

@@ -1,7 +1,7 @@
-"""Frames as a program has them in memory: arrays of numpy, jax or torch that are given one after the other.
+"""Frames held in memory: arrays of numpy, jax or torch that a program passes one after another.
 
-ASE, vesin and torch-sim have lattice vectors as rows of a matrix (`cell`), jax-md as columns of an upper
-triangular one (`box`), and often positions in fractions of it.
+ASE, vesin and torch-sim store lattice vectors as rows of a matrix (`cell`); jax-md stores them as columns of
+an upper triangular matrix (`box`), and often stores positions as fractions of the box.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ _UPPER = (
 
 
 def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
-    """An array as numpy has it, not copied.
+    """Return values as a numpy array, without a copy.
 
     Raises:
-        InputError: it holds numbers of other kinds, floats of fewer than 32 bits, or quantities with units.
+        InputError: the numbers are of another kind, floats have fewer than 32 bits, or the values have units.
     """
     if hasattr(values, "value_in_unit"):
         remedy = "Give numbers: .value_in_unit(openmm.unit.nanometer), with length='nm'"
@@ -51,11 +51,11 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
 
 
 class ArrayFrames(Trajectory):
-    """Frames that a program gives one by one; each waits until the next is examined.
+    """Trajectory of frames that a program passes one by one; a frame is kept until the next one is examined.
 
     Args:
-        name: what they are called on a page.
-        species, cell, box, pbc, fractional, timestep, length, time: as of `mdnum.Recorder`.
+        name: name of the frames on a results page.
+        species, cell, box, pbc, fractional, timestep, length, time: as in `mdnum.Recorder`.
     """
 
     reader, in_memory, remembered = "mdnum", True, 10_000  # a loop may have any number of frames
@@ -76,10 +76,11 @@ class ArrayFrames(Trajectory):
         self, step: int, positions: Any, cell: Any = None, box: Any = None, pbc: Any = None,
         velocities: Any = None,
     ) -> Frame:  # fmt: skip
-        """The next frame, of what `mdnum.Recorder.see` takes.
+        """Return the next frame, built from the arguments of `mdnum.Recorder.see`.
 
         Raises:
-            InputError: arrays of another shape or kind than expected, or than before; two boxes.
+            InputError: the shape or dtype of an array is invalid or differs from earlier frames, or both cell
+                and box are given.
         """
         here, x = self._box_of(cell, box, pbc), host(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
@@ -102,7 +103,7 @@ class ArrayFrames(Trajectory):
         return Frame(int(step), int(step) * self._timestep, x, here, v)
 
     def put(self, frame: Frame) -> None:
-        """Adds the next frame."""
+        """Append the next frame."""
         self._waiting.append(frame)
         if len(self._first) < SAMPLE and len(frame.positions) == self.atoms:
             self._first.append(frame)
@@ -128,7 +129,7 @@ class ArrayFrames(Trajectory):
         return Box(matrix, np.array(repeats, bool))
 
     def _begin(self, x: np.ndarray, box: Box, bits: int) -> None:
-        """Checks what holds for all frames by the first."""
+        """Check and store the properties that all frames share, using the first frame."""
         fractional, remedy = self._fractional, "Say fractional=True, or fractional=False for lengths"
         unit = len(x) >= (_FEW if self.reach > 1 else _MANY) and x.min() >= 0 and x.max() <= 1
         if fractional is None and unit and box.shortest > 2:
@@ -152,7 +153,7 @@ class ArrayFrames(Trajectory):
 
     @classmethod
     def of(cls, frames: Any, reach: float, velocities: Any = None, **options: Any) -> ArrayFrames:
-        """Frames that are all there: an array, or ASE's Atoms in a list; reach as of the class."""
+        """Build a trajectory from a complete array of frames or list of ASE Atoms; reach as in the class."""
         given = {name: options.pop(name) for name in ("cell", "box") if name in options}
         found, given["velocities"] = cls("array", **options), velocities
         found.reach = reach
@@ -172,16 +173,16 @@ class ArrayFrames(Trajectory):
 
     @property
     def now(self) -> Frame:
-        """The frame that was examined last."""
+        """Frame that was examined last."""
         return self._waiting[0]
 
     def sample(self) -> list[Frame]:
-        """The first frames, as many as there are by now."""
+        """Return the first frames, as far as they are available yet."""
         return list(self._first)
 
     @contextmanager
     def raw_frames(self) -> Iterator[Callable[[int], Any]]:
-        """Gives frames by their place."""
+        """Yield a function that returns a frame by its number."""
 
         def get(number: int) -> Frame | None:
             while self._waiting and self._gone < number:
@@ -192,12 +193,12 @@ class ArrayFrames(Trajectory):
         yield get
 
     def decoded(self, number: int, raw: Any) -> Frame:
-        """A frame is one already."""
+        """Return the frame unchanged, since frames in memory need no decoding."""
         return raw
 
 
 def one_by_one(frames: Any, given: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """(a frame of many, what belongs to it) of keywords of `mdnum.Recorder.see_many`."""
+    """Yield each frame with its own keyword arguments, from the arguments of `mdnum.Recorder.see_many`."""
     frames = frames if isinstance(frames, list | tuple) else host(frames, "positions")
     given = {name: one for name, one in given.items() if one is not None}
     rows = {name for name, one in given.items() if isinstance(one, list) or name in ("energy", "velocities")}

@@ -1,13 +1,14 @@
-"""Binary files that are read with care: GROMACS's xtc and trr.
+"""Readers of GROMACS's xtc and trr files that check each frame before it is decoded.
 
-The library that decodes xtc files divides by zero, or writes where it must not, when bytes are wrong, and all
-that was read before is lost with the process. So each frame is looked at first. The compressed stream says
-how many bits each atom takes, and walking through it (decoding nothing) tells whether it is one: head, number
-of atoms, step sizes and length have to come out. Damage that leaves a stream which could have been written is
-not found. Source: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile), the walk alone.
+If bytes are wrong, the library that decodes xtc files divides by zero or writes outside its buffers, and all
+earlier results are lost with the process. Each frame is therefore examined first. The compressed stream
+states how many bits each atom takes; a walk through the stream, without decoding, verifies header, number of
+atoms, step sizes and length. Damage that leaves a valid stream is not detected. Source: the algorithm of
+xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile), the walk alone.
 
-MDAnalysis's readers of xtc and trr keep an index next to the file. They write it through links and trust it
-where it belongs to another file; nothing of the kind is done here. Source of trr: GROMACS, trrio.
+MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. They write the index through
+symbolic links, and trust it even if it belongs to another file; this module uses no index file. Source of the
+trr format: GROMACS, trrio.
 """
 
 from __future__ import annotations
@@ -48,16 +49,16 @@ _TEN = np.float32(10)
 
 
 def opened(trajectory: Any) -> XdrFile | None:
-    """The file behind an MDAnalysis trajectory; None where that is neither xtc nor trr."""
+    """Open the file of an MDAnalysis trajectory with a checking reader; None if it is neither xtc nor trr."""
     path, kind = file_of(trajectory), {"XTC": XtcFile, "TRR": TrrFile}.get(str(trajectory.format))
     return None if kind is None or path is None else kind(path)
 
 
 class XdrFile:
-    """Frames of a file of GROMACS's, by number. Nothing is written beside the file, nor read there.
+    """Frames of a GROMACS file by number; no index file is written or read.
 
     Raises:
-        ValueError: by every method, where bytes are not what they have to be or the file ends.
+        ValueError: raised by every method if bytes are invalid or the file ends early.
     """
 
     def __init__(self, path: str | Path):
@@ -67,11 +68,11 @@ class XdrFile:
         self._starts = [0]
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         self._file.close()
 
     def whole_frames(self) -> int:
-        """Frames up to the end of the file, or to the first whose head is damaged or whose end is missing."""
+        """Return the number of complete frames before the end of the file or the first damaged header."""
         number = 0
         try:
             while self._starts[number] < self._size:
@@ -82,11 +83,11 @@ class XdrFile:
         return number
 
     def ends_at(self, number: int) -> bool:
-        """Whether the file ends with the frame before this one."""
+        """Return True if the file ends with the frame before the given number."""
         return self.start(number) == self._size
 
     def start(self, number: int) -> int:
-        """Where a frame begins, bytes."""
+        """Return the byte offset at which a frame begins."""
         while len(self._starts) <= number:
             at = len(self._starts) - 1
             self._stream(at)
@@ -97,11 +98,11 @@ class XdrFile:
         return self._starts[number]
 
     def check(self, number: int) -> None:
-        """Examines a frame without decoding it."""
+        """Check a frame without decoding it."""
         self.start(number + 1)
 
     def _stream(self, number: int, look: bool = False) -> None:
-        """Goes to the end of a frame, through its coordinates or past them."""
+        """Move the file position to the end of a frame; with look, verify the coordinates on the way."""
         raise NotImplementedError
 
     def _read(self, count: int) -> bytes:
@@ -112,7 +113,7 @@ class XdrFile:
 
 
 class XtcFile(XdrFile):
-    """Frames of an xtc file."""
+    """Reader of the frames of an xtc file."""
 
     bits = 32
 
@@ -122,24 +123,24 @@ class XtcFile(XdrFile):
         self._at = 0
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         super().close()
         if self._library is not None:
             self._library.close()
 
     @property
     def atoms(self) -> int:
-        """Atoms of the first frame."""
+        """Number of atoms in the first frame."""
         return self._head(0)[1]
 
     def check(self, number: int) -> None:
-        """Looks at a frame without decoding it."""
+        """Check a frame without decoding it."""
         self._stream(number, look=True)
         if len(self._starts) == number + 1:
             self._starts.append(self._file.tell())
 
     def read(self, number: int) -> Any:
-        """A frame as the library decodes it, in nm and ps, once it has been checked."""
+        """Check a frame, and return it as decoded by MDAnalysis's library, in nm and ps."""
         self.check(number)
         if self._library is None:
             from MDAnalysis.lib.formats.libmdaxdr import XTCFile
@@ -186,10 +187,10 @@ class XtcFile(XdrFile):
 
 @njit
 def _walk(stream, atoms, whole, small):
-    """Bits that the coordinates of so many atoms take; -8 where the stream is none.
+    """Return the number of bits that the coordinates of `atoms` atoms take; -8 if the stream is invalid.
 
-    An atom takes `whole` bits, and after it comes a flag; where it is set, five bits that say how many atoms
-    follow as differences of `small` bits each, and whether `small` changes.
+    An atom takes `whole` bits, followed by a flag. If the flag is set, the next five bits state how many of
+    the following atoms are stored as differences of `small` bits each, and whether `small` changes.
     """
     at, done, run = 0, 0, 0
     most = 8 * stream.shape[0]
@@ -222,20 +223,20 @@ def _walk(stream, atoms, whole, small):
 
 
 class TrrFile(XdrFile):
-    """Frames of a trr file, in float32 or float64 as they are written."""
+    """Reader of the frames of a trr file, in float32 or float64 as stored."""
 
     @property
     def atoms(self) -> int:
-        """Atoms of the first frame."""
+        """Number of atoms in the first frame."""
         return self.head(0)[0]
 
     @property
     def bits(self) -> int:
-        """Width of its numbers."""
+        """Width of the numbers in the file, in bits."""
         return 8 * self.head(0)[1]
 
     def head(self, number: int) -> tuple[int, int, list[int]]:
-        """(atoms, bytes of a number, bytes of the ten blocks) of a frame; the file is then at its time."""
+        """Return (atoms, bytes per number, bytes of the ten blocks) of a frame; stop at its time."""
         self._file.seek(self.start(number))
         magic, _, _, word, *numbers = _TRR.unpack(self._read(_TRR.size))
         sizes, atoms, box = numbers[:10], numbers[10], numbers[_BOX]
@@ -248,7 +249,7 @@ class TrrFile(XdrFile):
         return atoms, width, sizes
 
     def has_box(self, number: int) -> bool:
-        """Whether a frame has one."""
+        """Return True if the frame has a box."""
         return self.head(number)[2][_BOX] > 0
 
     def _stream(self, number: int, look: bool = False) -> None:
@@ -256,7 +257,7 @@ class TrrFile(XdrFile):
         self._file.seek(2 * width + sum(sizes), 1)
 
     def read(self, number: int) -> tuple[float, Any, np.ndarray, Any]:
-        """(time, box or None, positions, velocities or None) of a frame, in nm and ps."""
+        """Return (time, box or None, positions, velocities or None) of a frame, in nm and ps."""
         _, width, sizes = self.head(number)
         time, *blocks = [np.frombuffer(self._read(size), f">f{width}") for size in (2 * width, *sizes)]
         box, x, v = (
@@ -268,7 +269,7 @@ class TrrFile(XdrFile):
 
 
 class XtcTrajectory(Trajectory):
-    """An xtc file, in Å and ps. Its coordinates are integers, and float32 by the time they come here."""
+    """An xtc trajectory, in Å and ps. Coordinates are integers in the file, and are decoded to float32."""
 
     format = "XTC"
     reader = "MDAnalysis"
@@ -310,7 +311,7 @@ class XtcTrajectory(Trajectory):
 
 
 class TrrTrajectory(XtcTrajectory):
-    """A trr file, in Å and ps."""
+    """A trr trajectory, in Å and ps."""
 
     format = "TRR"
     reader = "mdnum"

@@ -1,7 +1,7 @@
-"""Where all atoms together do not move: damage that leaves finite numbers.
+"""Detection of impossible motions of all atoms together, left by damage whose numbers are still finite.
 
-A counter that overflowed puts one coordinate of every atom at one value, an offset that was misread shifts
-them. Planar and straight systems, drift, and wrapping are none of it.
+An overflowed counter sets one coordinate of every atom to a single value, and a misread offset shifts all
+atoms. Planar and linear systems, drift, and wrapping are not reported.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FAR, _FAR_FEW = 300.0, 1e4
 
 @dataclass
 class Collective:
-    """What is known of some atoms in the frames before."""
+    """Extents and positions of some atoms in the frames examined so far."""
 
     least: Float[np.ndarray, "3"] | None = None  # the smallest of `spreads` in any of them, length
     last: Float[np.ndarray, "some 3"] | None = None  # positions in the last one
@@ -35,13 +35,13 @@ class Collective:
     level: Bool[np.ndarray, "3"] | None = None  # coordinates that all atoms had in common in each of them
 
     def refuse(self, x: Float[np.ndarray, "some 3"], atoms: int, side: float, far: float) -> str | None:
-        """Why the atoms cannot have moved to where they are now, in words; None where they may have.
+        """Return the reason why the atoms cannot have moved to their present positions, or None.
 
         Args:
-            x: positions of some of them, which stand for all.
-            atoms: how many there are.
-            side: the shortest lattice vector, length; 0 without any.
-            far: what is far between two frames in this box, length; 0 without one.
+            x: positions of a sample of the atoms, which represents all atoms.
+            atoms: number of all atoms.
+            side: the shortest lattice vector, length; 0 without a periodic direction.
+            far: the displacement between two frames that counts as far in this box, length; 0 without a box.
         """
         now, least, last, alike = spreads(x), self.least, self.last, self.alike
         share, axis, value = _most_alike(x)
@@ -69,7 +69,7 @@ class Collective:
         return None
 
     def left(self, x: Float[np.ndarray, "some 3"], atoms: int) -> str:
-        """What all atoms had in common in all frames before, if they cannot have left it so; else empty."""
+        """Return the coordinates shared in all earlier frames, if atoms lost them too suddenly; else ""."""
         last, was, level = self.last, self.level, (x == x[0]).all(axis=0)
         self.level = level if was is None else was & level
         if last is None or was is None or atoms <= _FEW or not was.any() or np.any(self.level):
@@ -84,16 +84,17 @@ class Collective:
 
 
 def spreads(x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "3"]:
-    """Standard deviations along the principal axes, length, the smallest first."""
+    """Return the standard deviations along the principal axes, length, in ascending order."""
     away = x - x.mean(axis=0)
     return np.sqrt(np.maximum(np.linalg.eigvalsh(away.T @ away / len(x)), 0.0))
 
 
 def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> str | None:
-    """Where atoms of these spreads lie, in words, if that is a plane, a line or a point and never was before.
+    """Describe the plane, line or point on which atoms with these spreads lie for the first time, or None.
 
-    Rippled sheets and bent chains may become flat and straight: across them atoms have to have been further
-    apart than neighbors along them, or, where a coordinate is constant, a fifth of all of it.
+    Rippled sheets and bent chains may become flat and straight. A collapse is therefore reported only if the
+    earlier spread across the sheet or chain exceeded the distance of neighbors along it or, if a coordinate
+    is constant, a fifth of the largest spread.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):
@@ -106,9 +107,9 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
 
 
 def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
-    """(share of atoms with the most frequent coordinate, the axis, the coordinate).
+    """Return (share of atoms with the most frequent coordinate, its axis, its value).
 
-    Less the share with the second: in a crystal one is as frequent as the other.
+    The share of the second most frequent coordinate is subtracted: in a crystal, both are equally frequent.
     """
     ordered = np.sort(x, axis=0)
     repeated = np.count_nonzero(ordered[1:] == ordered[:-1], axis=0)
@@ -121,7 +122,7 @@ def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
 
 
 def _shift(before: np.ndarray, now: np.ndarray, far: float) -> float:
-    """How far all atoms are shifted from where they were, length; 0 where not far, or not together."""
+    """Return the common displacement of all atoms, length; 0 if it is small or not common to all."""
     moved = now - before
     if len(now) < 2 or not far or np.abs(moved).max() <= far / (2 * _SUDDEN):
         return 0.0

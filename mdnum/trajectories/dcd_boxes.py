@@ -1,9 +1,10 @@
-"""What the six numbers of a box in a DCD file mean: the format does not say, and there are three conventions.
+"""Meaning of the six box numbers in a DCD file: there are three conventions, and no record of the choice.
 
-Lengths and cosines of the angles (NAMD, VMD, LAMMPS, MDAnalysis since 2.10), lengths and angles in degrees
-(CHARMM before version 22, OpenMM, MDAnalysis before), or a symmetric matrix of vectors (CHARMM since 22).
-With a wrong box atoms overlap across its boundary, and those that are wrapped between frames seem to leap.
-Where neither shows, the version in the head counts: all programs but CHARMM write 24 there.
+The numbers are lengths and cosines of the angles (NAMD, VMD, LAMMPS, MDAnalysis since 2.10), lengths and
+angles in degrees (CHARMM before version 22, OpenMM, MDAnalysis before), or a symmetric matrix of vectors
+(CHARMM since 22). With a wrong box, atoms overlap across the boundary, and atoms that are wrapped between
+frames seem to leap. If neither is observed, the version in the header decides: all programs except CHARMM
+write 24.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ Examined = list[tuple[int, np.ndarray, np.ndarray]]
 
 
 def conventions(cell: Float[np.ndarray, "6"]) -> dict[str, Float[np.ndarray, "3 3"]]:
-    """Lattice vectors by each convention that makes a box of six numbers; that of MDAnalysis comes first."""
+    """Return lattice vectors by each convention that yields a box; MDAnalysis's convention comes first."""
     from MDAnalysis.lib.mdamath import triclinic_vectors
 
     angles, found = cell[[4, 3, 1]], {}
@@ -47,12 +48,12 @@ def conventions(cell: Float[np.ndarray, "6"]) -> dict[str, Float[np.ndarray, "3 
 
 
 class DcdBoxes:
-    """Lattice vectors of the frames of a DCD file, by the convention that fits its atoms.
+    """Lattice vectors of the frames of a DCD file, by the convention that is consistent with its atoms.
 
     Attributes:
-        convention: the name of it; None where no box examined needs one.
-        other: one that fits as well; None where the convention is known.
-        notes: how it was chosen, in a sentence.
+        convention: name of the convention; None if no examined box depends on the choice.
+        other: name of a second convention that fits equally well; None if the convention is certain.
+        notes: the reason for the choice, as a sentence.
     """
 
     def __init__(self, path: str, trajectory: Any):
@@ -76,7 +77,7 @@ class DcdBoxes:
             self.notes = (f"The box in the file is read as {self.convention}, {why}.",)
 
     def _sample(self, path: str) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """(number, positions, six numbers) of some frames whose box is not rectangular."""
+        """Yield (frame number, positions, six box numbers) of some frames whose box is not rectangular."""
         count = len(self._file)
         for number in sorted({*range(min(count, 8)), *np.linspace(0, count - 1, 4).astype(int).tolist()}):
             try:
@@ -90,7 +91,7 @@ class DcdBoxes:
                 yield number, x, cell
 
     def __call__(self, number: int, ts: Any) -> Float[np.ndarray, "3 3"] | None:
-        """The vectors of a frame; None where MDAnalysis's are the same, or somebody has set others."""
+        """Return the vectors of a frame; None if MDAnalysis's are the same, or a user has set others."""
         vectors = self._vectors(number, self.convention) if self.convention == _MATRIX else None
         if vectors is None:
             return None
@@ -98,7 +99,7 @@ class DcdBoxes:
         return vectors if any(np.allclose(one, ts.dimensions[:3], rtol=1e-5) for one in lengths) else None
 
     def instead(self, number: int) -> Float[np.ndarray, "3 3"] | None:
-        """The vectors of a frame by the other convention, where that fits as well."""
+        """Return the vectors of a frame by the other convention, if there is one that fits as well."""
         return self._vectors(number, self.other)
 
     def _vectors(self, number: int, convention: str | None) -> Float[np.ndarray, "3 3"] | None:
@@ -107,7 +108,7 @@ class DcdBoxes:
 
 
 def _plausible(frames: Examined, fit: list[str]) -> list[str]:
-    """The conventions that neither the boxes nor the atoms contradict."""
+    """Return the conventions that are consistent with both the boxes and the atoms."""
     gone: dict[str, list[float]] = {name: [] for name in fit}
     for (before, start, _), (number, end, cell) in pairwise(frames):
         moved = end - start - np.median(end - start, axis=0)
@@ -130,7 +131,7 @@ def _plausible(frames: Examined, fit: list[str]) -> list[str]:
 
 
 def _contacts(number: int, x: np.ndarray, cell: np.ndarray, name: str) -> Float[np.ndarray, "pairs"]:
-    """The distances of pairs that are closer than the mean distance of atoms, length."""
+    """Return the distances of all pairs closer than the mean spacing of the atoms, length."""
     boxes = conventions(cell)
     volume = max(abs(float(np.linalg.det(one))) for one in boxes.values())
     tracker = Tracker(CutoffRule(float(np.cbrt(volume / len(x)))))

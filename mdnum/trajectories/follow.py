@@ -1,7 +1,7 @@
-"""A trajectory read once, or two of the same atoms in step: frames checked, flips handed on as they come.
+"""Reading of one trajectory, or of two with the same atoms in step: frames are checked, flips passed on.
 
-Neighbor sets of two are compared once, at the first frame; from there the flips of either say what becomes of
-the difference, so that a frame costs what changed in it.
+The neighbor sets of two trajectories are compared once, at the first frame. From then on, the flips of both
+trajectories update the difference, so the cost of a frame is proportional to its changes.
 """
 
 from __future__ import annotations
@@ -69,13 +69,13 @@ def _usable(
     step: Callable[..., Any],
     found: Pass | Compared,
 ) -> Iterator[tuple[list[Frame], Any]]:
-    """(the next frame of each file, what `step` makes of them) up to where one ends or cannot be used.
+    """Yield (next frame of each file, result of `step`) until a file ends or a frame cannot be used.
 
-    Every rule steps before anything is handed on: a frame that one of them refuses is not in the ledger of
-    another.
+    All rules process a frame before any result is passed on: a frame that one rule rejects does not enter the
+    ledger of another rule.
 
     Raises:
-        InputError: the first frame cannot be read or used: there is nothing to keep.
+        InputError: the first frame cannot be read or used, so there are no results to keep.
     """
     radius, species = smallest_radius(rules), any(rule.needs_species for rule in rules)
     streams = []
@@ -104,7 +104,7 @@ def _usable(
 
 
 class NeighborCounts:
-    """How many neighbors each atom of the first group has, kept up to date by the flips."""
+    """Number of neighbors of each atom in the first group, updated with the flips of every frame."""
 
     def __init__(self, members: Members, atoms: int, groups: Groups, directed: bool):
         self._sides = [None if one is None else np.isin(np.arange(atoms), one) for one in groups]
@@ -115,7 +115,7 @@ class NeighborCounts:
         self._add(members.i, members.j, np.ones(len(members), np.int64))
 
     def step(self, flips: FlipTable) -> None:
-        """After the flips of a frame."""
+        """Update the numbers of neighbors with the flips of a frame."""
         self._add(flips.i, flips.j, np.where(flips.entered, 1, -1))
 
     def _add(self, i: np.ndarray, j: np.ndarray, sign: np.ndarray) -> None:
@@ -126,7 +126,7 @@ class NeighborCounts:
             np.add.at(self._now, one, counts)
 
     def count(self) -> tuple[int, float, int]:
-        """(fewest, mean, most) over the atoms at this frame, which is added to what was seen."""
+        """Return (fewest, mean, most) neighbors of an atom at this frame; add the frame to the histogram."""
         here = np.bincount(self._now if self._atoms is None else self._now[self._atoms])
         if len(here) > len(self.seen):
             self.seen = np.pad(self.seen, (0, len(here) - len(self.seen)))
@@ -138,7 +138,7 @@ class NeighborCounts:
 
 @dataclass
 class Followed:
-    """One rule on its way through the frames."""
+    """State of one rule while frames are read."""
 
     rule: Rule
     tracker: Tracker | ResidueTracker  # of it
@@ -151,7 +151,7 @@ class Followed:
 
 @dataclass
 class Pass:
-    """What came of reading a trajectory."""
+    """Results of reading a trajectory."""
 
     rules: list[Followed]
     frames: int = 0  # examined
@@ -162,7 +162,7 @@ class Pass:
 
     @property
     def odd(self) -> dict[str, Any] | None:
-        """How displacements contradict velocities and times; see `separation.odd_flight`."""
+        """Contradiction of displacements with velocities and times, if any; see `separation.odd_flight`."""
         return odd_flight(self.flights)
 
 
@@ -170,16 +170,15 @@ def follow(
     trajectory: Trajectory, rules: Sequence[Rule], groups: Groups, resolution: Resolution, sink: Sink,
     residues: ByResidue | None = None,
 ) -> Iterator[Pass]:  # fmt: skip
-    """Reads the frames once, handing rows of "members", "flips", "frames" and "motion" to the sink.
+    """Read the frames once, and send rows of "members", "flips", "frames" and "motion" to the sink.
 
-    With residues pairs are theirs, of the atoms that they hold; the groups are still of atoms.
-
-    Yields the same `Pass` after each frame, and can be left then. Memory is that of one frame and the
-    trackers', however many frames there are. A frame that cannot be read or used ends it; what came before
-    stays.
+    With residues, pairs are pairs of residues; the groups still list atoms. The same `Pass` is yielded after
+    each frame, and iteration may stop at any frame. Memory use is that of one frame and the trackers,
+    whatever the number of frames. Reading ends at a frame that cannot be read or used; earlier results are
+    kept.
 
     Raises:
-        InputError: the first frame cannot be read or used: there is nothing to keep.
+        InputError: the first frame cannot be read or used, so there are no results to keep.
     """
     species = [str(one) for one in trajectory.species]
     made, size = (lambda rule: Tracker(rule, *groups, species)), (trajectory.atoms, groups)
@@ -225,7 +224,7 @@ def follow(
 def _hand_on(
     sink: Sink, number: int, one: Followed, flips: FlipTable, frame: Frame, at: int, size: tuple[int, Groups]
 ) -> None:
-    """Rows of one frame and rule."""
+    """Send the table rows of one frame and one rule to the sink."""
     if one.neighbors is None:
         members = one.tracker.members()
         one.neighbors = NeighborCounts(members, *size, one.rule.directed)
@@ -253,7 +252,7 @@ def _hand_on(
 
 
 def _threshold(rule: Rule, members: Members) -> tuple[float, bool]:
-    """(where pairs come and go: a radius, or how far the last is; whether their order decides there)."""
+    """Return (usual distance of a pair that enters or leaves, True if the order of distances decides)."""
     if isinstance(rule, CutoffRule | SpeciesCutoffs):
         return rule.reach, False
     if not len(members):
@@ -284,7 +283,7 @@ def _measure_flux(one: Followed, frame: Frame, groups: Groups, species: list[str
 
 @dataclass
 class SetDifference:
-    """Pairs (i, j, rank) that are inside in one trajectory only, carried along by the flips of both."""
+    """Pairs (i, j, rank) that are inside in only one of two trajectories, updated by the flips of both."""
 
     only_a: set[Pair] = field(default_factory=set)
     only_b: set[Pair] = field(default_factory=set)
@@ -292,7 +291,7 @@ class SetDifference:
 
     @classmethod
     def of(cls, a: Members, b: Members) -> SetDifference:
-        """At the first frame."""
+        """Compute the difference of two neighbor sets at the first frame."""
         columns = [(one.i.tolist(), one.j.tolist(), one.rank.tolist()) for one in (a, b)]
         first, second = (set(zip(*one, strict=True)) for one in columns)
         both = first & second
@@ -304,7 +303,7 @@ class SetDifference:
         return len(self.only_a) + len(self.only_b)
 
     def step(self, a: FlipTable, b: FlipTable) -> None:
-        """After the flips of the next frame in either."""
+        """Update the difference with the flips of both trajectories at the next frame."""
         differed: dict[Pair, bool] = {}
         for flips, mine, others in ((a, self.only_a, self.only_b), (b, self.only_b, self.only_a)):
             columns = (flips.i.tolist(), flips.j.tolist(), flips.rank.tolist(), flips.entered.tolist())
@@ -322,7 +321,9 @@ class SetDifference:
 
 
 def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[np.ndarray, "pairs"]:
-    """Distances of pairs in a frame, through the image that each names; inf where there is none, length."""
+    """Return the distances of pairs in a frame through the image of the given rank, length; inf without
+    one.
+    """
     i, j, rank = np.array(pairs, np.int64).reshape(-1, 3).T
     at = Placed(np.ascontiguousarray(frame.positions), lattice_of(frame.box), 0.0)
     return image_distances(at, np.minimum(i, j), np.maximum(i, j), rank, directed)
@@ -330,7 +331,7 @@ def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[
 
 @dataclass
 class ComparedSide:
-    """One of the two trajectories."""
+    """One of two compared trajectories, with its tracker and its resolution."""
 
     trajectory: Trajectory
     tracker: Tracker
@@ -341,7 +342,7 @@ class ComparedSide:
     bound: float = 0.0  # how far a margin can be off
 
     def step(self, frame: Frame) -> FlipTable:
-        """The flips of the next frame."""
+        """Return the flips of the next frame."""
         self.distance_bound = self.resolution.bound(frame)
         self.box_bound = self.resolution.bound(frame, np.zeros(0, np.int64))
         # a margin among the nearest is the difference of two distances
@@ -349,12 +350,12 @@ class ComparedSide:
         return self.tracker.step(frame, bound=self.bound)
 
     def position_bound(self, periods: int) -> float:
-        """How far one atom, seen through so many periods of the box, can be off at the last frame, length."""
+        """Return the error bound of a position across `periods` box periods, at the last frame, length."""
         # a distance has two atoms that are off
         return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
 
     def speed_bound(self, frame: Frame) -> float:
-        """How far the velocity of an atom can be off, length per time."""
+        """Return the error bound of an atom's velocity, length per time."""
         if self.speeds is None or frame.velocities is None:
             return 0.0
         return self.speeds.bound(velocities_of(frame)) / 2
@@ -363,10 +364,10 @@ class ComparedSide:
 def differing_rows(
     pairs: list[Pair], difference: SetDifference, sides: Sequence[ComparedSide], frames: Sequence[Frame]
 ) -> dict[str, np.ndarray]:
-    """Columns on pairs that differ: where each is inside, and by how much.
+    """Return table columns for pairs that differ: the run in which each pair is inside, distances, margins.
 
-    A pair is ambiguous where its distance in either file is so close to the threshold that the positions may
-    have been on its other side before they were written.
+    A pair is ambiguous if its distance in either file is so close to the threshold that rounding in the file
+    may have moved the pair across the threshold.
     """
     rule = sides[0].tracker.rule
     i, j, rank = (np.array([pair[k] for pair in pairs], np.int64) for k in range(3))
@@ -389,7 +390,7 @@ def differing_rows(
 def _thresholds(
     i: np.ndarray, j: np.ndarray, inside: np.ndarray, rule: Rule, side: ComparedSide
 ) -> Float[np.ndarray, "pairs"]:
-    """Distance under which each pair is inside, length; that of a neighbor where it is one."""
+    """Return the distance below which each pair is inside, length; by center for nearest-neighbor rules."""
     if isinstance(rule, CutoffRule):
         return np.full(len(i), rule.radius)
     if isinstance(rule, SpeciesCutoffs):
@@ -402,7 +403,7 @@ def _thresholds(
 
 @dataclass
 class NeighborSets:
-    """The neighbor sets of one rule in the two trajectories."""
+    """Neighbor sets of one rule in the two trajectories, and their difference."""
 
     rule: Rule
     sides: list[ComparedSide]
@@ -415,7 +416,7 @@ class NeighborSets:
 
 @dataclass
 class Compared:
-    """What the frames showed."""
+    """Results of comparing two trajectories frame by frame."""
 
     frames: int = 0
     seed: int | None = None  # first frame whose positions differ at all
@@ -434,9 +435,9 @@ class Compared:
 
 
 def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Iterator[Compared]:
-    """Reads both once, in step, yielding the same `Compared` after each frame; only these atoms matter.
+    """Read two trajectories once, in step, comparing the given atoms; yield one `Compared` after each frame.
 
-    The sink takes rows of "apart" and "differing".
+    The sink takes rows of the tables "apart" and "differing".
     """
     found, sides = Compared(), sets[0].sides
 
@@ -488,10 +489,10 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 def _apart(
     found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
 ) -> tuple[Separation, float]:
-    """(separation, how much of it the resolution of both files explains), less a shift of all atoms alike.
+    """Return (separation, the part that the resolution of both files explains), less a common shift.
 
-    There is one where it explains nearly all: files of one run have other origins, or the motion of the
-    center of mass was removed in one of them.
+    A shift of all atoms is removed only if it explains nearly all of the separation: files of one run may
+    have different origins, or the motion of the center of mass was removed in one of them.
     """
     now = separation(a, b, atoms)
     allowed = sum(side.position_bound(now.periods) for side in sides)
@@ -520,7 +521,7 @@ def _sets_at(
     now: Separation,
     before: Separation,
 ) -> None:
-    """What one rule's sets show at a frame, and the pairs that are new among those that differ."""
+    """Record the difference of one rule's sets at a frame, and write the pairs that newly differ."""
     difference, first = one.difference, False
     if one.certain is None and len(difference):
         # all that differ: one that came to differ within the resolution may be beyond it by now
@@ -547,7 +548,7 @@ def _sets_at(
 
 
 def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Rates at which the separation grows before the sets differ, and from then on."""
+    """Return the growth rates of the separation before and after the frame at which the sets first differ."""
     cutoff, furthest = isinstance(one.rule, CutoffRule), float(table["furthest"].max(initial=0.0))
     limit = 0.1 * (one.rule.reach if cutoff else furthest)
     cut = frames if one.first is None else one.first["frame"]

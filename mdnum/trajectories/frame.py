@@ -1,8 +1,8 @@
-"""One frame of a trajectory in float64, whatever the file stores, and what no simulation writes into one.
+"""One frame of a trajectory in float64, and checks for values that no simulation writes.
 
-Formats that hold plain floats (dcd, trr, netcdf) take any bytes for coordinates: what damage leaves there is
-often a number, and a huge one. It would count as a place, and would widen what rounding may have done to
-every other pair of that frame.
+Formats with plain floats (dcd, trr, netcdf) accept any bytes as coordinates; damage often leaves a huge
+number. Such a number would count as a position, and would increase the rounding bound of every other pair of
+the frame.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ AtomIndices = Int[np.ndarray, "chosen"] | None
 
 @dataclass(frozen=True)
 class Box:
-    """Lattice vectors, and the directions in which they repeat."""
+    """Lattice vectors of a box, and the directions in which they repeat."""
 
     # rows, length; those of directions that do not repeat do not matter
     matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
@@ -45,35 +45,35 @@ class Box:
 
     @property
     def periodic(self) -> bool:
-        """Whether any direction repeats."""
+        """True if the box repeats along at least one direction."""
         return bool(self.pbc.any())
 
     @cached_property
     def longest(self) -> float:
-        """The longest lattice vector, length; 0 where it does not repeat along each, or one is not finite."""
+        """Longest lattice vector, length; 0 unless the box repeats along all axes with finite vectors."""
         if not np.all(self.pbc) or not np.isfinite(self.matrix).all():
             return 0.0
         return float(np.linalg.norm(self.matrix, axis=1).max())
 
     @cached_property
     def shortest(self) -> float:
-        """The shortest lattice vector of those that repeat, length; 0 without any."""
+        """Shortest lattice vector among the periodic directions, length; 0 without a periodic direction."""
         return float(np.linalg.norm(self.matrix[self.pbc], axis=1).min()) if self.periodic else 0.0
 
     @cached_property
     def broken(self) -> Int[np.ndarray, "axes"]:
-        """Axes along which it repeats, but without a vector."""
+        """Axes along which the box repeats although their lattice vector is zero or not finite."""
         vectors = self.matrix.any(axis=1) & np.isfinite(self.matrix).all(axis=1)
         return np.flatnonzero(self.pbc & ~vectors)
 
     def plain(self) -> dict[str, Any]:
-        """As plain values."""
+        """Return the box as plain Python values."""
         return {"matrix": np.asarray(self.matrix, float).tolist(), "pbc": np.asarray(self.pbc, bool).tolist()}
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Positions at one moment."""
+    """Positions of all atoms at one time, with the box."""
 
     index: int  # number of the frame in its file, from 0
     time: float  # in the file's unit; the index where the file has no times
@@ -85,24 +85,24 @@ class Frame:
 
     @cached_property
     def furthest(self) -> float:
-        """The largest coordinate in size, length: not finite where one is not, 0 without any."""
+        """Largest absolute coordinate, length; not finite if any coordinate is not; 0 without atoms."""
         return furthest(self.positions)
 
     def furthest_of(self, atoms: AtomIndices) -> float:
-        """The same of some atoms."""
+        """Return the largest absolute coordinate of the given atoms, length."""
         return self.furthest if atoms is None else furthest(self.positions[atoms])
 
 
 @dataclass
 class FrameCheck:
-    """Refuses frames that no simulation writes, or that do not compare with the first; gives on the others.
+    """Check that rejects frames which no simulation writes or which cannot be compared with the first one.
 
     Raises:
-        FrameError: a coordinate is not finite, an atom is further out than any gets or than floats resolve
-            distances of that length, more than one atom is at exactly 0, 0, 0, all atoms are where they do
-            not move together, the box repeats along other axes than in the first frame (most often: there is
-            none), or along one without a vector, or an atom is labeled as another one than in the first frame
-            and the file has no ids, or a rule needs species.
+        FrameError: a coordinate is not finite; an atom is further out than any atom gets, or than floats
+            resolve distances of length `radius`; more than one atom is at exactly 0, 0, 0; all atoms made an
+            impossible common move; the box repeats along other axes than in the first frame (most often, the
+            box is missing) or along an axis without a vector; or the label of an atom differs from the first
+            frame, and the file has no ids or a rule needs species.
     """
 
     atoms: AtomIndices = None  # those that matter, ascending; None for all
@@ -121,7 +121,7 @@ class FrameCheck:
         return frame
 
     def _wrong(self, frame: Frame) -> Iterator[tuple[str, str]]:
-        """(what is wrong, what to do); each where all before are not."""
+        """Yield (problem, remedy) for each failed check; later checks assume that the earlier ones passed."""
         atoms = self.atoms
         self.pbc = pbc = frame.box.pbc if self.pbc is None else self.pbc
         self.labels = labels = frame.labels if self.labels is None else self.labels
@@ -201,12 +201,12 @@ def far_out(
     bits: int = 64,
     before: Float[np.ndarray, "some 3"] | None = None,
 ) -> tuple[int, int, str] | None:
-    """The atom that is furthest out, where that is further than can be; arguments as of `FrameCheck`.
+    """Return the atom furthest out, if it is further out than possible; arguments as in `FrameCheck`.
 
-    Positions of some atoms a frame before tell the size of a system half of which is damaged.
+    Positions of some atoms one frame earlier give the size of the system even if half of it is damaged.
 
     Returns:
-        (the atom, how many are too far out, why in words); None where none is.
+        (the atom, the number of atoms too far out, the reason in words); None if no atom is too far out.
     """
     x = frame.positions if atoms is None else frame.positions[atoms]
     if len(x) < 2:
@@ -236,12 +236,12 @@ def far_out(
 
 
 def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, float] | None:
-    """The atom that is furthest from where it was a frame before, where that is further than can be.
+    """Return the atom with the largest displacement since the previous frame, if it is larger than possible.
 
-    Wrapping an atom, or all of them at once after a long time, is none.
+    Wrapping of one atom, or of all atoms at once after a long time, is not a leap.
 
     Returns:
-        (the atom, how far, length); None where there is no leap.
+        (the atom, its displacement, length); None if there is no leap.
     """
     x = now.positions if atoms is None else now.positions[atoms]
     moved = x - (before.positions if atoms is None else before.positions[atoms])
@@ -258,11 +258,11 @@ def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, flo
 
 
 def furthest(x: Float[np.ndarray, "atoms 3"]) -> float:
-    """The largest number in size; 0 without any."""
+    """Return the largest absolute value; 0 for an empty array."""
     # twice as fast as through their absolute values, and six times as by atom
     return float(max(x.max(initial=0.0), -x.min(initial=0.0)))
 
 
 def _named(at: Any, atoms: AtomIndices) -> int:
-    """Number in the file of the atom at this place among those that matter."""
+    """Return the number in the file of an atom, given its position among the selected atoms."""
     return int(at if atoms is None else atoms[at])

@@ -1,6 +1,6 @@
-"""What every pair did over the frames: its flips, every stay inside, and what fewer frames would show.
+"""History of every pair over the frames: its flips, its contacts, and the flips left at larger strides.
 
-What is lost between the frames is estimated from such counts in `lost`.
+The module `lost` estimates from such counts how many flips are lost between frames.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _ROOM = 2**62
 
 
 class Sums:
-    """Counts of some of the pairs, to which those of others are added field by field; None stays None."""
+    """Counts for a subset of the pairs; addition combines two subsets field by field, and None stays None."""
 
     # what is the same for all pairs
     _common: tuple[str, ...] = ()
@@ -36,7 +36,7 @@ class Sums:
 
 @dataclass(frozen=True)
 class History:
-    """Pairs that were ever inside or flipped, each with its flips in the order of frames."""
+    """Pairs that were ever inside or flipped, each with its flips in order of frames."""
 
     i: Int[np.ndarray, "pairs"]  # the pairs, sorted, each once; see `ledger.Members`
     j: Int[np.ndarray, "pairs"]
@@ -55,13 +55,13 @@ class History:
         first: Members | Mapping[str, np.ndarray],
         frames: int,
     ) -> History:
-        """The histories behind a ledger.
+        """Build the histories of pairs from a ledger of flips.
 
         Args:
             flips: all flips of some of the pairs, in the order of frames, or their columns frame, entered, i,
                 j, rank and ambiguous.
-            first: those of the pairs that are inside at the first frame, or their columns i, j and rank.
-            frames: frames examined, at least 1.
+            first: the pairs among them that are inside at the first frame, or their columns i, j and rank.
+            frames: number of frames examined, at least 1.
         """
         flips, first = (one if isinstance(one, Mapping) else vars(one) for one in (flips, first))
         starts, count = len(first["i"]), len(flips["frame"])
@@ -85,17 +85,17 @@ class History:
 
     @property
     def flips(self) -> Int[np.ndarray, "pairs"]:
-        """Flips of each pair."""
+        """Number of flips of each pair."""
         return np.diff(self.rows)
 
     @property
     def pair(self) -> Int[np.ndarray, "flips"]:
-        """The pair of each flip."""
+        """Index of the pair to which each flip belongs."""
         return np.repeat(np.arange(len(self)), self.flips)
 
 
 def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """A stable order that sorts by all columns, and in that order which rows differ from the one before."""
+    """Return (a stable order that sorts by all columns, mask of sorted rows unlike the row before)."""
     if not len(columns[0]):
         return np.zeros(0, np.int64), np.zeros(0, bool)
     sizes = [int(column.max()) + 1 for column in columns]
@@ -113,10 +113,10 @@ def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Contacts(Columns):
-    """Stays inside, sorted by (i, j, rank, begin).
+    """Contacts (periods in which a pair is inside), sorted by (i, j, rank, begin).
 
-    The frames say no more than that a pair was inside at `begin`, ..., `end - 1`: it entered some time
-    between the frames `begin - 1` and `begin`, and it may have been outside for a while between two frames.
+    A contact means that the pair was inside at the frames `begin`, ..., `end - 1`. The pair entered some time
+    between the frames `begin - 1` and `begin`, and may have been outside for a while between two frames.
     """
 
     i: Int[np.ndarray, "stays"]  # the pair; see `ledger.Members`
@@ -129,15 +129,15 @@ class Contacts(Columns):
 
     @property
     def length(self) -> Int[np.ndarray, "stays"]:
-        """Frames inside."""
+        """Number of frames of each contact."""
         return self.end - self.begin
 
 
 def contacts(history: History) -> Contacts:
-    """The stays inside of every pair.
+    """Return all contacts of every pair.
 
     Raises:
-        ValueError: flips of a pair do not enter and leave in turn: one is missing.
+        ValueError: the flips of a pair do not enter and leave alternately, so one is missing.
     """
     pair, inside, entered = history.pair, history.inside, history.entered
     odd = (np.arange(len(pair)) - history.rows[pair]) % 2 == 1
@@ -157,7 +157,7 @@ def contacts(history: History) -> Contacts:
 
 
 def mended(stays: Contacts, gap: int) -> Contacts:
-    """Intermittent contacts: stays of a pair that are at most `gap` frames apart count as one."""
+    """Merge contacts of a pair that are at most `gap` frames apart (intermittent contacts)."""
     if gap < 1 or not len(stays):
         return stays
     same = np.all([column[1:] == column[:-1] for column in (stays.i, stays.j, stays.rank)], axis=0)
@@ -172,7 +172,7 @@ def mended(stays: Contacts, gap: int) -> Contacts:
 
 @dataclass(frozen=True)
 class Strides(Sums):
-    """Flips that are left when only every nth frame is examined."""
+    """Number of flips that remain if only every nth frame is examined."""
 
     _common = ("stride",)
 
@@ -184,7 +184,7 @@ class Strides(Sums):
 
     @classmethod
     def of_history(cls, history: History, strides: Sequence[int]) -> Strides:
-        """Counts them: of the flips of a pair between two frames that are kept, an odd one is left."""
+        """Count remaining flips: an odd number of a pair's flips between two kept frames leaves one flip."""
         found = []
         for stride in strides:
             rows = np.flatnonzero(history.frame <= (history.frames - 1) // stride * stride)
@@ -198,12 +198,12 @@ class Strides(Sums):
 
     @property
     def share(self) -> Float[np.ndarray, "strides"]:
-        """Share of the flips that are left at each stride; nan where there were none."""
+        """Share of the flips that remain at each stride; nan without flips."""
         return np.divide(self.flips, self.of, out=np.full(len(self.of), np.nan), where=self.of > 0)
 
 
 def doublings(frames: int) -> list[int]:
-    """Strides 1, 2, 4, ... that leave at least four intervals."""
+    """Return the strides 1, 2, 4, ... that leave at least four intervals."""
     strides = [1]
     while (frames - 1) // (2 * strides[-1]) >= 4:
         strides.append(2 * strides[-1])
@@ -211,13 +211,13 @@ def doublings(frames: int) -> list[int]:
 
 
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:
-    """Decisions that come out differently when all atoms fly on straight for a moment.
+    """Count the decisions that change if all atoms move in straight lines for a short time.
 
-    The root mean square displacement in that moment is `move`, length: small beside the distance over which a
-    path bends, large enough that many pairs cross. `count` gives the flips between two frames.
+    The root mean square displacement in this time is `move`, length: small compared with the distance over
+    which paths bend, and large enough that many pairs cross. `count` returns the flips between two frames.
 
     Returns:
-        flips, and the moment in the unit of the velocities' time; None where no atom moves.
+        (number of flips, the time in the unit of the velocities); None if no atom moves.
     """
     if frame.velocities is None:
         return None

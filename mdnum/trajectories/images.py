@@ -1,7 +1,7 @@
-"""Pairs by (i, j, shift), in a box so narrow that several images of an atom are inside.
+"""Pairs identified by (i, j, shift), in a box so narrow that several images of an atom are inside.
 
-The ledger of flips names images by rank, which no wrapping of atoms changes: two images of a pair that change
-places at the cutoff within one frame are no flip there, and two here.
+The ledger of flips identifies images by rank, which wrapping of atoms does not change. If two images of a
+pair exchange places at the cutoff within one frame, the ledger has no flip, and this module counts two.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _TOGETHER, _APART = 1_000_000, 256
 
 
 def pair_keys(i: np.ndarray, j: np.ndarray, shifts: np.ndarray, atoms: int) -> Int[np.ndarray, "pairs"]:
-    """A number for each pair, and for each image where shifts have columns."""
+    """Return an integer key for each pair, or for each image of a pair if shifts have columns."""
     keys = i * np.int64(atoms) + j
     for column in shifts.T:
         keys = keys * _APART + column % _APART
@@ -29,7 +29,7 @@ def pair_keys(i: np.ndarray, j: np.ndarray, shifts: np.ndarray, atoms: int) -> I
 
 
 def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """(lattice vectors as rows, completed by normals; their inverse)."""
+    """Return (lattice vectors as rows, completed by normals; the inverse matrix)."""
     from ase.geometry import complete_cell
 
     matrix = complete_cell(np.where(frame.box.pbc[:, None], frame.box.matrix, 0.0))
@@ -37,12 +37,12 @@ def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
 
 
 def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
-    """Which images are meant by rank: x[j] + shift @ box is one, as in ASE, vesin and jax-md.
+    """Return the shifts of images given by rank; x[j] + shift @ box is an image, as in ASE, vesin and jax-md.
 
-    Of images of an atom itself it is the one of each ± pair whose first component that is not 0 is positive.
+    Images of an atom itself come in ± pairs; the shift whose first nonzero component is positive is returned.
 
     Args:
-        pairs: with i, j, rank and distance, as `Members`.
+        pairs: object with i, j, rank and distance, such as `Members`.
     """
     x, pbc, (matrix, inverse) = frame.positions, frame.box.pbc, cell_of(frame)
     most = pairs.distance.max(initial=0.0) * np.linalg.norm(inverse, axis=0) + 0.5
@@ -61,13 +61,13 @@ def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
 
 
 class ImageFlips:
-    """Decisions on images of pairs that differ from the frame before."""
+    """Flips of pairs identified by image, between successive frames."""
 
     def __init__(self) -> None:
         self._before: tuple[Frame, np.ndarray] | None = None
 
     def step(self, frame: Frame, pairs: Members) -> dict[str, Any] | None:
-        """Columns of the flips of a frame, None without any; pairs inside are those of a symmetric rule."""
+        """Return the columns of a frame's flips, or None; `pairs` are inside by a symmetric rule."""
         matrix, inverse = cell_of(frame)
         now = np.column_stack([pairs.i, pairs.j, image_shifts(frame, pairs)])
         known, self._before = self._before, (frame, now)

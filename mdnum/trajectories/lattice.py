@@ -1,17 +1,17 @@
-"""The lattice of a frame's box, atoms sorted by place into bins, and the loop that finds which are near.
+"""Reduced lattice of a box, binning of atoms, and the loop that finds near pairs.
 
-Lattice vectors are reduced first, so that a box that is skewed beyond need costs no more than the compact one
-that tiles space in the same way. A decision is always taken on the same number: the length of
+Lattice vectors are reduced first, so that a strongly skewed box costs no more than the compact box with the
+same lattice. Every decision uses the same number: the length of
 
     (x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2
 
 with the coordinates as they are stored, i < j, integers s and the reduced vectors a, in this order of
-operations. So it does not depend on which search found the pair.
+operations. A decision therefore does not depend on the search that found the pair.
 
-Bins are those of the reduced lattice's coordinates. Directions that do not repeat have bins too, folded onto
-a fixed number of them, so that one atom far away makes neither many bins nor a full one. Around each bin the
-atoms of the bins in reach are gathered, with the lattice vector that brings them near, as often as a small
-box repeats; then every atom of the bin is compared with all of them.
+Bins divide the coordinates of the reduced lattice. Nonperiodic directions have bins too, folded onto a fixed
+number of them, so that one distant atom creates neither many bins nor a full one. For each bin, the atoms of
+all bins in reach are gathered with the lattice vectors that bring them near, repeatedly if the box is small;
+then every atom of the bin is compared with all gathered atoms.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ INSIDE, DIRECTED = 0, 2
 
 
 class ReducedLattice(NamedTuple):
-    """What a search needs to know of a box; the compiled loops take it as it is."""
+    """Properties of a box that a search needs, as a tuple that compiled loops accept."""
 
     vectors: Float[np.ndarray, "3 3"]  # reduced, as rows, length; zero along directions that do not repeat
     periodic: Bool[np.ndarray, "3"]  # which rows repeat
@@ -48,16 +48,16 @@ class ReducedLattice(NamedTuple):
 
     @property
     def narrowest(self) -> float:
-        """Smallest width, length: no lattice vector is shorter."""
+        """Smallest width of the box, length; no lattice vector is shorter."""
         return float(self.widths.min())
 
     @property
     def volume(self) -> float:
-        """Volume of the box; of a slice one length thick along directions that do not repeat."""
+        """Volume of the box; nonperiodic directions count with one unit of length."""
         return float(1.0 / abs(np.linalg.det(self.inverse)))
 
     def rounding(self, largest: float, radius: float) -> float:
-        """How far a computed distance near radius can be off, length, with coordinates up to the largest.
+        """Return the rounding error of a distance near `radius`, length, for coordinates up to `largest`.
 
         Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1.
         """
@@ -67,10 +67,10 @@ class ReducedLattice(NamedTuple):
 
 
 def lattice_of(box: Box) -> ReducedLattice:
-    """The lattice of a box.
+    """Return the reduced lattice of a box.
 
     Raises:
-        InputError: a direction repeats, but its vector is zero, not finite, or in the plane of the others.
+        InputError: the vector of a periodic direction is zero, not finite, or in the plane of the others.
     """
     return _reduced(np.asarray(box.matrix, np.float64).tobytes(), np.asarray(box.pbc, bool).tobytes())
 
@@ -107,9 +107,10 @@ def _reduced(rows: bytes, periodic: bytes) -> ReducedLattice:
 def shortest(
     moved: Float[np.ndarray, "atoms 3"], box: Box
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """(displacements through the nearest image, whole lattice vectors taken off); all of them with a bad box.
+    """Return (displacements through the nearest image, numbers of lattice vectors removed).
 
-    The nearest of all for an atom that moved by less than half the width of the box.
+    The image is the nearest one if an atom moved by less than half the width of the box. With an invalid box,
+    displacements are returned unchanged.
     """
     try:
         lattice = lattice_of(box)
@@ -120,7 +121,7 @@ def shortest(
 
 
 def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
-    """Squared lengths of the lattice vectors no longer than radius, one of each ± pair, ascending."""
+    """Return the squared lengths of lattice vectors up to `radius`, one of each ± pair, ascending."""
     if not lattice.periodic.any() or radius < lattice.narrowest * (1 - 1e-9):
         return np.zeros(0)
     vectors, most = lattice.vectors, np.where(lattice.periodic, radius / lattice.widths + 1, 0).astype(int)
@@ -135,7 +136,7 @@ def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "ima
 # inlined: a call that takes arrays costs more than what is done here
 @njit(inline="always")
 def square_of(x, i, j, s0, s1, s2, vectors):
-    """Squared distance from atom i to an image of atom j, i < j: the number that decides."""
+    """Return the squared distance from atom i to an image of atom j, i < j: the number that decides."""
     if s0 == 0 and s1 == 0 and s2 == 0:
         d0, d1, d2 = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
     else:
@@ -147,10 +148,11 @@ def square_of(x, i, j, s0, s1, s2, vectors):
 
 @njit(inline="never")
 def near_squares(x, i, j, lattice, y, squares):
-    """`square_of` the image that rounding to the lattice names, of pairs; y is room for (3, block).
+    """Compute `square_of` for pairs, at the image found by rounding; y is a work array of shape (3, block).
 
-    Without a branch: to add a sum of zeros changes no square, and vectors are zero where a direction does not
-    repeat. Gathered first, so that the rest are vector instructions; what the lattice is, is read once.
+    The loop has no branch: adding a sum of zeros changes no square, and vectors are zero along nonperiodic
+    directions. Coordinates are gathered first, so that all other operations are vector instructions; the
+    lattice is read once.
     """
     vectors, inverse = lattice.vectors, lattice.inverse
     y0, y1, y2 = y[0], y[1], y[2]
@@ -176,9 +178,9 @@ def near_squares(x, i, j, lattice, y, squares):
 
 @njit
 def image_square(x, i, j, rank, lattice):
-    """Squared distance to the image of j that has `rank` nearer ones; inf where there are not so many.
+    """Return the squared distance to the image of j that has `rank` nearer images; inf without such an image.
 
-    i < j, or i == j for images of an atom itself, of which one of each ± pair counts.
+    Atoms have i < j, or i == j for images of an atom itself, of which one of each ± pair counts.
     """
     vectors, periodic, widths = lattice.vectors, lattice.periodic, lattice.widths
     # the image that rounding names; nearest where that is near enough
@@ -229,7 +231,7 @@ def image_square(x, i, j, rank, lattice):
 
 @dataclass(frozen=True)
 class Participants:
-    """The atoms that take part in a rule, numbered among themselves."""
+    """Atoms that take part in a rule, with consecutive indices of their own."""
 
     labels: Int[np.ndarray, "atoms"]  # their numbers in the file
     centers: Bool[np.ndarray, "atoms"]  # whose neighbors are wanted
@@ -239,29 +241,29 @@ class Participants:
 
     @property
     def radius(self) -> float:
-        """Largest radius, length."""
+        """Largest radius of all pairs of species, length."""
         return float(self.radii.max(initial=0.0))
 
     @property
     def squares(self) -> Float[np.ndarray, "species species"]:
-        """Squared radii; negative for pairs that are never inside."""
+        """Squared radius of each pair of species; negative for pairs that are never inside."""
         return np.where(self.radii >= 0, self.radii * self.radii, -1.0)
 
     @property
     def both(self) -> Bool[np.ndarray, "atoms"]:
-        """Atoms on both sides: images of themselves can be their neighbors."""
+        """Mask of the atoms on both sides: images of such an atom can be its own neighbors."""
         return self.centers & self.others
 
     @cached_property
     def kinds(self) -> list[Int[np.ndarray, "some"]]:
-        """Atoms of one species and on the same sides, for each there are; the rarest first."""
+        """Groups of atoms with the same species and on the same sides, smallest group first."""
         kind = 4 * self.species + 2 * self.centers + self.others
         return sorted((np.flatnonzero(kind == one) for one in np.unique(kind)), key=len)
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Where the atoms that take part are at one frame."""
+    """Positions and lattice, at one frame, of the atoms that take part in a rule."""
 
     positions: Float[np.ndarray, "atoms 3"]  # as stored, anywhere, length
     lattice: ReducedLattice  # of the box
@@ -269,7 +271,7 @@ class Placed:
 
 
 class SearchLimits(NamedTuple):
-    """Squared distances that a search distinguishes, by species."""
+    """Squared distances that bound the pairs of a search, by species."""
 
     kind: int  # `INSIDE` or `DIRECTED`
     low: Float[np.ndarray, "species species"]  # pairs nearer than this are inside for certain
@@ -278,14 +280,14 @@ class SearchLimits(NamedTuple):
 
     @classmethod
     def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> SearchLimits:
-        """Those of pairs within the band of their radius, or inside it."""
+        """Return limits for pairs that are inside their radius or within the band around it."""
         low = np.where(radii >= 0, np.maximum(radii - band, 0.0) ** 2, np.inf)
         high = np.where(radii >= 0, (radii + band) ** 2, -1.0)
         return cls(kind, low, high, float((radii.max(initial=0.0) + band) ** 2))
 
 
 class Candidates(NamedTuple):
-    """Pairs as a search records them; what does not fit is counted only."""
+    """Output buffers for the pairs of a search; pairs that do not fit are only counted."""
 
     i: Int[np.ndarray, "room"]  # pairs that are inside for certain
     j: Int[np.ndarray, "room"]
@@ -297,13 +299,13 @@ class Candidates(NamedTuple):
 
     @classmethod
     def room(cls, certain: int, open: int) -> Candidates:
-        """Room for so many."""
+        """Allocate buffers for the given numbers of certain and open pairs."""
         i, j, i_open, j_open, code = (np.empty(n, np.int32) for n in (certain, certain, open, open, open))
         return cls(i, j, i_open, j_open, code, np.empty(open), np.zeros(3, np.int64))
 
 
 class Binned(NamedTuple):
-    """Atoms of one frame in bins: all that the loop of a search needs."""
+    """Atoms of one frame sorted into bins: the input of the search loop."""
 
     lattice: ReducedLattice  # of the frame
     species: Int[np.ndarray, "atoms"]
@@ -323,7 +325,7 @@ class Binned(NamedTuple):
 
 
 def binned(placed: Placed, who: Participants, reach: float) -> Binned:
-    """Put atoms into bins, in which pairs within reach are to be found.
+    """Sort atoms into bins for a search of pairs within reach.
 
     Raises:
         InputError: the box repeats too often within reach.
@@ -348,10 +350,10 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
 
 
 def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[np.ndarray, "3"]):
-    """(bins, reach, step): bins along each axis, how many bins away a pair can be, and the width of a bin.
+    """Return (bins, reach, step): number of bins along each axis, range of a pair in bins, width of a bin.
 
-    There are no more than about twice as many bins as atoms. The extent of these is that along each axis that
-    does not repeat, length.
+    There are no more than about twice as many bins as atoms. `extent` is the extent of the atoms along each
+    nonperiodic axis, length.
     """
     bins, reach, step = np.ones(3, np.int64), np.ones(3, np.int64), np.ones(3)
     room = max(64.0, 2.0 * atoms)
@@ -380,7 +382,7 @@ def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[n
 
 @njit
 def wrap(x, lattice, bins, step):
-    """Wrap every atom, and name the lattice vectors taken off and its bin."""
+    """Wrap all atoms; return wrapped positions, the lattice vectors removed, and the bin of each atom."""
     wrapped, home, bin_of = np.empty(x.shape), np.empty(x.shape, np.int64), np.empty(x.shape[0], np.int64)
     vectors, inverse, periodic = lattice.vectors, lattice.inverse, lattice.periodic
     for i in range(x.shape[0]):
@@ -410,7 +412,7 @@ def wrap(x, lattice, bins, step):
 
 @njit
 def _sorted_by_bin(bin_of, chosen, total):
-    """(start, order) of the chosen atoms: a counting sort that keeps their order within a bin."""
+    """Return (start, order) of the chosen atoms by a counting sort that keeps their order within a bin."""
     start = np.zeros(total + 1, np.int64)
     count = 0
     for i in range(bin_of.shape[0]):
@@ -430,14 +432,14 @@ def _sorted_by_bin(bin_of, chosen, total):
 
 @njit
 def lattice_vector(code):
-    """The three integers of the code of a lattice vector."""
+    """Decode the three integers of a lattice vector from its code."""
     code = np.int64(code)
     return (code >> 20) - 512, ((code >> 10) & 1023) - 512, (code & 1023) - 512
 
 
 @njit
 def _run(d0, d1, d2, b0, b1, b2, bins, last):
-    """The run of bins that begins d away from a bin: lattice vector, first and last bin, next d2."""
+    """Return the run of bins at offset d from a bin: lattice vector, first and last bin, next d2."""
     n0, n1, n2 = (b0 + d0) // bins[0], (b1 + d1) // bins[1], (b2 + d2) // bins[2]
     c0, c1, low = b0 + d0 - n0 * bins[0], b1 + d1 - n1 * bins[1], b2 + d2 - n2 * bins[2]
     high = min(bins[2] - 1, low + last - d2)
@@ -447,7 +449,7 @@ def _run(d0, d1, d2, b0, b1, b2, bins, last):
 
 @njit
 def _most_around(bins, reach, start):
-    """Most atoms, and most runs, around any bin."""
+    """Return upper limits of the number of atoms and the number of runs around any bin."""
     atoms, runs = 0, 0
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
@@ -468,7 +470,7 @@ def _most_around(bins, reach, start):
 # candidate, and the loop its vector instructions.
 @njit(inline="never")
 def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
-    """Squares of near[:, first:last] as seen from x, and which of them, counted from first, are within."""
+    """Compute squared distances from x to near[:, first:last]; choose and count those up to `largest`."""
     near0, near1, near2 = near[0, first:last], near[1, first:last], near[2, first:last]
     for k in range(near0.shape[0]):
         y0, y1, y2 = near0[k] - x0, near1[k] - x1, near2[k] - x2
@@ -485,10 +487,10 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
 
 @njit
 def meet(atoms, limits, found):
-    """Record the pairs of all centers; returns how many of each kind.
+    """Record the pairs of all centers; return the numbers of certain and of open pairs.
 
-    Pairs of one set are met once: from a bin, half of the bins around are examined. Otherwise everything
-    around each center is; two atoms that are on both sides are met twice and count once.
+    Pairs of one set are visited once, by examining half of the bins around each bin. Otherwise all bins
+    around each center are examined; a pair of atoms that are on both sides is visited twice and counted once.
     """
     written, left = 0, 0
     start, bins, reach, species = atoms.start, atoms.bins, atoms.reach, atoms.species

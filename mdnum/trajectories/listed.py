@@ -1,8 +1,8 @@
-"""Pairs inside a cutoff that a program's own neighbor list lacks, and for how long.
+"""Pairs inside a cutoff that are missing from a program's own neighbor list, with their duration.
 
-Whatever made the list incomplete (a skin that was used up, a buffer that overflowed, images that it does not
-know), what it did to the program is the pairs that were missing while they were inside. Those within the
-bound of the cutoff are a matter of rounding and are not counted.
+A list is incomplete because the skin was exceeded, a buffer overflowed or images are not supported; in all
+cases the program is affected by the pairs that are missing while they are inside. Missing pairs within the
+error bound of the cutoff are due to rounding and are not counted.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _KNOWN = (
 
 @njit
 def _same(given, known):
-    """Whether two arrays hold the same numbers."""
+    """Return True if two arrays hold the same numbers."""
     for begin in range(0, len(known), 8192):
         some, others, differ = given[begin : begin + 8192], known[begin : begin + 8192], 0
         for k in range(len(some)):
@@ -50,7 +50,7 @@ def _same(given, known):
 
 
 class GivenList(NamedTuple):
-    """A neighbor list as a program has it, without padding, by the first atom of each entry."""
+    """A program's neighbor list without padding, sorted by the first atom of each entry."""
 
     shifted: bool  # whether it says which image each neighbor is; else the nearest alone
     full: bool  # whether it has each pair from both of its atoms; else from the lower one here
@@ -61,7 +61,7 @@ class GivenList(NamedTuple):
 
     @classmethod
     def of(cls, parts: list[np.ndarray], atoms: int) -> GivenList:
-        """A list of the arrays that `arrays_of` gives, in int32."""
+        """Build a list, in int32, from the arrays that `arrays_of` returns."""
         i, j, *shifts = parts
         image = _image(*shifts[0].T) if shifts else np.zeros(len(i), np.int32)
         there = (i >= 0) & (i < atoms) & (j >= 0) & (j < atoms) & ((i != j) | (image != 0))
@@ -92,11 +92,11 @@ class GivenList(NamedTuple):
         return cls(shifted, full, np.searchsorted(i, np.arange(atoms + 1, dtype=i.dtype)), i, j, image)
 
     def has(self, i: np.ndarray, j: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, "pairs"]:
-        """Whether it has each of other entries; fastest in the order of i."""
+        """Return True for each of the given entries that the list contains; fastest in the order of i."""
         return _has(self.first, self.j, self.image, i, j, image, self.shifted)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
-        """From how many of its atoms each pair is missing: 0, 1, and 2 in a list that is full."""
+        """Return from how many of its atoms each pair is missing: 0 or 1, or up to 2 in a full list."""
         i, j, image, near = pairs.i, pairs.j, np.zeros(len(pairs), np.int64), pairs.rank == 0
         if self.shifted:
             image, near = _image(*image_shifts(frame, pairs).T), np.True_
@@ -110,17 +110,17 @@ class GivenList(NamedTuple):
 
 @njit
 def _image(s0, s1, s2):
-    """A number for a shift."""
+    """Encode a lattice shift as one integer."""
     return (s0 % _APART * _APART + s1 % _APART) * _APART + s2 % _APART
 
 
 def _shift(image: np.ndarray) -> Int[np.ndarray, "images 3"]:
-    """The shift of a number."""
+    """Decode lattice shifts from integer codes."""
     return np.stack([image >> 16, image >> 8, image], axis=-1).astype(np.int8).astype(np.int32)
 
 
 def _opposite(image: np.ndarray) -> Int[np.ndarray, "images"]:
-    """The numbers of the opposite shifts."""
+    """Return the codes of the opposite shifts."""
     return _image(*-_shift(image).T)
 
 
@@ -150,7 +150,7 @@ def _has(first, other, images, i, j, image, shifted):
 
 
 def arrays_of(neighbors: Any, atoms: int) -> list[np.ndarray]:
-    """i, j and shifts, where there are any, of a list in one of the forms that `mdnum.Recorder.see` takes."""
+    """Return i, j and shifts, if any, of a neighbor list in a form that `mdnum.Recorder.see` accepts."""
     given = getattr(neighbors, "idx", neighbors)
     shifts = getattr(neighbors, "shifts", None)
     given = [*(given if isinstance(given, tuple) else (given,)), *(() if shifts is None else (shifts,))]
@@ -169,7 +169,7 @@ def arrays_of(neighbors: Any, atoms: int) -> list[np.ndarray]:
 
 
 class ListCheck:
-    """Compares the list in use with the pairs inside, frame after frame; while it stays, only by flips."""
+    """Comparison of a neighbor list with the pairs inside, frame by frame, or by flips while unchanged."""
 
     def __init__(self, rule: Rule) -> None:
         self._rule = rule
@@ -182,7 +182,7 @@ class ListCheck:
         self._open: dict[tuple[int, int, int], tuple[int, int, int, float]] = {}
 
     def given(self, neighbors: Any, species: np.ndarray) -> GivenList:
-        """A list; the same object where it did not change."""
+        """Return the neighbor list as a `GivenList`: the same object if it did not change."""
         if self._newest is None:
             if self._rule.directed:
                 message = f"a neighbor list is compared with a cutoff, and the rule is {self._rule.name}"
@@ -207,12 +207,12 @@ class ListCheck:
         flips: Mapping[str, np.ndarray],
         now: GivenList,
     ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """(what is known of the list at a frame, rows of pairs that were missing up to the one before).
+        """Compare list and pairs inside; return (results at the frame, rows of pairs no longer missing).
 
         Args:
-            at: position of the frame among those examined.
-            tracker, flips: of the rule, after this frame; flips by columns.
-            now: the list in use.
+            at: index of the frame among the frames examined.
+            tracker, flips: tracker of the rule after this frame, and the flips of the frame by columns.
+            now: the neighbor list in use.
         """
         new, earlier, before = now is not self._list, self._list, self._before
         x, lattice, reach = frame.positions, lattice_of(frame.box), self._rule.reach
@@ -250,7 +250,7 @@ class ListCheck:
         return row, self.ended(at, tracker.bound, {key: known[key] for key in gone})
 
     def _drops(self, earlier: GivenList, now: GivenList, frame: Frame, before: Frame, placed: Placed) -> bool:
-        """Whether a list may lack pairs inside that the one before it had."""
+        """Return True if a list may lack inside pairs that the previous list contained."""
         i, j, image, reach = earlier.i, earlier.j, earlier.image, self._rule.reach
         x, (matrix, inverse) = placed.positions, cell_of(frame)
         if (earlier.shifted, earlier.full) != (now.shifted, now.full):
@@ -273,7 +273,7 @@ class ListCheck:
         return bool((distance <= self._radii[self._kinds[i], self._kinds[j]] + placed.rounding).any())
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
-        """Rows of pairs that were missing up to a frame; of those that still are, where none are named."""
+        """Return rows of the given pairs, missing up to a frame; by default, of all pairs still missing."""
         names = ("i", "j", "rank", "missing", "begin", "number", "deepest", "end")
         held = sorted((self._open if stays is None else stays).items())
         rows = [(*key, *told, at) for key, told in held if told[-1] > bound]

@@ -1,18 +1,18 @@
-"""How many flips are lost between frames: pairs that cross their threshold and are back by the next frame.
+"""Estimate of flips lost between frames: pairs that cross their threshold and return by the next frame.
 
-The truth meant is the run's own: flips that an examination at every step of it would count. What happens
-within a step is no part of it, so a file that holds every step loses nothing. Estimates that share little:
+The reference is the number of flips that an examination of the run at every time step would count. Crossings
+within a time step do not count, so a file with every step loses nothing. Nearly independent estimates are:
 
-- **thinning**: what every second, fourth and eighth frame alone would lose of the flips;
-- **persistence**: whether atoms move on as they did a frame before. Pairs spread evenly around a threshold
-  cross it in proportion to the displacement between two frames, whatever the path;
-- **velocities**, where the file has them: displacements over those that they alone would make; and the
-  **flux**, at which pairs that fly straight on cross their thresholds.
+- **thinning**: the share of flips that would be lost with every second, fourth and eighth frame alone;
+- **persistence**: how much motion continues from one frame to the next. Pairs spread evenly around a
+  threshold cross it in proportion to the displacement between two frames, whatever the path;
+- **velocities**, if the file has them: the ratio of displacements to those that velocities alone predict; and
+  the **flux**, the rate at which pairs in straight flight cross their thresholds.
 
-The first two are carried on to finer frames by a family of laws: frames t apart show flips at a rate of
-(1 + (t/τ)^p)^(-s/p), p = 2 where paths are smooth and 1 where velocities change in kicks, s = 1/2 where
-motion ends up diffusive and 1 where atoms stay at their places. Those that fit are averaged. Constants were
-chosen on planted systems, and the coverage was measured on others (docs/lost-flips.md).
+The first two are extrapolated to finer frames by a family of laws: frames a time t apart show flips at a rate
+(1 + (t/τ)^p)^(-s/p), with p = 2 for smooth paths and 1 if velocities change in kicks, s = 1/2 for motion that
+ends up diffusive and 1 if atoms stay at their sites. The laws that fit are averaged. Constants were chosen on
+test systems with known losses, and the coverage was measured on others (docs/lost-flips.md).
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ Estimate = tuple[float, float]
 
 @dataclass(frozen=True)
 class FrameMotion:
-    """How far atoms get from frame to frame, as root mean squares."""
+    """Root mean square displacements of atoms from frame to frame."""
 
     growth: tuple[float, float, float]  # displacement in 1, 2 and 4 frames over that many times the one in 1
     step: float  # displacement of a pair in a frame, along an axis, length
@@ -74,7 +74,9 @@ class FrameMotion:
         *,
         timed: bool = True,
     ) -> FrameMotion | None:
-        """That of frames in a row, by the atoms on both sides of a pair; None for few, or below rounding."""
+        """Measure the motion of the atoms in pairs over consecutive frames; None for few frames or no
+        motion.
+        """
         sides = [slice(None) if one is None else one for one in (first, first if second is None else second)]
         atoms, grid = min(len(sample[0].positions[side]) for side in sides), resolution.usual_step(sample[0])
         pairs = list(pairwise(sample))
@@ -83,7 +85,7 @@ class FrameMotion:
             return None
 
         def variance(ways: Float[np.ndarray, "ways atoms 3"]) -> float:
-            """Along an axis, without what all atoms have in common."""
+            """Return the variance along an axis, without the motion common to all atoms."""
             free = ways - ways.mean(axis=1, keepdims=True)
             return float(np.mean([(free[:, side] ** 2).mean() for side in sides]))
 
@@ -99,7 +101,7 @@ class FrameMotion:
 
 @dataclass(frozen=True)
 class LostFlips:
-    """An estimate of what is lost between the frames, as shares of all flips that happened."""
+    """Estimate of the flips lost between frames, as shares of all flips that happened."""
 
     # "none_lost" (every second frame alone would lose no flip), "estimate"; or why there is no number:
     # "rounding" (the file's digits may have made what thinning loses), "open" (too wide a range fits)
@@ -116,13 +118,13 @@ class LostFlips:
 def lost_flips(
     found: Strides, motion: FrameMotion | None = None, flux: Any = None, reach: float = math.nan
 ) -> LostFlips | None:
-    """What is lost between the frames; None with fewer than three strides, or no flips.
+    """Estimate the flips lost between frames; return None with fewer than three strides, or without flips.
 
     Args:
-        found: flips left at each stride.
-        motion: of the atoms of the pairs.
-        flux: crossings by velocities, "crossed", and the share of them that is "lost"; None without any.
-        reach: the threshold's distance, length, where there is one.
+        found: flips that remain at each stride.
+        motion: motion of the atoms that form pairs.
+        flux: number of crossings by velocities, "crossed", and the share that is "lost"; None without any.
+        reach: distance of the threshold, length, if there is one.
     """
     if len(found.stride) < 3 or tuple(found.stride[:3]) != (1, 2, 4) or not found.of.all():
         return None
@@ -154,7 +156,7 @@ def lost_flips(
 
 
 def _of_motion(motion: FrameMotion, reach: float, bound: float) -> dict[str, Estimate]:
-    """The estimates by persistence, and by velocities where there are any."""
+    """Return the estimate by persistence and, if there are velocities, the estimate by velocities."""
     taken, few = -np.diff(np.log(motion.growth)), 1 / math.sqrt(motion.atoms)
     found = {"persistence": _carried_on(taken, np.hypot((_LAW["persistence"] + few) * taken, _LEAST))}
     if math.isfinite(motion.moved):
@@ -178,7 +180,7 @@ def _of_thinning(found: Strides) -> Estimate:
 
 
 def _carried_on(taken: Float[np.ndarray, "doublings"], error: Float[np.ndarray, "doublings"]) -> Estimate:
-    """What is lost at stride 1, by all laws that take so much at each doubling."""
+    """Return the loss at stride 1, averaged over the laws that reproduce the loss at each doubling."""
     misfit = sum(((law - one) / off) ** 2 for law, one, off in zip(_TAKEN, taken, error, strict=False))
     weight = np.exp(np.min(misfit) / 2 - misfit / 2 - _RARE)
     mean = float(np.average(_LOST, weights=weight))

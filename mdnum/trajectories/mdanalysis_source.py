@@ -1,9 +1,9 @@
-"""Trajectories that MDAnalysis reads, and what stands behind the last frame that it reads.
+"""Trajectories read by MDAnalysis, and detection of data after the last frame that MDAnalysis reads.
 
-A run that was killed, a copy that was cut and a frame whose head is damaged all look like the end of the file
-to MDAnalysis's readers of dcd, trr and some text formats, which leave the rest out without a word. A number
-cut in the middle is read as another one. Amber's NetCDF with fewer records than its head names, which is what
-a run that was killed leaves, is no file at all to them: it is read here (ambermd.org/netcdf/nctraj.xhtml).
+A killed run, a truncated copy and a damaged frame header all look like the end of the file to MDAnalysis's
+readers of dcd, trr and some text formats, which silently skip the rest. A number that is cut off is read as
+another number. MDAnalysis rejects an Amber NetCDF file with fewer records than its header states, which a
+killed run leaves; such a file is read by this module (ambermd.org/netcdf/nctraj.xhtml).
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ _PART = 1 << 22
 
 
 class LibraryFrames:
-    """Frames of one of MDAnalysis's readers, each looked at before the library reads it.
+    """Frames of an MDAnalysis reader; each frame is checked before MDAnalysis reads it.
 
     Attributes:
-        raw: the last frame that was read, before transformations; None where there are none.
-        replaced: whether transformations were made in memory, where nothing of what was read is left.
+        raw: the last frame read, before transformations; None without transformations.
+        replaced: True if transformations were applied in memory and have replaced the values read.
     """
 
     def __init__(self, trajectory: Any):
@@ -71,11 +71,11 @@ class LibraryFrames:
         self._guard = opened(trajectory)
 
     def timestep(self, number: int, forward: bool = False) -> Any:
-        """MDAnalysis's timestep of a frame, which may be the one after that at which the reader stands.
+        """Return MDAnalysis's timestep of a frame; `forward` if the reader is at the frame before.
 
         Raises:
-            UnreadableFrame: it cannot be read, or should not: that would end the process, or its last number
-                was cut.
+            UnreadableFrame: the frame cannot be read, reading it would end the process, or its last number is
+                cut off.
         """
         with self._reading(number):
             if self._guard is not None:
@@ -99,7 +99,7 @@ class LibraryFrames:
             return ts
 
     def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
-        """A frame from a timestep, copied; errors as of `timestep`."""
+        """Return a timestep as a frame, copied; errors as in `timestep`."""
         with self._reading(number):
             time, x = float(number) if untimed else float(ts.time), np.array(ts.positions, np.float64)
             velocities = np.array(ts.velocities, np.float64) if ts.has_velocities else None
@@ -115,7 +115,7 @@ class LibraryFrames:
         return reading(file_of(self.trajectory) or "the trajectory", number)
 
     def _refuse_cut_text(self, number: int) -> None:
-        """Refuses the last frame of text whose last number was cut; no other can be."""
+        """Reject the last frame of a text file if its last number is cut off; no other frame can be."""
         trajectory = self.trajectory
         if number != trajectory.n_frames - 1 or (found := _text(trajectory)) is None:
             return
@@ -134,7 +134,7 @@ class LibraryFrames:
 
 
 class MDAnalysisTrajectory(Trajectory):
-    """A file behind an MDAnalysis Universe. Coordinates pass through float32 there, whatever it holds."""
+    """Trajectory read through an MDAnalysis Universe; coordinates pass through float32 in all formats."""
 
     reader = "MDAnalysis"
     bits = 32
@@ -161,7 +161,7 @@ class MDAnalysisTrajectory(Trajectory):
             return self._boxes.other(self.universe.trajectory[number], number)
 
     def _universe_of(self, format: str | None) -> tuple[Any, list[str]]:
-        """A Universe of the trajectory, and the warnings that opening it and its time step gave."""
+        """Return a Universe of the trajectory, and the warnings from opening it and reading its time step."""
         import MDAnalysis
 
         path = self.path
@@ -213,9 +213,9 @@ class MDAnalysisTrajectory(Trajectory):
 
 
 def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
-    """What the file says its atoms are in each frame: MDAnalysis reads that of the first alone.
+    """Return a function that reads the atom labels of any frame; MDAnalysis reads those of the first only.
 
-    Others of MDAnalysis's readers than those of XYZ files and of PDB models give None.
+    The function returns None for all formats except XYZ files and PDB models.
     """
     from MDAnalysis.lib.util import anyopen
 
@@ -243,7 +243,7 @@ def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
 
 
 def _length_of(trajectory: Any) -> str:
-    """Unit of length in words; "" where the file has one of its own (GSD)."""
+    """Return the name of the length unit; "" for formats with a unit of their own (GSD)."""
     unit = trajectory.units.get("length")
     if unit is None or getattr(trajectory, "convert_units", True):
         return "Å" if unit else ""
@@ -252,7 +252,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factors(trajectory: Any) -> tuple[float, float]:
-    """Times in a DCD file over MDAnalysis's, which has the step in this machine's byte order; `swapped`."""
+    """Return (ratio of the times in a DCD file to MDAnalysis's, which ignores byte order; `swapped`)."""
     read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
     if not read:
         return 1.0, math.nan
@@ -268,9 +268,9 @@ def _time_factors(trajectory: Any) -> tuple[float, float]:
 
 
 def left_over(trajectory: Any) -> str | None:
-    """What is left behind the last frame of one of MDAnalysis's readers, in words; None where nothing is.
+    """Describe the data after the last frame of an MDAnalysis reader; return None if there are none.
 
-    One that reads text by lines is moved to its last frame.
+    A reader of line-based text is moved to its last frame.
     """
     path = file_of(trajectory)
     if path is None or not path.is_file():
@@ -307,7 +307,7 @@ def left_over(trajectory: Any) -> str | None:
 
 
 def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
-    """Bytes behind the last frame, and those of a frame."""
+    """Return (bytes after the last frame of a DCD file, bytes of a frame)."""
     from MDAnalysis.lib.formats.libdcd import DCDFile
 
     with DCDFile(str(path)) as file:
@@ -320,7 +320,7 @@ def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
 
 
 def _behind_text(file: Any) -> str | None:
-    """Lines behind the last frame, without blank ones at the end."""
+    """Describe the lines after the last frame, without blank ones at the end; return None without any."""
     if file is None or file.closed:
         return None
     lines = 0
@@ -333,7 +333,7 @@ def _behind_text(file: Any) -> str | None:
 
 
 def _last_bytes(path: Path) -> tuple[bytes, int]:
-    """The end of a file, and how many bytes it has; of a compressed one, what is in it, which is all read."""
+    """Return (the last bytes of a file, its size); a compressed file is read completely, uncompressed."""
     from MDAnalysis.lib.util import anyopen
 
     packed = path.suffix in (".gz", ".bz2")
@@ -347,7 +347,7 @@ def _last_bytes(path: Path) -> tuple[bytes, int]:
 
 
 def _text(trajectory: Any) -> tuple[Path, str] | None:
-    """(file, format) behind MDAnalysis's reader where it reads text by lines."""
+    """Return (file, format) if MDAnalysis's reader reads the file as lines of text; otherwise None."""
     path, word = file_of(trajectory), next((one for one in formats_of(trajectory) if one in _LINES), None)
     return None if word is None or path is None else (path, word)
 
@@ -356,7 +356,7 @@ def _text(trajectory: Any) -> tuple[Path, str] | None:
 
 
 class NetcdfFile(netcdf_file):
-    """A NetCDF file in classic format, of which whole records are read, however many its head names."""
+    """A NetCDF file in classic format whose complete records can be read, however many its header states."""
 
     # where the first record begins, bytes
     _begin = sys.maxsize
@@ -369,17 +369,17 @@ class NetcdfFile(netcdf_file):
 
     @property
     def record(self) -> int:
-        """Bytes of a record; 0 without any."""
+        """Bytes of a record; 0 without any record."""
         return int(vars(self)["_recsize"])
 
     @property
     def told(self) -> int:
-        """How many its head tells of; -1 where the writer did not get to say."""
+        """Number of records stated in the header; -1 if the writer never filled it in."""
         return int(vars(self)["_recs"])
 
     @property
     def whole(self) -> int:
-        """How many there are from beginning to end."""
+        """Number of complete records."""
         room = max(self._behind, 0) // self.record
         return room if self.told < 0 else min(room, self.told)
 
@@ -388,7 +388,7 @@ class NetcdfFile(netcdf_file):
 
     @property
     def rest(self) -> int:
-        """Bytes behind them."""
+        """Number of bytes after the complete records."""
         return self._behind - self.whole * self.record
 
     @property
@@ -397,7 +397,7 @@ class NetcdfFile(netcdf_file):
 
 
 def netcdf_of(path: str | Path) -> NetcdfFile | None:
-    """A NetCDF file in classic format; None for another file, or where the head itself is cut."""
+    """Open a NetCDF file in classic format; return None for other files, or if the header is truncated."""
     try:
         file = NetcdfFile(str(path))
     except (OSError, TypeError, ValueError, KeyError, IndexError):
@@ -408,7 +408,7 @@ def netcdf_of(path: str | Path) -> NetcdfFile | None:
 
 
 class NetcdfTrajectory(Trajectory):
-    """An Amber NetCDF file that ends early, in Å and ps."""
+    """Trajectory from an Amber NetCDF file that ends early, in Å and ps."""
 
     format = "NCDF"
 
@@ -452,7 +452,7 @@ class NetcdfTrajectory(Trajectory):
 
 
 def _scaled(variable: Any, number: int) -> np.ndarray:
-    """The value of a variable in a record."""
+    """Return the value of a variable in a record, multiplied by the variable's scale factor."""
     values, scale = np.array(variable[number]), getattr(variable, "scale_factor", None)
     values = values.astype(values.dtype.newbyteorder("="))
     # rounded once, as MDAnalysis does

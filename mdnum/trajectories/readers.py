@@ -1,4 +1,4 @@
-"""Trajectories of any code: which reader a file gets, and which of its frames are meant by run.xtc@100:."""
+"""Choice of a reader for a trajectory file, and frame selections such as run.xtc@100:."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ for _words, _reader in {
 def open_trajectory(
     path: str | Path, topology: str | Path | None = None, slice: str = "", format: str | None = None
 ) -> Trajectory:
-    """Opens a file that MDAnalysis or ASE reads, or the folder of an mdnum run.
+    """Open a trajectory file that MDAnalysis or ASE can read, or the folder of an mdnum run.
 
     Args:
-        path: the file; may end in @START:STOP:STEP.
-        topology: a file that says what the atoms are, where the trajectory does not (xtc, trr, dcd, ...):
-            anything that MDAnalysis takes for one.
-        slice: frames to read, as behind the @.
-        format: the format in MDAnalysis's or ASE's word, where the name of the file does not tell it.
+        path: the file, optionally followed by a frame selection @START:STOP:STEP.
+        topology: a file that identifies the atoms, if the trajectory does not (xtc, trr, dcd, ...); any
+            topology file that MDAnalysis accepts.
+        slice: frames to read, written as after the @.
+        format: MDAnalysis's or ASE's name of the format, if the file name does not identify it.
 
     Raises:
-        InputError: no such file, nobody reads it, or it does not belong to the topology.
+        InputError: the file does not exist, no reader supports it, or it does not match the topology.
     """
     for one in (path, "" if topology is None else topology):
         expect_path(one, IN_MEMORY)
@@ -101,7 +101,7 @@ def open_trajectory(
 
 
 def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
-    """What opens a file, of its path, its topology and the frames asked for."""
+    """Return the function that opens a file, given its path, its topology and the requested frames."""
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
     word = (format or suffix[1:]).lower()
     if word in READERS:
@@ -129,7 +129,7 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
 
 
 def _first_lines(file: Path) -> tuple[str, str]:
-    """The first two lines in small letters; empty for a file that is no text."""
+    """Return the first two lines in lower case; empty strings for a file that is not text."""
     from ase.io.formats import open_with_compression
 
     try:
@@ -143,7 +143,7 @@ def _first_lines(file: Path) -> tuple[str, str]:
 
 
 def split_path(text: str) -> tuple[Path, str]:
-    """(path, words of the slice behind its last @); a file whose own name has an @ is found as it is."""
+    """Return (path, slice after the last @); a file whose own name contains an @ is recognized."""
     whole = Path(text).expanduser()
     name, at, words = text.rpartition("@")
     if not at or whole.exists():
@@ -154,10 +154,10 @@ def split_path(text: str) -> tuple[Path, str]:
 
 
 def parse_slice(words: str, where: str = "") -> slice:
-    """The slice that words name: "100:", "::10", "-50:", "5" (that frame alone), "" (all).
+    """Return the slice that a text describes: "100:", "::10", "-50:", "5" (one frame), "" (all frames).
 
     Raises:
-        InputError: the words are no slice, or go backward: flips follow time.
+        InputError: the text is not a slice, or its stride is not positive, whereas flips follow time.
     """
     match = _SLICE.fullmatch(words.strip())
     if match is None:

@@ -1,8 +1,8 @@
-"""Frames that repeat earlier ones bit for bit, or have their times: a restart, or no motion at all.
+"""Detection of frames that repeat earlier ones bit for bit, or their times: restarts, or no motion at all.
 
-A run that continues from a checkpoint writes some frames again, joined files have frames in common, and a
-simulation that stopped, or a rejected Monte Carlo move, leaves the frame before. Times do not always tell. A
-restart that rounds otherwise repeats times and not bits: of two frames the first is kept.
+A run that continues from a checkpoint writes some frames again, concatenated files have frames in common, and
+a stopped simulation or a rejected Monte Carlo move repeats the previous frame. Times do not always reveal it.
+A restart with different rounding repeats times but not bits; the first of the two frames is kept.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _SAME = 1e-8
 
 
 def digest(frame: Frame) -> bytes:
-    """Sixteen bytes that two frames share if their positions and boxes are the same bit for bit."""
+    """Return sixteen bytes that are equal for two frames with bitwise identical positions and boxes."""
     x = np.ascontiguousarray(frame.positions)
     parts = (x[:: max(1, len(x) // _ATOMS)], np.array(crc32(x.data)), frame.box.matrix, frame.box.pbc)
     return blake2b(b"".join(part.tobytes() for part in parts), digest_size=16).digest()
@@ -33,16 +33,16 @@ def digest(frame: Frame) -> bytes:
 
 @dataclass
 class RepeatedFrames:
-    """Which frames repeat earlier ones. Memory: a digest for each frame that differs from all before.
+    """Record of the frames that repeat earlier ones; its memory holds one digest per distinct frame.
 
     Attributes:
-        drop: leave them out when frames are passed on.
-        most: frames that are remembered, the latest.
-        frames: how many there are.
-        again: ranges of other frames whose times were there before, with numbers as in `stretches`, the first
-            and the last time (time, to), and how many there are (frames).
-        stretches: of consecutive ones that repeat consecutive ones: numbers in the file (first, last,
-            of_first, of_last), and whether that is one frame without motion (still).
+        drop: True to leave repeated frames out when frames are passed on.
+        most: number of frames remembered, the most recent ones.
+        frames: number of repeated frames.
+        again: ranges of different frames whose times occurred before, with numbers as in `stretches`, the
+            first and the last time (time, to), and the number of frames (frames).
+        stretches: ranges of consecutive frames that repeat consecutive ones: numbers in the file (first,
+            last, of_first, of_last), and whether the range is one frame without motion (still).
     """
 
     drop: bool = False
@@ -60,7 +60,7 @@ class RepeatedFrames:
     _had = 0
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Passes frames on, without those that repeat others if they are to be left out."""
+        """Yield frames, without repeated ones if `drop` is set."""
         for frame in frames:
             every: list[dict[Any, Any]] = [self._known, self._wrapped, self._times]
             for held in every:
@@ -72,7 +72,7 @@ class RepeatedFrames:
                 yield frame
 
     def _digest(self, frame: Frame) -> bytes:
-        """Of the frame, or of an earlier one that had the same atoms in other cells."""
+        """Return the digest of a frame, or of an earlier frame with the same atoms in other cells."""
         digested, box = digest(frame), frame.box
         if not box.pbc.all() or not np.linalg.det(box.matrix):
             return digested
@@ -86,7 +86,7 @@ class RepeatedFrames:
         return digested if before == mine else known
 
     def had(self, number: int, time: float) -> bool:
-        """Whether the next frame, once it was seen, has the time of an earlier one, and times had gone on."""
+        """Return True if the frame seen last has the time of an earlier frame although times had advanced."""
         of = self._times.setdefault(f"{time:.12g}", number)
         if of == number or len(self._times) < 2:
             return False
@@ -98,7 +98,7 @@ class RepeatedFrames:
         return True
 
     def see(self, number: int, digested: bytes) -> bool:
-        """Whether the next frame, of this number in the file, repeats an earlier one."""
+        """Return True if the next frame, with the given number in the file, repeats an earlier frame."""
         # of several that are the same the last one counts, so that no motion is a repeat of the frame before
         place, of = self._known.get(digested, (self._place, number))
         self._known[digested] = self._place, number
@@ -113,6 +113,6 @@ class RepeatedFrames:
         return back > 0
 
     def plain(self, most: int = 100) -> dict[str, Any]:
-        """As plain values, with so many of the stretches."""
+        """Return the record as plain values, with at most `most` ranges."""
         sizes = {"frames": self.frames, "stretches": len(self.stretches), "to_the_end": self._back > 0}
         return sizes | {"dropped": self.drop, "ranges": self.stretches[:most], "again": self.again[:most]}

@@ -1,8 +1,8 @@
-"""Contacts between residues: two are in contact where their nearest atoms are within the cutoff.
+"""Contacts between residues: two residues are in contact if their nearest atoms are within the cutoff.
 
-A pair of residues is inside while any of its pairs of atoms is, so that the decisions are those on atoms; the
-ledger has the smallest distances. Hydrogens and virtual sites are left out unless they are wanted: where they
-are depends on constraints and on who wrote the file, and the cutoffs in use are meant for heavy atoms.
+A pair of residues is inside while any of its atom pairs is inside, so decisions are made on atoms; the ledger
+holds the smallest distances. Hydrogens and virtual sites are left out by default: their positions depend on
+constraints and on the program that wrote the file, and customary cutoffs are meant for heavy atoms.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _TOGETHER = 20_000
 
 @dataclass(frozen=True)
 class ByResidue:
-    """Residues in the place of atoms."""
+    """Residues of a file, used in place of atoms."""
 
     of: Int[np.ndarray, "atoms"]  # residue of each atom of the file
     table: AtomTable  # of the residues, an entry each
@@ -45,10 +45,11 @@ class ByResidue:
 
     @classmethod
     def make(cls, table: AtomTable, groups: Groups, hydrogens: bool, rules: Sequence[Rule]) -> ByResidue:
-        """The residues of a file; `hydrogens` keeps hydrogens and virtual sites.
+        """Build the residues of a file; `hydrogens` keeps hydrogens and virtual sites.
 
         Raises:
-            InputError: the file has no residues, no atom is left, or a rule knows no pairs of residues.
+            InputError: the file has no residues, no atom is left, or a rule is not defined for pairs of
+                residues.
         """
         if len(table) and not any(table.residue_names):
             remedy = "Give a topology that has residues with -s TOPOLOGY"
@@ -70,23 +71,23 @@ class ByResidue:
 
     @property
     def names(self) -> ResidueNames:
-        """What the residues are called."""
+        """Names of the residues."""
         table = self.table
         return ResidueNames(table.residues, table.residue_names, table.residue_ids, table.segments)
 
     @property
     def sides(self) -> Groups:
-        """Residues on either side."""
+        """Residues on either side of a pair."""
         first, second = (None if side is None else np.unique(self.of[side]) for side in self.groups)
         return first, second
 
     def tracker(self, rule: Rule, species: Sequence[str] | None, bound: float = 0.0) -> ResidueTracker:
-        """Who follows the contacts by a rule."""
+        """Return a tracker for the contacts that a rule defines."""
         return ResidueTracker(rule, self, species, bound)
 
 
 def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarray, "atoms"]]:
-    """(which atoms are hydrogens, by their element; which are virtual sites, by their name)."""
+    """Return (mask of hydrogens, by element; mask of virtual sites, by name)."""
     water = {str(name) for name in np.unique(table.residue_names.astype(str)) if _WATER.fullmatch(str(name))}
     virtual = [
         _VIRTUAL.fullmatch(str(name)) is not None or (name in _OF_WATER and residue in water)
@@ -97,7 +98,7 @@ def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarr
 
 
 def of_residues(table: AtomTable) -> AtomTable:
-    """A table with an entry for each residue, whose species is the residue's name."""
+    """Return a table with an entry for each residue, whose species is the residue's name."""
     at = np.unique(table.residues, return_index=True)[1]
     names, blank = table.residue_names[at], np.full(len(at), "", object)
     ids, segments = table.residue_ids[at], table.segments[at]
@@ -105,18 +106,18 @@ def of_residues(table: AtomTable) -> AtomTable:
 
 
 class ResidueTracker:
-    """Contacts between residues from frame to frame, with what a `Tracker` offers of pairs of atoms.
+    """Tracker of contacts between residues, with the interface that `Tracker` has for pairs of atoms.
 
-    Atoms of one residue make no contact. `near` counts pairs of atoms, of which each pair of residues within
-    the bound has one or more; the smallest margin is not searched for (inf).
+    Atoms of one residue make no contact. `near` counts pairs of atoms; each pair of residues within the bound
+    has one or more of them. The smallest margin is not computed (inf).
 
     Args:
-        rule: who is in contact, of atoms.
-        residues: which atoms count.
-        species: of each atom of the file; needed by rules that ask for it.
-        bound: how far a distance can be off through the resolution of the file, length.
+        rule: membership rule for atoms.
+        residues: residues, and the atoms that count.
+        species: species of each atom of the file; required by some rules.
+        bound: error of a distance due to the resolution of the file, length.
 
-    Error: smallest distances are rounded as distances of atoms are.
+    Error: smallest distances have the rounding error of distances between atoms.
     """
 
     min_margin = np.inf
@@ -136,21 +137,21 @@ class ResidueTracker:
 
     @property
     def pairs(self) -> int:
-        """Pairs of residues in contact at the last frame."""
+        """Number of pairs of residues in contact at the last frame."""
         return len(self._pairs)
 
     @property
     def near(self) -> int:
-        """Pairs of atoms at the last frame with a |margin| of at most the bound."""
+        """Number of pairs of atoms at the last frame whose |margin| is at most the bound."""
         return self._atoms.near
 
     @property
     def bound(self) -> float:
-        """How far a distance can be off at the last frame, length."""
+        """Error bound of a distance at the last frame, length."""
         return self._atoms.bound
 
     def step(self, frame: Frame, bound: float | None = None) -> FlipTable:
-        """The contacts that formed or broke since the frame before; see `Tracker.step`."""
+        """Return the contacts that formed or broke since the previous frame; see `Tracker.step`."""
         flips, before = self._atoms.step(frame, bound), self._last
         i, j, sign = flips.i, flips.j, np.where(flips.entered, 1, -1)
         if before is None:
@@ -178,14 +179,14 @@ class ResidueTracker:
         )  # fmt: skip
 
     def members(self) -> Members:
-        """The pairs of residues in contact at the last frame, with their smallest distances."""
+        """Return the pairs of residues in contact at the last frame, with their smallest distances."""
         if self._last is None:
             return Members.none()
         i, j = np.divmod(self._pairs, self._count)
         return Members(i, j, np.zeros_like(i), self._closest(self._last, i, j)[0])
 
     def _closest(self, frame: Frame, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(distance, threshold) of the pair of atoms that is furthest inside, or least outside, length."""
+        """Return (distance, threshold) of the atom pair that is deepest inside or least outside, length."""
         placed, found = self._placed(frame), np.full((2, len(i)), np.inf)
         for begin in range(0, len(i), _TOGETHER):
             part = slice(begin, begin + _TOGETHER)
@@ -215,7 +216,7 @@ class ResidueTracker:
 
 
 def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(the atoms among these in the order of their residues, where those of each begin and the last end)."""
+    """Return (atoms sorted by residue, offsets at which the atoms of each residue begin and the last end)."""
     atoms = np.arange(len(of)) if atoms is None else atoms
     order = atoms[np.argsort(of[atoms], kind="stable")]
     return order, np.searchsorted(of[order], np.arange(count + 1))
@@ -223,7 +224,7 @@ def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[n
 
 @dataclass(frozen=True)
 class Occupancy(Columns):
-    """How much of the time each pair was in contact, sorted by (i, j): the entries of a contact matrix."""
+    """Share of the frames in which each pair was in contact, sorted by (i, j): a sparse contact matrix."""
 
     i: Int[np.ndarray, "pairs"]  # the pair
     j: Int[np.ndarray, "pairs"]
@@ -234,7 +235,7 @@ class Occupancy(Columns):
 
     @classmethod
     def of(cls, stays: Contacts, frames: int) -> Occupancy:
-        """Sums over the stays of each pair in so many frames."""
+        """Sum the contacts of each pair over the given number of frames."""
         new = np.append(True, (np.diff(stays.i) != 0) | (np.diff(stays.j) != 0))[: len(stays)]
         heads, where = np.flatnonzero(new), np.cumsum(new) - 1
         weights = (stays.length, stays.began, stays.ended)
@@ -244,7 +245,7 @@ class Occupancy(Columns):
 
 @dataclass(frozen=True)
 class ResidueNames(Columns):
-    """What residues are called, an entry each."""
+    """Names of residues, one entry per residue."""
 
     residue: Int[np.ndarray, "residues"]  # its number from 0, by which tables name it
     name: np.ndarray
@@ -255,7 +256,7 @@ class ResidueNames(Columns):
 def contacts_over_time(
     stays: Contacts, residues: int, frames: int
 ) -> tuple[Int[np.ndarray, "moments"], Float[np.ndarray, "residues moments"]]:
-    """(first frame of each of up to `MOMENTS` stretches, mean number of contacts of each residue then)."""
+    """Return (first frame of each of up to `MOMENTS` intervals, mean number of contacts of each residue)."""
     edges = np.unique(np.linspace(0, frames, min(frames, MOMENTS) + 1).astype(np.int64))
     found = np.zeros((residues, len(edges) - 1))
     for k, (low, high) in enumerate(pairwise(edges)):

@@ -1,14 +1,14 @@
-"""How finely a file tells where atoms are, found from its numbers, and what that leaves undecided.
+"""Resolution of positions in a file, inferred from its numbers, and the decisions it leaves undecided.
 
-A file that keeps three decimals has moved every coordinate by up to half a unit of the third: whether a pair
-is inside a cutoff cannot be told when its distance is closer to it than what that does to a distance. `infer`
-looks for the decimal grid that all coordinates lie on, so that a precision nobody wrote down is found too.
+Writing three decimals moves every coordinate by up to half a unit of the third. Whether a pair is inside a
+cutoff is then undecidable if its distance is closer to the cutoff than the resulting error of a distance.
+`infer` searches for the decimal grid that holds all coordinates, so an undocumented precision is found too.
 
-Rounding every coordinate moves a crossing to another frame, hides a short visit, or lets a pair that hovers
-at the cutoff hop across it. From one file nobody can tell which flips those are, but how many there must be
-can be estimated (`grid_effect`): pairs are drawn at random near the cutoff, move as atoms of the file do
-between two frames, and are decided with and without rounding. Among the nearest neighbors a flip is two atoms
-at about the same distance from a third that change places, and what is drawn are three atoms.
+Rounding of coordinates moves a crossing to another frame, hides a short visit, or makes a pair near the
+cutoff cross it. One file does not show which flips are affected, but their number can be estimated
+(`grid_effect`): random pairs near the cutoff move as atoms of the file do between two frames, and are decided
+with and without rounding. For nearest neighbors, a flip is an exchange of two atoms at about the same
+distance from a third, so triples of atoms are drawn.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _WIDE = 4.0
 
 @dataclass(frozen=True)
 class Resolution:
-    """The resolution of the positions in a file."""
+    """Resolution of the positions in a file."""
 
     # "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32", "float64", or
     # "unknown" where every coordinate looked at is 0 (bounds are then those of float32)
@@ -68,14 +68,16 @@ class Resolution:
     told: bool = True  # whether the coordinates determine it; where all are 0, it is the format's usual one
 
     def bound(self, frame: Frame, atoms: AtomIndices = None) -> float:
-        """How far a distance in this frame can be from that of the positions before they were written.
+        """Return the largest error of a distance in this frame due to rounding when the file was written.
 
-        The worst case, length: both atoms moved by half a step along every axis, in opposite directions, and
-        a pair across the boundary by what rounding did to the box. For float64 it is the distance's rounding.
-        A margin to a cutoff is off by as much, one among the nearest neighbors (the difference of two
-        distances) by twice that. Only the distances of these atoms are meant, where they are given.
+        The bound is the worst case, length: both atoms are moved by half a step along every axis in opposite
+        directions, and a pair across the boundary also by the rounding of the box. For float64, the bound is
+        the rounding of the distance. A margin to a cutoff has the same error bound; a margin among the
+        nearest neighbors (the difference of two distances) has twice that. If atoms are given, only their
+        distances count.
 
-        Error: for a pair through one period of the box; further images add as much of the box's part again.
+        Error: valid for a pair through one period of the box; each further period adds the part of the box
+            again.
         """
         if atoms is not None or not np.isfinite(frame.furthest):
             x = frame.positions if atoms is None else frame.positions[atoms]
@@ -98,7 +100,7 @@ class Resolution:
         return float(2 * np.sqrt(3) * coordinate + box + arithmetic)
 
     def usual_step(self, frame: Frame) -> float:
-        """Root mean square of what the last digit of a coordinate is worth, length."""
+        """Return the root mean square value of the last digit of a coordinate, length."""
         if not len(frame.positions):
             return 0.0
         if not self.step:
@@ -115,7 +117,7 @@ class Resolution:
         return self.kind in ("float32", "unknown") or self.bits == 32
 
     def _half(self, frame: Frame) -> float:
-        """Half a step along an axis at worst, length."""
+        """Return the largest half step along an axis, length."""
         if not self.step or not len(frame.positions):
             return 0.0
         if self.kind == "fractions":
@@ -130,12 +132,12 @@ FLOAT32 = Resolution("float32", 0.0, 32, 0)
 
 
 def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resolution:
-    """The resolution of frames.
+    """Infer the resolution of positions from a sample of frames.
 
     Args:
         sample: frames of one file, at least one.
-        bits: width of a coordinate as the reader hands it over.
-        format: in the reader's word, for what formats are known to round.
+        bits: width of a coordinate as the reader returns it.
+        format: the reader's name of the format, for formats with known rounding.
     """
     moved = np.zeros(len(sample[0].positions), bool)
     for frame in sample[1:]:
@@ -173,7 +175,7 @@ def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resoluti
 
 
 def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
-    """Positions in fractions of the box."""
+    """Return positions as fractions of the box vectors."""
     return np.linalg.solve(frame.box.matrix.T, (frame.positions - frame.box.origin).T).T
 
 
@@ -183,11 +185,11 @@ def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
 def decimal_grid(
     values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values"]
 ) -> tuple[float, int]:
-    """The decimals that all values keep to, each of which may be off by its slack.
+    """Find the decimal grid that holds all values, each within its slack.
 
     Returns:
-        the coarsest decimal step that all are multiples of, and 0; or the step of the largest and the number
-        of significant digits that all have; or 0.0 and 0 where they are no decimals.
+        (the coarsest decimal step of which all values are multiples, 0); or (the step of the largest value,
+            the number of significant digits of all values); or (0.0, 0) if the values are not decimals.
     """
     values, index = np.unique(values, return_index=True)
     slack = slack[index]
@@ -211,7 +213,7 @@ def decimal_grid(
 
 
 def steps_of(values: Float[np.ndarray, "*shape"], step: float, digits: int) -> Float[np.ndarray, "*shape"]:
-    """What the last digit of each value is worth: the step, or by the value's size where digits count."""
+    """Return the value of the last digit of each number: the step, or by size for significant digits."""
     if digits == 0:
         return np.full_like(values, step)
     size = np.where(values == 0, 1.0, np.abs(values))
@@ -231,7 +233,7 @@ def _fixed(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values
 
 
 def _chance(parts: Float[np.ndarray, "values"]) -> float:
-    """Logarithm of the probability that values at random all fall into these parts of a step."""
+    """Return the logarithm of the probability that random values all fall into these parts of a step."""
     return float(np.log(np.maximum(parts, 1e-300)).sum())
 
 
@@ -247,7 +249,7 @@ Places = tuple[Float[np.ndarray, "draws 3"], ...]
 
 @dataclass(frozen=True)
 class GridEffect:
-    """Flips with and without the rounding of the file, estimated."""
+    """Estimated shares of flips that the rounding of a file hides or creates."""
 
     missed: float  # share of the flips that happened between two frames and are not in the file at that frame
     invented: float  # share of the flips in the file that did not happen at that frame
@@ -264,25 +266,25 @@ def grid_effect(
     ranked: bool = False,
     draws: int = _DRAWS,
 ) -> GridEffect | None:
-    """Estimates what rounding to the file's resolution does to flips at a cutoff, or among the nearest.
+    """Estimate the effect of a file's resolution on flips at a cutoff or among the nearest neighbors.
 
     Args:
-        resolution: of the file.
-        sample: consecutive frames as they are looked at, at the stride in question.
-        radius: the cutoff, length; where `ranked`, about how far the last of the nearest is away.
-        first: atoms on one side of a pair, the ones that have neighbors; None for all.
-        second: atoms on the other side; None for the same.
-        ranked: whether it is the order of distances that decides, and no length.
-        draws: pairs drawn, or triples.
+        resolution: resolution of the file.
+        sample: consecutive frames at the stride of the analysis.
+        radius: the cutoff, length; if `ranked`, the approximate distance of the last of the nearest.
+        first: atoms on one side of a pair, whose neighbors are meant; None for all.
+        second: atoms on the other side; None for the same atoms.
+        ranked: True if the order of distances decides, and no length.
+        draws: number of pairs or triples drawn.
 
     Returns:
-        None where the frames cannot tell: fewer than two, nothing moves, every coordinate is 0, or no radius.
+        the shares; None with fewer than two frames, no motion, all coordinates 0, or no radius.
 
-    Error: the atoms of a pair are taken to move independently and straight on, and pairs to be spread
-        evenly around the cutoff; the draws themselves scatter by about 1 % of the shares. In an LJ liquid
-        whose float64 positions were known the shares were right to 0.01 at strides of 0.0002 to 0.1 τ, among
-        the 4 nearest to 0.02 and the 12 nearest to 0.07 (tests/trajectories/test_resolution.py). Atoms bonded
-        to one another move together, and less against each other than this takes them to.
+    Error: the atoms of a pair are assumed to move independently and straight, and pairs to be spread evenly
+        around the cutoff; the draws scatter by about 1 % of the shares. In an LJ liquid with known float64
+        positions, the shares were right to 0.01 at strides of 0.0002 to 0.1 τ, among the 4 nearest to 0.02
+        and the 12 nearest to 0.07 (tests/trajectories/test_resolution.py). Bonded atoms move together, with
+        less relative motion than assumed.
     """
     if len(sample) < 2 or not len(sample[0].positions) or not radius > 0:
         return None
@@ -301,7 +303,7 @@ def grid_effect(
     before, after = _drawn(random, one, other, radius, steps, draws, ranked)
 
     def decided(places: Places) -> np.ndarray:
-        """Whether a pair is inside, or the second of three is closer to the first than the third is."""
+        """Return True if a pair is inside, or the second atom of a triple is nearer than the third."""
         squares = [((place - places[0]) ** 2).sum(axis=1) for place in places[1:]]
         return squares[0] < (squares[1] if ranked else radius**2)
 
@@ -324,7 +326,7 @@ def _drawn(
     draws: int,
     ranked: bool,
 ) -> tuple[Places, Places]:
-    """Pairs near the radius before and after they move; ranked: two others equally far from an atom."""
+    """Draw pairs near the radius, or triples with two equal distances, before and after their motion."""
     moved = [moves[random.integers(len(moves), size=draws)] for moves in (one, other, other)[: 2 + ranked]]
     # the distance of the middle one of three counts twice where the others are on opposite sides
     spread = float(np.sqrt((1 + ranked) * (one**2).mean() + (1 + ranked) * (other**2).mean()))
@@ -339,17 +341,17 @@ def _drawn(
 
 
 def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
-    """Vectors of the grid that positions lie on, as rows, length."""
+    """Return the vectors of the grid of positions, as rows, length."""
     if resolution.kind == "fractions" and not resolution.digits:
         return resolution.step * frame.box.matrix
     return resolution.usual_step(frame) * np.eye(3)
 
 
 def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]:
-    """Displacements of every atom in one frame, without what rounding did to them.
+    """Return the displacement of every atom in one frame, corrected for rounding.
 
-    Over so many frames that a displacement is well above a step of the grid; what rounding adds to their
-    variance is taken off again.
+    Displacements are measured over enough frames to exceed a step of the grid clearly; the variance that
+    rounding adds is subtracted.
     """
     moves, lag, total = np.zeros_like(sample[0].positions), 0, 0.0
     for before, after in pairwise(sample):
@@ -366,11 +368,11 @@ def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]
 
 
 def unrounded(variance: float, size: float) -> float:
-    """Variance of displacements whose ends, rounded to multiples of size, differ with this variance.
+    """Return the true variance of displacements whose ends, rounded to multiples of size, show this variance.
 
-    A displacement of f steps beyond a whole number of them gains size² f (1 - f) on average over where it
-    begins. Over displacements with variance v from a normal distribution that is (by its Fourier series)
-    size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
+    If a displacement exceeds a whole number of steps by a fraction f, rounding adds size² f (1 - f) on
+    average over starting points. For normally distributed displacements of variance v, this averages (by its
+    Fourier series) to size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
     """
     low, high, k = 0.0, variance, np.arange(1, 200)
     for _ in range(60):

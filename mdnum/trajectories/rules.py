@@ -1,12 +1,13 @@
-"""What makes two atoms neighbors: membership rules, each with a margin.
+"""Membership rules, which define the neighbors of an atom, each with a margin.
 
-A rule is *symmetric* (a pair is inside or not, whoever asks) or *directed* (j is a neighbor of i, and i need
-not be one of j). Distances are compared as float64 squares; a margin is a length, positive inside:
+A rule is *symmetric* (a pair is inside or not, in either order) or *directed* (j is a neighbor of i, and i
+need not be a neighbor of j). Distances are compared as float64 squares; a margin is a length, positive
+inside:
 
     CutoffRule      r_cut - r
     SpeciesCutoffs  r_cut of the two species - r
     Nearest         distance of the first outside - r for a neighbor, distance of the k-th - r for another
-    Capped          the same, and never more than radius - r
+    Capped          as for Nearest, and never more than radius - r
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def _count(value: int, where: str) -> None:
 
 
 class _Membership:
-    """What most rules have in common."""
+    """Properties that most membership rules share."""
 
     directed = False
     needs_species = False
@@ -46,27 +47,27 @@ class _Membership:
 
     @property
     def reach(self) -> float:
-        """Distance beyond which nothing is a neighbor, length."""
+        """Distance beyond which no atom is a neighbor, length."""
         return self.radius
 
     @property
     def shortest(self) -> float:
-        """The shortest length that distances are compared with; infinite where their order decides."""
+        """Shortest length with which distances are compared; infinite if their order decides."""
         return self.reach
 
     def table(
         self, species: Sequence[str] | np.ndarray
     ) -> tuple[Int[np.ndarray, "atoms"], Float[np.ndarray, "species species"]]:
-        """Species of each atom as a number, and the radius of each pair of numbers (`NEVER` without one)."""
+        """Return the species number of each atom, and the radius of each pair of numbers (or `NEVER`)."""
         return np.zeros(len(species), np.int64), np.array([[float(self.reach)]])
 
 
 @dataclass(frozen=True)
 class CutoffRule(_Membership):
-    """Inside where r < radius, a length.
+    """Rule by which a pair is inside if r < radius, a length.
 
-    The decision compares r² with radius² in float64, as most codes do; a pair within rounding of the radius
-    is ambiguous whichever way it fell.
+    The decision compares r² with radius² in float64, as most codes do; a pair within rounding error of the
+    radius is ambiguous, whichever way it is decided.
     """
 
     radius: float
@@ -81,7 +82,7 @@ class CutoffRule(_Membership):
 
 @dataclass(frozen=True)
 class SpeciesCutoffs(_Membership):
-    """A radius, length, for each pair of species, in either order; pairs without one are never inside."""
+    """Rule with a radius, length, for each pair of species, in either order; other pairs are never inside."""
 
     radii: Mapping[tuple[str, str], float]
 
@@ -115,10 +116,10 @@ class SpeciesCutoffs(_Membership):
     def table(
         self, species: Sequence[str] | np.ndarray
     ) -> tuple[Int[np.ndarray, "atoms"], Float[np.ndarray, "species species"]]:
-        """As of every rule.
+        """Return the species numbers and radii, as every rule does.
 
         Raises:
-            InputError: a species of the rule that no atom has.
+            InputError: no atom has a species of the rule.
         """
         names, index = np.unique(np.asarray(species, str), return_inverse=True)
         place = {str(name): k for k, name in enumerate(names)}
@@ -134,7 +135,7 @@ class SpeciesCutoffs(_Membership):
 
 @dataclass(frozen=True)
 class Nearest(_Membership):
-    """The k nearest of each atom within a length, directed from the atom to its neighbors."""
+    """Rule for the k nearest neighbors of each atom within a length, directed from atom to neighbor."""
 
     k: int
     within: float | None = None
@@ -152,7 +153,7 @@ class Nearest(_Membership):
 
     @property
     def most(self) -> int:
-        """Neighbors an atom can have."""
+        """Largest number of neighbors that an atom can have."""
         return self.k
 
     @property
@@ -167,9 +168,9 @@ class Nearest(_Membership):
 
 @dataclass(frozen=True)
 class Capped(_Membership):
-    """A cutoff, length, with a largest number of neighbors: the `most` nearest of those inside, directed.
+    """Cutoff rule, length, that keeps at most the `most` nearest of the atoms inside; the rule is directed.
 
-    What graph builders do that have a maximum number of neighbors and keep the nearest.
+    Graph builders with a maximum number of neighbors that keep the nearest ones follow this rule.
     """
 
     radius: float
@@ -190,5 +191,5 @@ Rule = CutoffRule | SpeciesCutoffs | Nearest | Capped
 
 
 def smallest_radius(rules: Sequence[Rule]) -> float:
-    """The shortest length that any of the rules compares distances with; infinite where none does."""
+    """Return the shortest length with which any of the rules compares distances; infinite without one."""
     return float(min((one.shortest for one in rules), default=math.inf))

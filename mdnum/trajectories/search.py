@@ -1,7 +1,7 @@
-"""All pairs of a frame within a distance, images and all; the nearest few; and what two searches differ in.
+"""Search of all pairs of a frame within a distance, with images; nearest neighbors; changes between frames.
 
-Distances in a search carry the rounding of wrapped coordinates. A pair closer to its threshold than a guard
-is decided again from the coordinates as stored (`lattice.square_of`), so every search decides alike.
+Distances in a search carry the rounding error of wrapped coordinates. A pair closer to its threshold than a
+guard band is decided again from the coordinates as stored (`lattice.square_of`), so all searches agree.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _MOST_IMAGES_EACH, _MOST_REPEATED = 100, 2_000_000
 
 
 class Found(NamedTuple):
-    """What a search recorded, a row per pair, in no order; a pair appears once for each of its images."""
+    """Pairs recorded by a search, one row per pair and image, in no particular order."""
 
     kind: int  # `INSIDE` or `DIRECTED`
     i: Int[np.ndarray, "pairs"]  # the center of a directed one, else either
@@ -56,7 +56,7 @@ class Found(NamedTuple):
 
 
 class NeighborRows(NamedTuple):
-    """Neighbors of each atom, one after the other."""
+    """Neighbors of each atom, stored in one row per atom."""
 
     first: Int[np.ndarray, "atoms"]  # where the row of each atom begins in `other`, and its length
     count: Int[np.ndarray, "atoms"]
@@ -64,7 +64,7 @@ class NeighborRows(NamedTuple):
     square: Float[np.ndarray, "stored"]  # squared distances, where the rule is directed; else empty
 
     def pairs(self) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """(i, j) of all rows, one row after the other."""
+        """Return (i, j) of all rows, one row after another."""
         i = np.repeat(np.arange(len(self.first)), self.count)
         inside = np.arange(len(i)) - np.repeat(np.cumsum(self.count) - self.count, self.count)
         return i, self.other[self.first[i] + inside].astype(np.int64)
@@ -80,17 +80,18 @@ def search(
     room: int = 0,
     open_room: int = 0,
 ) -> Found:
-    """Look for pairs; images of an atom itself are left out, they are those of `lattice.own_images`.
+    """Find pairs of atoms; images of an atom itself are not included (see `lattice.own_images`).
 
     Args:
-        kind: what to record. `INSIDE`: pairs inside. `DIRECTED`: for each center everything within radius +
+        kind: what to record. `INSIDE`: pairs inside. `DIRECTED`: for each center, all atoms within radius +
             band.
         band: pairs this close to their radius are decided from the coordinates as stored, length; at least
-            what rounding does to a distance.
-        bound: pairs this close are counted as close, length; at most the band.
-        room, open_room: pairs inside and pairs in the band to make room for, where it is known.
+            the rounding error of a distance.
+        bound: pairs this close to their radius are counted as close, length; at most the band.
+        room, open_room: expected numbers of pairs inside and of pairs in the band, if known.
+
     Raises:
-        InputError: more pairs than fit into memory.
+        InputError: the pairs do not fit into memory.
     """
     radius, radii = who.radius, who.radii
     atoms = binned(placed, who, radius + band)
@@ -116,9 +117,9 @@ def search(
 
 @njit(inline="always")
 def exact_square(x, home, i, j, n0, n1, n2, vectors):
-    """The number that decides on a pair found with n added to the wrapped coordinates of j.
+    """Return the deciding squared distance of a pair, found with shift n of the wrapped coordinates of j.
 
-    The same number whichever of the two comes first: every rounding is that of the opposite number.
+    The result is the same in either order of the two atoms, since all rounded numbers only change sign.
     """
     s0, s1, s2 = n0 + home[i, 0] - home[j, 0], n1 + home[i, 1] - home[j, 1], n2 + home[i, 2] - home[j, 2]
     return square_of(x, i, j, s0, s1, s2, vectors)
@@ -126,9 +127,10 @@ def exact_square(x, home, i, j, n0, n1, n2, vectors):
 
 @njit
 def _settle(x, atoms, kind, square, radius, bound, found):
-    """Decide on the candidates that wrapped coordinates left open; returns the smallest |margin|.
+    """Decide the candidates that wrapped coordinates left open; return the smallest |margin|.
 
-    The values are the squares of wrapped coordinates, and then, of a directed search, those that decide.
+    Values on entry are squared distances of wrapped coordinates; a directed search replaces them by the
+    deciding squares.
     """
     smallest, home, vectors, species = np.inf, atoms.home, atoms.lattice.vectors, atoms.species
     for k in range(found.counts[1]):
@@ -149,7 +151,7 @@ def _settle(x, atoms, kind, square, radius, bound, found):
 
 
 def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float) -> float:
-    """About how many pairs there are, if atoms fill the box evenly; 0 where it has no end."""
+    """Return the expected number of pairs if atoms fill the box evenly; 0 for a box that is not periodic."""
     if not lattice.periodic.all():
         return 0.0
     images = (4.0 / 3.0 * np.pi * radius**3) / lattice.volume
@@ -167,7 +169,7 @@ def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float)
 
 
 def _check_count(pairs: float, radius: float) -> None:
-    """Refuse more pairs than there is memory for."""
+    """Reject more pairs than there is memory for."""
     memory = _memory()
     if pairs > min(MOST_PAIRS, memory / _BYTES):
         raise InputError(
@@ -180,7 +182,7 @@ def _check_count(pairs: float, radius: float) -> None:
 
 
 def _memory() -> float:
-    """Bytes of memory that the machine has; 32 GB where it does not say."""
+    """Return the bytes of memory of the machine; 32 GB if they are unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):
@@ -188,7 +190,7 @@ def _memory() -> float:
 
 
 def rows_of(found: Found, atoms: int) -> NeighborRows:
-    """Pairs by their first atom, the lower one unless they are directed."""
+    """Sort pairs into rows by their first atom, which is the lower one unless pairs are directed."""
     i, j, directed = found.i, found.j, found.kind == DIRECTED
     low, high = (i, j) if directed else (np.minimum(i, j), np.maximum(i, j))
     room = np.empty((4, len(i)), np.int64)
@@ -201,7 +203,7 @@ def rows_of(found: Found, atoms: int) -> NeighborRows:
 
 
 class Chosen(NamedTuple):
-    """The neighbors of each center, nearest first."""
+    """Nearest neighbors of each center, nearest first."""
 
     rows: NeighborRows  # the squares are those of the neighbors
     close: int  # as of `Found`
@@ -213,7 +215,7 @@ class Chosen(NamedTuple):
 def nearest(
     placed: Placed, who: Participants, rule: Nearest | Capped, *, band: float, bound: float
 ) -> Chosen:
-    """The nearest few of each center; arguments as of `search`."""
+    """Find the nearest few neighbors of each center; arguments as in `search`."""
     positions, lattice = placed.positions, placed.lattice
     atoms, reach, centers = len(positions), rule.reach, who.centers
     # a distance that no pair exceeds: a lattice has no end
@@ -253,7 +255,7 @@ def nearest(
 def _choose(
     rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
 ):  # fmt: skip
-    """Sort each row by (square, index) and keep the first; returns (written, close, smallest, lacking)."""
+    """Sort each row by (square, index), keep the nearest; return (written, close, smallest, lacking)."""
     written, close, smallest, short = 0, 0, np.inf, 0
     for i in range(rows.first.shape[0]):
         if not centers[i]:
@@ -309,7 +311,7 @@ def _choose(
 
 
 def _guess(placed: Placed, who: Participants, most: int, everything: float) -> float:
-    """A radius in which most atoms have enough neighbors."""
+    """Estimate a radius within which most atoms have enough neighbors."""
     lattice, candidates = placed.lattice, int(who.others.sum())
     if not candidates:
         return 1.0 if not np.isfinite(everything) else max(everything, 1e-300)
@@ -324,7 +326,7 @@ def _guess(placed: Placed, who: Participants, most: int, everything: float) -> f
 
 
 class Changed(NamedTuple):
-    """Decisions that differ between two frames, in no order, by indices of the atoms that take part."""
+    """Decisions that differ between two frames, unordered, by indices of the participating atoms."""
 
     i: Int[np.ndarray, "flips"]
     j: Int[np.ndarray, "flips"]
@@ -333,12 +335,12 @@ class Changed(NamedTuple):
 
     @classmethod
     def room(cls, pairs: int) -> Changed:
-        """Room for so many."""
+        """Allocate columns for the given number of pairs."""
         return cls._make(np.empty(pairs, kind) for kind in (np.int64, np.int64, np.int64, np.bool_))
 
 
 def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
-    """Every decision that differs, pair by pair and image by image; room is made for so many at first."""
+    """Return all decisions that differ, by pair and image; `room` is the initial size of the buffers."""
     while True:
         made = Changed.room(room)
         total = _compared(before, now, made)
@@ -349,7 +351,7 @@ def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
 
 @njit
 def _compared(old, new, made):
-    """Write what differs; rows that do not fit are counted only. seen[j] = (images before, images now)."""
+    """Write decisions that differ; rows that do not fit are only counted. seen[j] = (images before, now)."""
     atoms = old.first.shape[0]
     seen = np.zeros((atoms, 2), np.int32)
     total, room = 0, made.i.shape[0]
@@ -379,9 +381,9 @@ def image_distances(
     rank: Int[np.ndarray, "pairs"],
     directed: bool = False,
 ) -> Float[np.ndarray, "pairs"]:
-    """Distances to the images that have `rank` nearer ones, length; inf where there are not so many.
+    """Return distances to the images that have `rank` nearer images, length; inf without such an image.
 
-    Of a directed rule both of a ± pair of images of an atom itself are neighbors.
+    With a directed rule, both images of a ± pair of an atom itself are neighbors.
     """
     out = np.empty(len(i))
     rank = np.where(i == j, rank // 2, rank) if directed else rank
@@ -405,7 +407,7 @@ def _image_distances(x, lattice, i, j, rank, out):
 
 
 def ranks(i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-    """0, 1, 2, ... within each run of equal (i, j)."""
+    """Return the numbers 0, 1, 2, ... within each run of equal (i, j)."""
     new = np.ones(len(i), bool)
     new[1:] = (i[1:] != i[:-1]) | (j[1:] != j[:-1])
     at = np.flatnonzero(new)

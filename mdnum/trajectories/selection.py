@@ -1,4 +1,4 @@
-"""Atoms by words, in MDAnalysis's selection language, whoever reads the file."""
+"""Selection of atoms by text in MDAnalysis's selection language, for files of any reader."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _SHOWN = 8
 
 
 def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
-    """Indices of the atoms that words name at the first frame asked for, ascending.
+    """Return the indices of the atoms that a selection matches at the first requested frame, ascending.
 
-    A selection that depends on where atoms are ("around 5 protein") is made once, there.
+    A selection that depends on positions ("around 5 protein") is evaluated once, at that frame.
 
     Raises:
-        InputError: the words are no selection, name no atom, or need what the file does not tell.
+        InputError: the text is not a selection, matches no atom, or needs information that the file lacks.
     """
     from MDAnalysis.exceptions import NoDataError, SelectionError
 
@@ -52,7 +52,7 @@ def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
 
 
 def _universe(trajectory: Trajectory) -> Any:
-    """A Universe that stands at the first frame asked for. Distances in a selection are float32."""
+    """Return a Universe at the first requested frame; distances in a selection are float32."""
     from MDAnalysis.lib.mdamath import triclinic_box
 
     first = next(iter(trajectory.frames()), None)
@@ -74,7 +74,7 @@ def _universe(trajectory: Trajectory) -> Any:
 
 
 def _there_are(table: AtomTable) -> str:
-    """What could have been named."""
+    """Describe the names that a selection can use."""
     if not table.named:
         return "the file has no names of atoms"
     words = []

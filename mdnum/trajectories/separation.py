@@ -1,4 +1,4 @@
-"""Two frames of the same atoms: how far apart, by which shift, with which velocities, and how that grows."""
+"""Comparison of two frames of the same atoms: separation, common shift, velocities, and growth over time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _STEEPEST, _BETTER = 4.0, 2.0
 
 @dataclass(frozen=True)
 class Separation:
-    """How far atoms are from where they are in another frame."""
+    """Displacements of atoms between two frames, summarized."""
 
     furthest: float  # largest displacement, length
     typical: float  # root mean square displacement, length
@@ -43,16 +43,16 @@ class Separation:
 def displacements(
     start: Frame, end: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | float = 0.0
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """(from one frame to another less a shift, whole lattice vectors of the second's box taken off)."""
+    """Return (displacements to another frame less a shift, numbers of its lattice vectors removed)."""
     x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
     shared = np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool)
     return shortest(y - x - shift, Box(end.box.matrix, shared))
 
 
 def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
-    """Whether two boxes tile space in the same way, whichever lattice vectors they name.
+    """Return True if two boxes generate the same lattice, whichever lattice vectors they list.
 
-    A component of a lattice vector may be off by the tolerance, length.
+    A component of a lattice vector may differ by the tolerance, length.
     """
     if (np.asarray(one.pbc, bool) != np.asarray(other.pbc, bool)).any():
         return False
@@ -68,7 +68,7 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
 def separation(
     one: Frame, other: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | None = None
 ) -> Separation:
-    """The separation of two frames, less a shift; only of these atoms, where they are given."""
+    """Return the separation of two frames less a shift, for the given atoms or all."""
     moved, whole = displacements(one, other, atoms, 0.0 if shift is None else shift)
     square = np.sum(moved**2, axis=1)
     at = int(np.argmax(square))
@@ -82,7 +82,7 @@ def separation(
 
 
 def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[np.ndarray, "3"]:
-    """The displacement that most atoms have in common, up to lattice vectors, length."""
+    """Return the displacement that most atoms have in common, up to lattice vectors, length."""
     shift = displacements(one, other, atoms)[0][0]
     for _ in range(2):
         # nearest images about one atom lie on both sides of the box if that atom is on the other; about the
@@ -95,20 +95,20 @@ def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[n
 
 
 def velocities_of(frame: Frame) -> Frame:
-    """A frame whose positions are the velocities of another, which has them."""
+    """Return a frame whose positions are the velocities of the given frame."""
     assert frame.velocities is not None
     return Frame(frame.index, frame.time, frame.velocities, Box())
 
 
 def velocities_differ(a: Frame, b: Frame, atoms: AtomIndices, bound: float) -> dict[str, Any] | None:
-    """How velocities of two frames differ by more than a vector that all atoms have in common.
+    """Describe a difference between the velocities of two frames, beyond a vector common to all atoms.
 
     Args:
-        bound: how far the difference of two velocities can be off, length per time.
+        bound: error bound of the difference of two velocities, length per time.
 
     Returns:
-        None where neither has any, or they agree; kind "zero" and the side that has none, or kind "other" and
-        the factor from A to B, by least squares, and the correlation.
+        None if neither frame has velocities, or they agree; kind "zero" and the side without velocities; or
+            kind "other", the factor from A to B by least squares, and the correlation.
     """
     rows = slice(None) if atoms is None else atoms
     u, v = (np.zeros((1, 3)) if one.velocities is None else one.velocities[rows] for one in (a, b))
@@ -123,7 +123,7 @@ def velocities_differ(a: Frame, b: Frame, atoms: AtomIndices, bound: float) -> d
 
 
 class FreeFlight(NamedTuple):
-    """Displacements between two frames next to what velocities say."""
+    """Displacements between two frames compared with those that velocities predict."""
 
     moved: float  # root mean square displacement over that of velocities times time
     factor: float  # displacements over the mean of both velocities times time, by least squares
@@ -132,10 +132,10 @@ class FreeFlight(NamedTuple):
 
 
 def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
-    """How displacements between two frames compare with velocities; None without either, or without motion.
+    """Compare displacements between two frames with velocities; return None without velocities or motion.
 
-    `moved` is near 1 where atoms fly straight and below it where they turn around in between: never far
-    above. `factor` is near 1 as long as velocities keep their direction, whichever units they have.
+    `moved` is near 1 if atoms fly straight, below 1 if they turn around in between, and never far above 1.
+    `factor` is near 1 if velocities keep their direction and have the unit of positions over times.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None
@@ -157,14 +157,15 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
 
 
 def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
-    """Whether displacements contradict velocities and times, from their medians over some frames.
+    """Return the contradiction of displacements with velocities and times, from medians over some frames.
 
-    That atoms move less than their velocities say is no contradiction where they turn around between two
-    frames: it is one only where velocities have kept their directions, and displacements lie along them.
+    If atoms turn around between two frames, they move less than velocities predict, without contradiction.
+    Too small a displacement counts only if velocities kept their directions and displacements are parallel to
+    them.
 
     Returns:
-        the factor by which they are too large (or small, below 1), and whether it is a lower bound of it;
-        None where there is no contradiction.
+        the factor by which displacements are too large (or too small, below 1), and whether it is a lower
+            bound; None if there is no contradiction.
     """
     if not flights:
         return None
@@ -179,7 +180,7 @@ def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class GrowthLaw:
-    """How a separation grows: lines through its logarithm over time, and over the logarithm of time."""
+    """Fits of a growing separation: its logarithm against time, and against the logarithm of time."""
 
     frames: int  # used
     rate: float  # of an exponential, per time
@@ -195,17 +196,16 @@ def growth(
     limit: float,
     began: tuple[float, float],
 ) -> GrowthLaw | None:
-    """The law by which a separation grows.
+    """Fit the law by which a separation grows.
 
-    A force or a velocity that is wrong by a constant separates two runs as a low power of the time since
-    then; chaos does exponentially. Lengths of 0, and those above the limit, which are no small differences
-    any more, are left out.
+    A constant error of a force or a velocity separates two runs as a low power of time; chaos separates them
+    exponentially. Lengths of 0, and lengths above the limit, which are no longer small, are left out.
 
     Args:
-        began: times between which the two began to separate, where a power law begins.
+        began: times between which the separation began, as the origin of a power law.
 
     Returns:
-        None with fewer than five frames.
+        the law; None with fewer than five frames.
     """
     use = (length > 0) & (length < limit) & np.isfinite(length)
     if np.count_nonzero(use) < 5 or np.ptp(time[use]) == 0:

@@ -1,16 +1,16 @@
-"""How long contacts last, where the beginning or the end of many was not seen, and who flips.
+"""Statistics of contact durations, whose beginning or end may not have been observed, and of pairs that flip.
 
-Three different answers to the first, each honest about what it is:
+Three quantities describe how long contacts last:
 
-- the **lifetime** of a contact that was seen to begin: the product-limit estimate (Kaplan and Meier, J. Am.
-  Stat. Assoc. 53, 457, 1958), which uses stays that go on after the last frame for as long as they were seen;
-- the **mean by rate**: time spent inside over the number of leaves, which uses every frame of every stay,
-  whether its ends were seen or not, and is the mean lifetime where pairs leave at a constant rate;
-- the **residence**: of pairs found inside at some frame, the share still inside (without a break) so much
-  later (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long stays are met more often: it is not
-  the lifetime.
+- the **lifetime** of a contact whose beginning was observed: the product-limit estimate (Kaplan and Meier, J.
+  Am. Stat. Assoc. 53, 457, 1958), which uses contacts that outlast the last frame for the time observed;
+- the **mean by rate**: time inside divided by the number of leaves, which uses every frame of every contact,
+  whether its ends were observed or not, and is the mean lifetime if pairs leave at a constant rate;
+- the **residence**: of the pairs inside at some frame, the share still inside, without a break, after a given
+  lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more often, so
+  residence differs from lifetime.
 
-All in frames; times come from the frames' own. Counts of parts of the pairs add up to those of all.
+Durations are in frames; times come from the frames' own. Counts for subsets of the pairs are additive.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _CLASSES = 60
 
 @dataclass(frozen=True)
 class Durations(Sums):
-    """Stays counted by the number of frames they were inside for: entry n is for n frames."""
+    """Contacts counted by duration: entry n is the number of contacts that lasted n frames."""
 
     seen: Int[np.ndarray, "lengths"]  # seen to begin and to end
     goes_on: Int[np.ndarray, "lengths"]  # seen to begin, but not to end (censored on the right)
@@ -45,24 +45,24 @@ class Durations(Sums):
 
     @classmethod
     def of(cls, stays: Contacts, frames: int) -> Durations:
-        """Those of contacts over so many frames."""
+        """Count contacts by duration, in the given number of frames."""
         kinds = [(b, e) for b in (stays.began, ~stays.began) for e in (stays.ended, ~stays.ended)]
         return cls(*(np.bincount(stays.length[b & e], minlength=frames + 1) for b, e in kinds))
 
     @property
     def all(self) -> Int[np.ndarray, "lengths"]:
-        """Stays of any kind by length."""
+        """Number of contacts of any kind, by duration."""
         return self.seen + self.goes_on + self.older + self.throughout
 
     @property
     def followed(self) -> Int[np.ndarray, "lengths"]:
-        """Stays seen to begin, by the frames after which they were seen to end, or last seen to survive."""
+        """Contacts with observed beginning, by frames until their observed end or last observed survival."""
         # one that goes on after n frames was seen to survive n - 1 times
         return self.seen + np.append(self.goes_on[1:], 0)
 
     @property
     def exposure(self) -> int:
-        """Times that a pair inside at one frame was examined again at the next one."""
+        """Number of times that a pair inside at one frame was examined again at the next frame."""
         length = np.arange(len(self.seen))
         # a stay of n frames that goes on after the last one has been examined again n - 1 times
         whole, cut = self.seen + self.older, self.goes_on + self.throughout
@@ -70,13 +70,13 @@ class Durations(Sums):
 
     @property
     def leaves(self) -> int:
-        """Stays seen to end."""
+        """Number of contacts whose end was observed."""
         return int(self.seen.sum() + self.older.sum())
 
 
 @dataclass(frozen=True)
 class Survival:
-    """Share of contacts that last longer than so many frames, from those seen to begin."""
+    """Share of contacts that last longer than n frames, from contacts whose beginning was observed."""
 
     frames: Int[np.ndarray, "points"]  # lengths at which some ended, from 1, rising
     share: Float[np.ndarray, "points"]  # still inside after that many frames
@@ -85,22 +85,22 @@ class Survival:
     longest: int  # frames for which any was followed: nothing is known beyond
 
     def at(self, share: float) -> int | None:
-        """Frames after which at most this share is left: the median at 0.5; None if it stays above."""
+        """Return the frames after which at most this share is left (0.5: the median), or None if never."""
         below = np.flatnonzero(self.share <= share)
         return int(self.frames[below[0]]) if len(below) else None
 
     @property
     def mean(self) -> float:
-        """Area below the curve up to `longest`, frames: the mean, or less where some outlast that."""
+        """Area below the curve up to `longest`, frames: the mean, or less if some contacts last longer."""
         edges = np.concatenate([[0], self.frames, [self.longest]])
         return float(np.sum(np.diff(edges) * np.concatenate([[1.0], self.share])))
 
 
 def survival(found: Durations) -> Survival:
-    """The product-limit estimate from the stays that were seen to begin.
+    """Compute the product-limit estimate from the contacts whose beginning was observed.
 
-    Stays that were there at the first frame are left out: how old they were then is not known, and long ones
-    are met more often.
+    Contacts present at the first frame are left out: their age is unknown, and long ones are sampled more
+    often.
     """
     followed, points = found.followed, np.flatnonzero(found.seen)
     at_risk = np.cumsum(followed[::-1])[::-1][points]
@@ -114,9 +114,9 @@ def survival(found: Durations) -> Survival:
 
 
 def mean_by_rate(found: Durations) -> tuple[float, float]:
-    """(frames inside per leave, standard error), every stay counted; inf where none was seen to leave.
+    """Return (frames inside per leave, standard error) over all contacts; inf if no pair was seen to leave.
 
-    The error is that of independent leaves (Poisson): chatter makes it larger.
+    The error assumes independent leaves (Poisson); chatter makes the true error larger.
     """
     if not found.leaves:
         return float("inf"), float("nan")
@@ -125,10 +125,10 @@ def mean_by_rate(found: Durations) -> tuple[float, float]:
 
 
 def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
-    """Of the pairs inside at a frame, the share inside without a break until so many frames later.
+    """Return the share of pairs inside at a frame that stay inside without a break, for each lag.
 
-    By lag from 0, averaged over all frames that leave room for it; nan where no pair was inside. `pairs` are
-    the numbers inside at each frame.
+    Lags begin at 0; shares are averaged over all frames that leave room for the lag, and nan if no pair was
+    inside. `pairs` are the numbers of pairs inside at each frame.
     """
     count, lags = found.all, np.arange(len(pairs))
     stays = np.cumsum(count[::-1])[::-1]
@@ -140,13 +140,13 @@ def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.nd
 
 
 def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of the pairs inside at a frame, those inside so many frames later, whatever happened between.
+    """Count pairs inside at a frame that are inside after a lag too, whatever happened in between.
 
-    The intermittent counterpart of `residence`; divide the first by the second (sums over parts of the pairs
-    add up). Each lag is from 0 to frames - 1.
+    The ratio of the two results is the intermittent counterpart of `residence` (counts for subsets of the
+    pairs are additive). Each lag is from 0 to frames - 1.
 
     Returns:
-        by lag, pairs of frames at which a pair was inside both times, and at which it was the first time.
+        by lag, the number of times that a pair was inside both times, and that it was inside the first time.
     """
     both, once = np.zeros(len(lags), np.int64), np.zeros(len(lags), np.int64)
     pairs = np.append(np.flatnonzero(_new_pairs(stays)), len(stays))
@@ -173,7 +173,7 @@ def _again(pairs, begin, end, lags, frames, both, once):
 
 
 def _new_pairs(stays: Contacts) -> np.ndarray:
-    """Whether each stay is the first of its pair."""
+    """Return True for each contact that is the first of its pair."""
     changed = [np.diff(column) != 0 for column in (stays.i, stays.j, stays.rank)]
     return np.concatenate([[True], np.any(changed, axis=0)])[: len(stays)]
 
@@ -183,21 +183,21 @@ def _new_pairs(stays: Contacts) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Classes:
-    """Classes of atoms: an index for each atom, and names."""
+    """Classification of atoms: a class index for each atom, and the names of the classes."""
 
     of: Int[np.ndarray, "atoms"]
     names: Sequence[str]
 
     @classmethod
     def by(cls, words: np.ndarray) -> Classes:
-        """Atoms of one word belong to one class."""
+        """Put atoms with the same word into one class."""
         names, index = np.unique(words.astype(str), return_inverse=True)
         return cls(index.reshape(-1), [str(one) for one in names])
 
 
 @dataclass(frozen=True)
 class Labels:
-    """Species, and residues by name and one by one; None where the file has none."""
+    """Classes of atoms by species, by residue name and by residue; None without residues in the file."""
 
     species: Classes
     residue_names: Classes | None
@@ -205,7 +205,7 @@ class Labels:
 
     @classmethod
     def of(cls, table: AtomTable) -> Labels:
-        """Those of a topology."""
+        """Build the classes from a topology."""
         if not any(table.residue_names):
             return cls(Classes.by(table.species), None, None)
         first = np.unique(table.residues, return_index=True)[1]
@@ -216,7 +216,7 @@ class Labels:
 
 @dataclass(frozen=True)
 class ClassTally(Sums):
-    """Flips and time inside by pair of classes."""
+    """Numbers of flips and frames inside by pair of classes."""
 
     _common = ("names",)
 
@@ -228,9 +228,9 @@ class ClassTally(Sums):
 
     @classmethod
     def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> ClassTally:
-        """Counts by the classes of the two atoms over so many frames.
+        """Count flips and frames inside by the classes of the two atoms, over the given number of frames.
 
-        Where directed, i -> j and j -> i are two things; else both count as one, under the class that comes
+        If directed, i -> j and j -> i count separately; otherwise they count as one, under the lower class
         first.
         """
         first, second = classes.of[stays.i], classes.of[stays.j]
@@ -248,12 +248,12 @@ class ClassTally(Sums):
 
     @property
     def mean_stay(self) -> Float[np.ndarray, "classes classes"]:
-        """Frames inside per leave; nan where none left."""
+        """Mean number of frames inside per leave; nan if no pair left."""
         none = np.full(self.left.shape, np.nan)
         return np.divide(self.exposure, self.left, out=none, where=self.left > 0)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Rows by pair of classes that were ever inside, those with most flips first."""
+        """Return table rows for pairs of classes that were ever inside, those with most flips first."""
         stay = self.mean_stay
         rows = [
             {
@@ -267,7 +267,7 @@ class ClassTally(Sums):
 
 @dataclass(frozen=True)
 class Chatter(Sums):
-    """Flips by how soon the same pair flips back."""
+    """Flips counted by the time until the same pair flips back."""
 
     inside: Int[np.ndarray, "lengths"]  # visits inside by their length in frames, 0 to the window
     outside: Int[np.ndarray, "lengths"]  # excursions outside by their length
@@ -275,7 +275,7 @@ class Chatter(Sums):
 
     @classmethod
     def of(cls, history: History, window: int) -> Chatter:
-        """Those that are reversed within a window of frames."""
+        """Count the flips that are reversed within a window of frames."""
         pair = history.pair
         same = pair[1:] == pair[:-1]
         apart, from_inside = np.diff(history.frame)[same], history.entered[:-1][same]
@@ -287,18 +287,18 @@ class Chatter(Sums):
 
     @property
     def window(self) -> int:
-        """Frames within which a flip was looked for that reverses another."""
+        """Number of frames within which the reversal of a flip was searched for."""
         return len(self.inside) - 1
 
     @property
     def undone(self) -> int:
-        """Flips that the same pair reverses within the window."""
+        """Number of flips that the same pair reverses within the window."""
         return int(self.inside.sum() + self.outside.sum())
 
 
 @dataclass(frozen=True)
 class Busiest(Columns):
-    """Pairs by the number of their flips, most first."""
+    """Pairs sorted by the number of their flips, in descending order."""
 
     i: Int[np.ndarray, "pairs"]  # the pairs
     j: Int[np.ndarray, "pairs"]
@@ -308,7 +308,7 @@ class Busiest(Columns):
 
     @classmethod
     def of(cls, history: History, stays: Contacts, most: int = _BUSIEST) -> Busiest:
-        """The pairs of a history that flipped most often."""
+        """Return the pairs of a history that flipped most often."""
         # stays are in the order of the history's pairs, of which some were never inside
         inside = np.zeros(len(history), np.int64)
         ever = history.inside | (history.flips > 0)
@@ -316,26 +316,26 @@ class Busiest(Columns):
         return cls(history.i, history.j, history.rank, history.flips, inside).first(most)
 
     def first(self, most: int = _BUSIEST) -> Busiest:
-        """So many of them, without pairs that never flipped."""
+        """Return the first `most` pairs, without pairs that never flipped."""
         order = np.lexsort((self.rank, self.j, self.i, -self.flips))[:most]
         order = order[self.flips[order] > 0]
         return self[order]
 
     def __add__(self, other: Busiest) -> Busiest:
-        """The busiest of two parts that have no pair in common."""
+        """Return the busiest pairs of two parts that have no pair in common."""
         return Busiest.concatenate([self, other]).first()
 
 
 @dataclass(frozen=True)
 class Residues(Sums):
-    """Flips of each group of atoms (a residue, say): with others, and within itself."""
+    """Flips of each group of atoms (for example a residue), with other groups and within itself."""
 
     between: Int[np.ndarray, "groups"]
     within: Int[np.ndarray, "groups"]
 
     @classmethod
     def of(cls, history: History, classes: Classes) -> Residues:
-        """Flips by the groups of the two atoms."""
+        """Count flips by the groups of the two atoms."""
         first, second, flips = classes.of[history.i], classes.of[history.j], history.flips
         own, count = first == second, len(classes.names)
         between = (np.bincount(one[~own], flips[~own], count) for one in (first, second))
@@ -348,7 +348,7 @@ class Residues(Sums):
 
 @dataclass(frozen=True)
 class AgainSums(Sums):
-    """Sums of `again` over some of the stays."""
+    """Sums of the counts that `again` returns, over some of the contacts."""
 
     both: Int[np.ndarray, "lags"]
     once: Int[np.ndarray, "lags"]
@@ -357,7 +357,7 @@ class AgainSums(Sums):
 
 @dataclass(frozen=True)
 class Statistics(Sums):
-    """Everything that is counted of the pairs of a rule."""
+    """All statistics of the pairs of a rule."""
 
     durations: Durations  # of contacts, and of contacts whose short gaps are overlooked
     intermittent: Durations
@@ -375,9 +375,9 @@ class Statistics(Sums):
     def of(
         cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
     ) -> tuple[Statistics, Contacts]:
-        """Those of some of the pairs, added to those of others before, and their contacts.
+        """Compute statistics of some pairs, added to earlier ones, and the contacts of these pairs.
 
-        Within a window of frames a flip that is reversed is chatter, and a stay outside is overlooked in an
+        Within a window of frames, a flip that is reversed is chatter, and an absence is ignored in an
         intermittent contact.
         """
         frames, stays = history.frames, contacts(history)
@@ -406,9 +406,9 @@ class Statistics(Sums):
         return counted if before is None else before + counted, stays
 
     def curves(self, pairs: Int[np.ndarray, "frames"], interval: float) -> dict[str, np.ndarray]:
-        """Columns of a table of lifetimes by lag, from the numbers of pairs inside at each frame.
+        """Return table columns of lifetimes by lag, from the numbers of pairs inside at each frame.
 
-        The time between frames is nan where it is not known.
+        The time between frames, `interval`, is nan if unknown.
         """
         lags = lags_of(len(pairs))
         left, loose = survival(self.durations), survival(self.intermittent)
@@ -429,7 +429,7 @@ class Statistics(Sums):
 
 @dataclass(frozen=True)
 class Lifetime:
-    """Lifetimes in numbers, frames; None where the file does not tell."""
+    """Contact lifetimes as numbers, in frames; None if the file does not determine a value."""
 
     followed: int  # contacts seen to begin
     median: int | None  # frames after which so many are over
@@ -444,7 +444,7 @@ class Lifetime:
 
     @classmethod
     def of(cls, durations: Durations) -> Lifetime:
-        """Those of stays counted by their length."""
+        """Compute lifetimes from contacts counted by duration."""
         left, any_left = survival(durations), bool(durations.seen.any())
         return cls(
             int(durations.seen.sum() + durations.goes_on.sum()), left.at(0.5), left.at(0.75), left.at(0.25),
@@ -454,7 +454,7 @@ class Lifetime:
 
 
 def lags_of(frames: int) -> Int[np.ndarray, "lags"]:
-    """Lags of curves, in frames: all of them as far as there are few, then further apart."""
+    """Return the lags of curves, in frames: all small lags, then lags with growing spacing."""
     if frames < 2:
         return np.zeros(1, np.int64)
     return np.unique(np.concatenate([[0], np.round(np.geomspace(1, frames - 1, _POINTS))]).astype(np.int64))

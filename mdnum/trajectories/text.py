@@ -1,13 +1,13 @@
-"""Trajectories that ASE reads, and text, one block of lines a frame: read block by block, every digit kept.
+"""Trajectories that ASE reads, and text files that are read frame by frame, with every digit kept.
 
-Text that is read here, and what the libraries lose of it (tests/trajectories/test_source.py measures that
-they still do):
+Text formats read by this module, and what the libraries lose of them (tests/trajectories/test_source.py
+measures that they still do):
 
 - LAMMPS's `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org/dump.html,
-  Howto_triclinic): MDAnalysis narrows them to float32 and takes a tilted box without its tilt;
-- GROMACS's gro files with any number of frames, in columns as wide as the distance of two points
-  (manual.gromacs.org, reference manual, file formats): MDAnalysis and ASE read the first alone;
-- extended XYZ, each block through ASE, which would otherwise look at the whole file before the first frame.
+  Howto_triclinic): MDAnalysis reduces them to float32 and reads a tilted box without its tilt;
+- GROMACS's gro files with any number of frames, in columns as wide as the distance of two decimal points
+  (manual.gromacs.org, reference manual, file formats): MDAnalysis and ASE read the first frame alone;
+- extended XYZ, each block through ASE, which would otherwise scan the whole file before the first frame.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _NUMBER = re.compile(r"[-+]?(\d*)(?:\.(\d*))?(?:[eEdD]([-+]?\d*))?")
 
 
 class AseFrames(Trajectory):
-    """Frames that are ASE's Atoms once they are read."""
+    """Base class of readers that read each frame as an ASE Atoms object."""
 
     reader = "ASE"
     _timed, _per_time = False, 1.0
@@ -54,7 +54,7 @@ class AseFrames(Trajectory):
         return raw
 
     def _of_atoms(self, first: Any) -> AtomTable:
-        """What the first frame says of its atoms, and of the units."""
+        """Return the table of atoms of the first frame, and set the units."""
         self._timed = "time" in first.info
         units = _units(self.path)
         self.length, self.time = units.length, units.time if self._timed else "frame"
@@ -82,13 +82,13 @@ class AseFrames(Trajectory):
 
 
 def _ids(atoms: Any) -> np.ndarray | None:
-    """Ids that say which atom is which; None where there are none, or not one for each."""
+    """Return the ids of the atoms; None if there are none, or not a different one for each atom."""
     ids = atoms.arrays.get("id")
     return ids if ids is not None and ids.ndim == 1 and len(np.unique(ids)) == len(ids) else None
 
 
 class AseTrajectory(AseFrames):
-    """A file that `ase.io` reads, frame by frame where its format allows that."""
+    """Trajectory that `ase.io` reads, frame by frame if its format allows it."""
 
     def __init__(self, path: Path, topology: Topology | None, frames: slice, format: str):
         super().__init__(path, topology, frames)
@@ -117,10 +117,10 @@ class AseTrajectory(AseFrames):
 
 
 def format_of(path: Path) -> str:
-    """The format of a file in ASE's word.
+    """Return ASE's name for the format of a file.
 
     Raises:
-        InputError: it knows none for it, or the file cannot be read.
+        InputError: ASE does not know the format, or the file cannot be read.
     """
     try:
         with reading(path, by="ASE"):
@@ -132,7 +132,7 @@ def format_of(path: Path) -> str:
 
 
 def _units(path: Path) -> Units:
-    """Units of the mdnum run that a file belongs to; else ASE's Å, and ps for times and velocities."""
+    """Return the units of the mdnum run that wrote a file; for other files, ASE's Å, with times in ps."""
     if path.name != "trajectory.traj":
         return METAL
     return units_named(str(RunFolder(path.parent).system.get("units", "metal")))
@@ -142,17 +142,17 @@ def _units(path: Path) -> Units:
 
 
 def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
-    """Refuses a last line that was cut in its last number: what is left of it is another number.
+    """Reject a last line that was cut within its last number, since the remaining digits are another number.
 
-    That the line has no end proves nothing by itself, since some programs leave it out. The number was cut
-    where it has fewer digits than those that stand in its place in the lines before.
+    A missing newline proves nothing by itself, since some programs omit it. The number was cut if it has
+    fewer digits than the numbers at the same place in the lines before.
 
     Args:
-        lines: of a frame, all with one number in the last place.
+        lines: lines of a frame, all with a number in the last place.
         like: words to compare with instead.
 
     Raises:
-        ValueError: it was cut.
+        ValueError: the last number was cut.
     """
     if not lines or lines[-1].endswith(("\n", "\r")):
         return
@@ -190,7 +190,9 @@ def _is_cut(word: str, others: Sequence[str]) -> bool:
 
 
 def _digits(word: str) -> tuple[int, int, int] | None:
-    """(decimals, significant digits, digits of the exponent or -1); None for what is no number."""
+    """Return (decimals, significant digits, digits of the exponent or -1); None if the word is not a
+    number.
+    """
     match = _NUMBER.fullmatch(word)
     if match is None:
         return None
@@ -200,7 +202,7 @@ def _digits(word: str) -> tuple[int, int, int] | None:
 
 
 class TextTrajectory(Trajectory):
-    """A text file of frames. A reader of a format says where a block ends and what is in it."""
+    """A text file of frames. A subclass for a format defines where a block ends and how it is decoded."""
 
     def __init__(self, path: Path, topology: Topology | None, frames: slice):
         super().__init__(path, topology, frames)
@@ -211,15 +213,15 @@ class TextTrajectory(Trajectory):
 
     @abstractmethod
     def _block(self, lines: Any) -> list[str] | None:
-        """The lines of the next frame; None at the end of the file.
+        """Return the lines of the next frame; None at the end of the file.
 
         Raises:
-            ValueError: the lines are not what a frame consists of.
+            ValueError: the lines do not form a frame.
         """
 
     @abstractmethod
     def _described(self, block: list[str]) -> AtomTable:
-        """What the first frame says of its atoms."""
+        """Return the table of atoms that the first frame defines."""
 
     @contextmanager
     def raw_frames(self) -> Iterator[Callable[[int], Any]]:
@@ -237,7 +239,7 @@ def _whole_number(line: str, what: str) -> int:
 
 
 def _rows(lines: Any, head: int, atoms: int, cut: bool = True) -> list[str]:
-    """The lines of so many atoms, behind some others."""
+    """Return `head` lines and the lines of the given number of atoms after them."""
     if atoms < 0:
         raise ValueError(f"expected the number of atoms; found {atoms}")
     rows = list(islice(lines, head + atoms))
@@ -249,7 +251,7 @@ def _rows(lines: Any, head: int, atoms: int, cut: bool = True) -> list[str]:
 
 
 class ExtxyzTrajectory(AseFrames, TextTrajectory):
-    """Extended XYZ."""
+    """Trajectory in extended XYZ format."""
 
     format = "extxyz"
 
@@ -271,7 +273,7 @@ class ExtxyzTrajectory(AseFrames, TextTrajectory):
 
 
 class XdatcarTrajectory(ExtxyzTrajectory):
-    """VASP's XDATCAR; the head is repeated where the cell changes. ASE's reader gives all frames or none."""
+    """VASP's XDATCAR; the header is repeated if the cell changes. ASE's reader returns all frames or none."""
 
     format = "vasp-xdatcar"
     # lines with the cell and the atoms, and how many atoms there are
@@ -305,7 +307,7 @@ _ROUNDED = 1e-4
 
 
 class LammpsDump(TextTrajectory):
-    """A text dump of LAMMPS. Atoms are in the order of their ids."""
+    """Text dump of LAMMPS; atoms are in the order of their ids."""
 
     format = "lammpstrj"
 
@@ -346,7 +348,7 @@ class LammpsDump(TextTrajectory):
         return Frame(number, time, positions, box, velocities, labels, identified=True)
 
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
-        """The rows in the order of their ids, which are those of the first frame."""
+        """Return the order of the rows by id; the ids must be those of the first frame."""
         if "id" not in columns:
             message = "the dump has no ids, and LAMMPS changes the order of atoms as they move"
             raise self._refused(message, "Dump the column id")
@@ -374,13 +376,13 @@ class LammpsDump(TextTrajectory):
 
 
 def _labels(columns: list[str], rows: np.ndarray) -> np.ndarray | None:
-    """Elements of the atoms, else their types; None where the dump has neither."""
+    """Return the elements of the atoms, or their types; None if the dump has neither."""
     name = next((one for one in ("element", "type") if one in columns), None)
     return None if name is None else rows[:, columns.index(name)].astype(str)
 
 
 def _items(block: list[str]) -> dict[str, list[str]]:
-    """Lines by the words of their item; the box and the columns keep their head line as the first."""
+    """Return lines by the name of their item; the box and the atoms keep their header line as the first."""
     items: dict[str, list[str]] = {}
     rows: list[str] = []
     for k, line in enumerate(block):
@@ -397,7 +399,7 @@ def _items(block: list[str]) -> dict[str, list[str]]:
 
 
 def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
-    """Names of the columns, and the words of every atom, shape (atoms, columns)."""
+    """Return (names of the columns, the words of every atom with shape (atoms, columns))."""
     head, *rows = items["ATOMS"]
     columns = head.split()
     words = np.array("".join(rows).split(), dtype=object)
@@ -408,7 +410,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
 
 
 def _bounds(items: dict[str, list[str]]) -> Box:
-    """Lattice vectors, which directions repeat, and the corner, which moves as the box breathes."""
+    """Return the box of a dump frame; its origin, a corner of the box, moves when the volume changes."""
     head, *rows = items["BOX BOUNDS"]
     names, words = head.split(), [row.split() for row in rows[:3]]
     pbc, values = np.array([name == "pp" for name in names[-3:]], bool), np.array(words, np.float64)
@@ -437,7 +439,7 @@ _NANOMETER = 10.0
 
 
 class GroTrajectory(TextTrajectory):
-    """A gro file, in Å and Å/ps as MDAnalysis has it."""
+    """GROMACS gro file, in Å and Å/ps as in MDAnalysis."""
 
     format = "GRO"
     # numbers of the box in the frame before
@@ -487,7 +489,7 @@ class GroTrajectory(TextTrajectory):
 
 
 def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray, "atoms numbers"]:
-    """The numbers in fixed columns, which may touch one another."""
+    """Return the numbers in fixed columns, which may touch one another."""
     size = _HEAD + count * width
     text = np.array([row[:size].ljust(size).encode() for row in rows], dtype=f"S{size}")
     letters = np.frombuffer(text.tobytes(), "S1").reshape(len(rows), size)[:, _HEAD:]
@@ -495,7 +497,7 @@ def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray,
 
 
 def _gro_box(line: str) -> Box:
-    """Three diagonal elements, or nine: v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros for no box."""
+    """Return the box of three diagonal elements, or of v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros: no box."""
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
         raise ValueError(f"the box line has {len(values)} numbers")
@@ -506,5 +508,5 @@ def _gro_box(line: str) -> Box:
 
 
 def _box_words(line: str) -> list[str]:
-    """The numbers of a box; five decimals, between which boxes of 10 µm and more leave no room."""
+    """Split a box line into numbers with five decimals, which touch in boxes of 10 µm and more."""
     return _TOUCHING.findall(line) if max(map(len, line.split())) > _LONG else line.split()

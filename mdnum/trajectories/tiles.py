@@ -1,13 +1,15 @@
-"""Every pair near enough decided anew at each frame, sixteen at once; only what came to differ is looked at.
+"""Decisions on all near pairs at each frame, sixteen at once; only decisions that changed are processed
+further.
 
-Atoms are put into clusters of sixteen by halving space, and two clusters (and the lattice vector between
-them) are a tile: a row of sixteen decisions for each atom of the first, as bits. At a frame the rows that can
-hold a pair near enough are computed in float32 vectors and compared with what they were at the frame before.
-A pair closer to its threshold than float32 can tell is decided by the number that decides in every search
-(`search.exact_square`), and so are those whose margin is asked for.
+Atoms are sorted into clusters of sixteen by halving space. Two clusters and the lattice vector between them
+form a tile: a row of sixteen decisions, as bits, for each atom of the first cluster. At each frame, the rows
+that may hold a near pair are computed in float32 vectors and compared with the frame before. A pair closer to
+its threshold than float32 can resolve is decided by the number that all searches use (`search.exact_square`),
+and so is a pair whose margin is needed.
 
-Tiles serve as long as each cluster stays in the box around it with which they were found. Atoms are followed
-through the lattice, so that those a code wraps back into the box between two frames have not moved far.
+Tiles remain valid as long as each cluster stays in the box around it with which the tiles were found. Atoms
+are followed through the lattice, so an atom that a code wraps into the box between two frames has not moved
+far.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ _UNIT = 2.0**-24
 
 
 class Tiled(NamedTuple):
-    """Tiles of pairs of one radius, and the decisions in them at the last frame."""
+    """Tiles of pairs with the same radius, and their decisions at the last frame."""
 
     first: Int[np.ndarray, "tiles"]  # clusters
     second: Int[np.ndarray, "tiles"]
@@ -47,7 +49,7 @@ class Tiled(NamedTuple):
 
 
 class _Numbers(NamedTuple):
-    """What a frame's exact numbers are computed from."""
+    """Data from which the exact squared distances of a frame are computed."""
 
     positions: Float[np.ndarray, "atoms 3"]
     home: Int[np.ndarray, "atoms 3"]  # lattice vectors that have been taken off each atom
@@ -56,7 +58,7 @@ class _Numbers(NamedTuple):
 
 
 class _Limits(NamedTuple):
-    """What pairs of one radius are compared with."""
+    """Thresholds for the pairs with the same radius."""
 
     radius: float
     square: float  # of the radius
@@ -69,7 +71,7 @@ class _Limits(NamedTuple):
 
 @dataclass
 class Tiles:
-    """Tiles in use."""
+    """Tiles in use, with the followed coordinates of the atoms."""
 
     order: Int[np.ndarray, "slots"]
     kinds: list[tuple[float, Tiled]]  # (radius, tiles) of each two kinds of atoms that can be neighbors
@@ -83,7 +85,9 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Follow the atoms to a frame; whether every pair within clear of its radius is in a tile there."""
+        """Follow the atoms to a frame; return True if all pairs within `clear` of their radius are in
+        tiles.
+        """
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
@@ -97,7 +101,7 @@ class Tiles:
         )
 
     def _follow(self, before: Placed, now: Placed, change: np.ndarray) -> tuple[float, float, float]:
-        """Write the columns and boxes; (largest, second, root mean square) displacement, length."""
+        """Update columns and boxes; return the (largest, second, root mean square) displacement, length."""
         lattice = now.lattice
         most, second, total = _follow(
             before.positions, now.positions, self.order, self.home, lattice.vectors, change, lattice.inverse,
@@ -107,7 +111,7 @@ class Tiles:
         return math.sqrt(most), math.sqrt(second), math.sqrt(total / max(len(now.positions), 1))
 
     def doubt(self, now: Placed, radius: float) -> float:
-        """How far a distance near the radius can be off through float32, length."""
+        """Return the float32 error bound of a distance near the radius, length."""
         largest = float(np.abs(self.boxes).max(initial=0.0))
         vectors = float(np.abs(now.lattice.vectors).sum())
         # rounding of two coordinates and a shift, of a difference with each, and of the square
@@ -116,15 +120,16 @@ class Tiles:
     def examine(
         self, now: Placed, *, bound: float, horizon: float, pairs: int, record: bool = True
     ) -> tuple[Changed, int, float]:
-        """Decide on all pairs at the frame that was followed to last.
+        """Decide all pairs at the frame to which the atoms were followed last.
 
         Args:
             bound: pairs this close to their radius are counted, length.
-            horizon: the smallest |margin| is known up to here, length.
-            pairs: about so many are inside.
-            record: whether to tell which flipped.
+            horizon: the smallest |margin| is determined up to this length.
+            pairs: approximate number of pairs inside.
+            record: True to return the pairs that flipped.
+
         Returns:
-            (pairs that flipped, how many are within the bound, the smallest |margin|).
+            (pairs that flipped, number of pairs within the bound, smallest |margin|).
         """
         numbers = _Numbers(now.positions, self.home, now.lattice.vectors, self.order)
         shifts = (_VECTORS @ now.lattice.vectors).astype(np.float32)
@@ -162,7 +167,9 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Whether a pair that came by so much is inside through one image only, and the same at both frames."""
+    """Return True if a pair that approached by `moved` is inside by one image only, the same in both
+    frames.
+    """
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
@@ -171,10 +178,10 @@ def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool
 def tiles_of(
     before: Placed, now: Placed, who: Participants, clear: float, pairs: int, spare: Tiles | None = None
 ) -> Tiles | None:
-    """Tiles that serve from one frame to the next, with the decisions of the first.
+    """Build tiles that serve from one frame to the next, with the decisions of the first frame.
 
-    None where atoms move too far, or the box repeats too soon. About so many pairs are inside; the memory of
-    spare tiles, which are not needed any more, is used again.
+    The result is None if atoms move too far, or the box repeats too soon. `pairs` is the approximate number
+    of pairs inside; the memory of `spare`, tiles that are no longer needed, is reused.
     """
     radius, lattice, x = who.radius, before.lattice, before.positions
     if not _one_image(before, now, radius, 0.0):
@@ -235,7 +242,7 @@ def tiles_of(
 
 
 def _aligned(clusters: int) -> Float32[np.ndarray, "clusters 3 16"]:
-    """Room for coordinates, where no vector is in two lines of the cache."""
+    """Allocate coordinates so that no vector spans two cache lines."""
     room = np.empty(3 * CLUSTER * clusters + CLUSTER, np.float32)
     first = -room.ctypes.data % 64 // 4
     return room[first : first + 3 * CLUSTER * clusters].reshape(clusters, 3, CLUSTER)
@@ -250,7 +257,7 @@ def _tiled(
     shifts: Float32[np.ndarray, "27 3"],
     reach: np.float32,
 ) -> Tiled:
-    """The tiles of two kinds whose boxes are within reach."""
+    """Return the tiles of two kinds of atoms whose cluster boxes are within reach."""
     room = 32 * int(runs[a + 1] - runs[a]) + 64
     while True:
         made = np.empty((3, room), np.int32)
@@ -265,9 +272,9 @@ def _tiled(
 
 @njit
 def _halved(x, order):
-    """Sort atoms so that each run of sixteen is compact: in halves along the longest edge, and these again.
+    """Sort atoms so that each run of sixteen is compact, by repeated bisection along the longest edge.
 
-    About: a half may hold an atom that belongs in the other, which costs time and nothing else.
+    Bisection is approximate: a half may hold an atom that belongs in the other, which costs nothing but time.
     """
     count, scratch = order.shape[0], np.empty(order.shape[0], np.int32)
     stack, edges = np.empty((64, 2), np.int64), np.empty((64, 6))
@@ -312,10 +319,11 @@ def _halved(x, order):
 
 @njit
 def _nodes(boxes, runs):
-    """Boxes around the clusters of each run, around its halves, and so on: the halves follow their whole.
+    """Return the boxes around the clusters of each run, around its halves, and so on; halves follow their
+    whole.
 
-    Of a node with n clusters the first half begins one node further, the second twice as many nodes as the
-    first half has clusters.
+    The first half of a node begins one node further; the second half begins further by twice the number of
+    clusters in the first half.
     """
     nodes, spans = np.empty((2 * runs[-1], 6), np.float32), np.empty((2 * runs[-1], 2), np.int64)
     stack = [(0, 0, 0)]
@@ -342,7 +350,7 @@ def _nodes(boxes, runs):
 
 @njit
 def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
-    """Write the tiles between two runs of clusters as far as they fit; how many there are."""
+    """Write the tiles between two runs of clusters, as far as they fit; return their number."""
     count, square, same = 0, reach * reach, a == b
     stack = np.empty((256, 6), np.int64)
     for code in codes:
@@ -380,9 +388,9 @@ def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
 
 @njit
 def _follow(before, now, order, home, vectors, change, inverse, periodic, center, columns):
-    """Write followed coordinates; the two largest squared displacements, and their sum over all atoms.
+    """Write followed coordinates; return the two largest squared displacements, and the sum over all atoms.
 
-    Counts in home the lattice vectors that atoms were moved by.
+    The lattice vectors by which atoms were moved are counted in `home`.
     """
     most, second, total = 0.0, 0.0, 0.0
     for at in range(order.shape[0]):
@@ -423,7 +431,7 @@ def _follow(before, now, order, home, vectors, change, inverse, periodic, center
 
 @njit
 def _stays(boxes, around, drift):
-    """Whether each box is inside the one around it, less the drift."""
+    """Return True if each box is inside its surrounding box, reduced by the drift."""
     out = 0
     for k in range(boxes.shape[0]):
         for c in range(3):
@@ -433,7 +441,7 @@ def _stays(boxes, around, drift):
 
 @njit
 def _box(columns, boxes):
-    """The box around each cluster, leaving out empty slots."""
+    """Compute the box around each cluster, ignoring empty slots."""
     for k in range(columns.shape[0]):
         for c in range(3):
             low, high = np.float32(np.inf), np.float32(-np.inf)
@@ -445,7 +453,7 @@ def _box(columns, boxes):
 
 @njit
 def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count):
-    """Decide on the pairs of tiles from one on; (tile to go on with, flips, close, smallest |margin|)."""
+    """Decide the pairs of tiles from `begin` on; return (next tile, flips, close, smallest |margin|)."""
     close, smallest, room = 0, np.inf, flips.i.shape[0]
     first, second, vector, rows, inside = tiled.first, tiled.second, tiled.vector, tiled.rows, tiled.inside
     order, low, high, scratch = numbers.order, limits.low, limits.high, np.empty(4 * CLUSTER, np.float32)
@@ -498,7 +506,9 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
 
 @njit(inline="never")
 def _settled(inside, doubtful, i, slot, code, numbers, limits):
-    """Decide on the pairs of a row that are in doubt: (bits inside, how many within the bound, smallest)."""
+    """Decide the doubtful pairs of a row; return (bits inside, number within the bound, smallest
+    |margin|).
+    """
     close, smallest, vectors, order = 0, np.inf, numbers.vectors, numbers.order
     n0, n1, n2 = np.intp(code // 9) - 1, np.intp(code // 3 % 3) - 1, np.intp(code % 3) - 1
     while doubtful != np.uintp(0):

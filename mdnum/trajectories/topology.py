@@ -1,17 +1,17 @@
-"""What MDAnalysis and ASE make of atoms and boxes: names, elements, residues; boxes as the files have them.
+"""Atoms and boxes as MDAnalysis and ASE read them: names, elements, residues, and boxes as stored in files.
 
-MDAnalysis keeps three lengths and three angles, from which a box has its first vector along x and its second
-in the xy plane. Most programs turn their boxes like that; where one does not, its coordinates are turned
-otherwise too, and images would be put into wrong places without a word:
+MDAnalysis keeps three lengths and three angles, and builds a box with its first vector along x and its second
+in the xy plane. Most programs orient their boxes in this way; if one does not, its coordinates are oriented
+differently too, and images would silently be put in wrong places:
 
-- CHARMM's are symmetric matrices (since version 22, in dcd files, which do not say so: see dcd_boxes);
-- HOOMD's have tilt factors, which MDAnalysis takes for the cosines of angles (in gsd files);
-- those of H5MD and of DL_POLY's HISTORY are vectors in any direction.
+- CHARMM's boxes are symmetric matrices (since version 22, in dcd files, which do not say so: see dcd_boxes);
+- HOOMD's boxes have tilt factors, which MDAnalysis takes for the cosines of angles (in gsd files);
+- boxes of H5MD and of DL_POLY's HISTORY are vectors in any direction.
 
-Of PDB files with many models it loses boxes unless there are as many as models. Programs write CRYST1 once at
-the head (OpenMM), before each model (GROMACS), or inside of each. MDAnalysis reads a model from its MODEL
-record on: what stands before the first is never read, and what stands behind a model is taken for that
-one's, though it is the next one's.
+MDAnalysis loses the boxes of a PDB file with many models unless each model has one. Programs write CRYST1
+once in the header (OpenMM), before each model (GROMACS), or inside each model. MDAnalysis reads a model from
+its MODEL record on: a box before the first model is never read, and a box after a model is assigned to that
+model, although it belongs to the next one.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ Matrices = Callable[[int, Any], Float[np.ndarray, "3 3"] | None]
 
 @dataclass(frozen=True)
 class AtomTable:
-    """What a topology says of every atom, one entry an atom."""
+    """Properties of every atom according to a topology, one entry per atom."""
 
     names: np.ndarray  # as in the file ("OW"); the species where it has no names
     species: np.ndarray  # chemical element where it is known or can be guessed, else the file's atom type
@@ -71,12 +71,12 @@ class AtomTable:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader of results should know of how the atoms are named."""
+        """Remarks on the naming of atoms for readers of results."""
         return (_UNNAMED,) if not self.named else (_GUESSED,) if self.guessed else ()
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
-        """Names and numbers by the names of columns, an entry an atom; without those that no atom has."""
+        """Names and numbers by column name, one entry per atom; columns without any value are left out."""
         numbered = any(self.residue_names) or self.residues.any()
         every = {
             "atom_name": self.names if self.named else (), "residue_name": self.residue_names,
@@ -88,12 +88,12 @@ class AtomTable:
     def plain(
         cls, species: list[str], named: bool = True, arrays: Mapping[str, np.ndarray] = MappingProxyType({})
     ) -> AtomTable:
-        """Atoms of some species.
+        """Build a table of atoms from their species.
 
         Args:
-            named: whether the file says which.
-            arrays: further columns of a file, by the names that ASE or others give them; of these, names of
-                atoms, residues and segments and numbers of residues are kept.
+            named: True if the file gives the species.
+            arrays: further columns of a file, by their names in ASE or other programs; names of atoms,
+                residues and segments and numbers of residues are kept.
         """
         words, none = np.array(species, dtype=object), np.zeros(len(species), np.int64)
 
@@ -112,7 +112,7 @@ class AtomTable:
 
     @classmethod
     def of(cls, atoms: Any) -> AtomTable:
-        """What a topology says of its atoms, an MDAnalysis AtomGroup."""
+        """Build a table from an MDAnalysis AtomGroup."""
 
         def column(name: str, otherwise: Any) -> np.ndarray:
             values = getattr(atoms, name, None)
@@ -143,7 +143,7 @@ class AtomTable:
         )  # fmt: skip
 
     def universe(self) -> Any:
-        """A Universe of these atoms, without coordinates."""
+        """Return a Universe of these atoms, without coordinates."""
         from MDAnalysis import Universe
 
         at = np.unique(self.residues, return_index=True)[1]
@@ -160,23 +160,23 @@ class AtomTable:
         return universe
 
     def give_elements(self, universe: Any) -> None:
-        """Adds the elements that were guessed, for selections by element."""
+        """Add guessed elements to a Universe, for selections by element."""
         if self.guessed and not hasattr(universe.atoms, "elements"):
             universe.add_TopologyAttr("elements", self.species)
 
 
 @dataclass(frozen=True)
 class Topology:
-    """A file that says what atoms are: one that MDAnalysis takes for a topology, or any structure."""
+    """A file that identifies the atoms: a topology that MDAnalysis accepts, or any structure."""
 
     path: Path
     otherwise: Callable[[Path], AtomTable]  # the atoms of a file that MDAnalysis does not read
 
     def read(self) -> tuple[AtomTable, Any]:
-        """The atoms of the file, and a Universe of them without coordinates.
+        """Return the atoms of the file, and a Universe of them without coordinates.
 
         Raises:
-            InputError: nobody reads it.
+            InputError: no reader supports the file.
         """
         try:
             universe = topology_universe(self.path)
@@ -191,10 +191,11 @@ class Topology:
 
 
 def topology_universe(topology: str | Path) -> Any:
-    """A Universe of a topology, without coordinates: its readers of these may write files beside it.
+    """Return a Universe of a topology, without coordinates, whose readers may write files next to the
+    topology.
 
     Raises:
-        InputError: MDAnalysis does not read it.
+        InputError: MDAnalysis cannot read the file.
     """
     from MDAnalysis import Universe
     from MDAnalysis.core._get_readers import get_parser_for
@@ -205,7 +206,7 @@ def topology_universe(topology: str | Path) -> Any:
 
 
 def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
-    """Atoms in a trajectory; None where its format does not tell. Some readers want those of its topology."""
+    """Return the number of atoms in a trajectory; None if unknown. Some readers need that of the topology."""
     from MDAnalysis.core._get_readers import get_reader_for
 
     for known in ({}, {"n_atoms": topology}):
@@ -222,22 +223,22 @@ def atoms_in(path: str | Path, topology: int | None = None, format: str | None =
 
 
 def formats_of(trajectory: Any) -> list[str]:
-    """MDAnalysis's words for the format of one of its readers."""
+    """Return MDAnalysis's names for the format of one of its readers."""
     return [trajectory.format] if isinstance(trajectory.format, str) else list(trajectory.format)
 
 
 def file_of(trajectory: Any) -> Path | None:
-    """The one file behind one of MDAnalysis's readers; None where there is none."""
+    """Return the file that an MDAnalysis reader reads; None if there is no single file."""
     path = getattr(trajectory, "filename", None)
     return Path(path) if isinstance(path, str | Path) else None
 
 
 class Boxes:
-    """The boxes of an MDAnalysis trajectory (its reader), turned as its coordinates are.
+    """Boxes of an MDAnalysis trajectory (its reader), oriented as its coordinates are.
 
     Attributes:
-        notes: what somebody who relies on the boxes should know, in sentences.
-        own: whether boxes are read from the file itself, and may be others than MDAnalysis's.
+        notes: remarks for a user who relies on the boxes, in sentences.
+        own: True if boxes are read from the file itself, and may differ from MDAnalysis's.
     """
 
     def __init__(self, trajectory: Any):
@@ -257,7 +258,7 @@ class Boxes:
         self.own = self._matrix is not None or bool(self._models)
 
     def other(self, ts: Any, number: int) -> tuple[str, Box] | None:
-        """As `Trajectory.other_box`, for a timestep that is this frame of the file."""
+        """Return another possible box, as `Trajectory.other_box` does, for the timestep of this frame."""
         instead = getattr(self._matrix, "instead", None)
         if instead is not None and (matrix := instead(number)) is not None:
             return "BOX_UNDECIDED", Box(matrix, np.ones(3, bool))
@@ -268,7 +269,7 @@ class Boxes:
         return ("BOX_NOT_MDANALYSIS", theirs) if differs else None
 
     def box(self, ts: Any, number: int) -> Box:
-        """The box of a timestep that is this frame of the file."""
+        """Return the box of a timestep that is this frame of the file."""
         dimensions = ts.dimensions
         # transformations may have set another
         if self._models and (dimensions is None or not self._changed):
@@ -280,11 +281,12 @@ class Boxes:
 
 
 def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
-    """The box with these lengths, Å, and angles, degrees: a along x, b in the xy plane, as MDAnalysis has it.
+    """Return the box with these lengths, Å, and angles, degrees: a along x, b in the xy plane, as in
+    MDAnalysis.
 
-    None is for no box; an axis of length 0 with right angles does not repeat.
+    None stands for no box; an axis of length 0 with right angles does not repeat.
 
-    Error: MDAnalysis keeps lengths and angles in float32: lattice vectors are off by 1e-7 of themselves.
+    Error: MDAnalysis keeps lengths and angles in float32: lattice vectors have a relative error of 1e-7.
     """
     from MDAnalysis.lib.mdamath import triclinic_vectors
 
@@ -359,7 +361,7 @@ _MATRICES = {"DCD": _dcd, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
 
 @lru_cache(maxsize=4)
 def _models(path: str, size: int, changed: int) -> tuple[tuple[Dimensions, ...], int]:
-    """(lengths and angles of each model's box, records); read again if the file has changed."""
+    """Return (lengths and angles of each model's box, number of records), cached until the file changes."""
     from MDAnalysis.lib.util import anyopen
 
     found: list[Dimensions] = []

@@ -1,4 +1,4 @@
-"""Which neighbors an atom gained and lost, frame after frame."""
+"""Tracking of the neighbors that each atom gains and loses from frame to frame."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ HORIZON = 0.02
 
 
 def atoms_of(groups: Groups) -> AtomIndices:
-    """The atoms that are on any side; None for all."""
+    """Return the atoms on either side of a pair; None for all."""
     some = [one for one in groups if one is not None]
     return np.unique(np.concatenate(some)) if some else None
 
 
 @dataclass(frozen=True)
 class Moment(Placed):
-    """One frame as it was decided."""
+    """One frame with the neighbors that were decided."""
 
     own: Int[np.ndarray, "species"]  # images of an atom itself that are inside, by species
     last_in: Float[np.ndarray, "limits"]  # thresholds of each atom, where the rule is directed
@@ -61,24 +61,24 @@ class Moment(Placed):
 class Tracker:
     """Flips of a membership rule between consecutive frames.
 
-    Remembers one frame, so memory does not grow with the number of frames; can be pickled.
+    A tracker remembers one frame, so its memory does not grow with the number of frames; it can be pickled.
 
     Args:
-        rule: who is a neighbor.
-        first: atoms of the file on one side; None for all. A directed rule looks for neighbors of these.
-        second: atoms on the other side; None for the same atoms as first. An atom may be on both.
-        species: of each atom of the file; needed by rules that ask for it.
-        bound: how far a margin can be off through the resolution of the file, length. What float64 rounds
-            is added to it.
+        rule: the membership rule that defines neighbors.
+        first: atoms of the file on one side; None for all. A directed rule searches for neighbors of these.
+        second: atoms on the other side; None for the same atoms as first. An atom may be on both sides.
+        species: species of each atom of the file; required by some rules.
+        bound: error bound of a margin due to the resolution of the file, length. The rounding error of
+            float64 is added to it.
 
     Attributes:
-        pairs: inside at the last frame.
-        near: pairs at the last frame with a |margin| of at most the bound, inside or not.
-        min_margin: smallest |margin| at the last frame, length; inf where no pair is within `HORIZON` of its
-            radius. The nearest few of an atom without a radius have no such limit.
+        pairs: number of pairs inside at the last frame.
+        near: number of pairs at the last frame with a |margin| of at most the bound, inside or not.
+        min_margin: smallest |margin| at the last frame, length; inf if no pair is within `HORIZON` of its
+            radius. For nearest neighbors without a radius, there is no such limit.
 
     Raises:
-        InputError: indices that are not integers from 0; no species where they are needed.
+        InputError: indices are not integers from 0, or required species are missing.
     """
 
     def __init__(
@@ -112,14 +112,15 @@ class Tracker:
         self.min_margin = np.inf
 
     def step(self, frame: Frame, bound: float | None = None) -> FlipTable:
-        """What changed since the frame before; nothing at the first.
+        """Return the flips since the previous frame; none at the first frame.
 
         Args:
-            frame: the next one; its own index does not matter.
-            bound: of this frame and from here on, length; None for the one before.
+            frame: the next frame; its own index does not matter.
+            bound: error bound of margins from this frame on, length; None to keep the previous one.
+
         Raises:
-            FrameError: a position that is not finite; a direction that repeats without a vector; another
-                number of atoms than before; more pairs than fit into memory.
+            FrameError: a position is not finite, a periodic direction has no vector, the number of atoms
+                differs from earlier frames, or the pairs do not fit into memory.
         """
         if bound is not None:
             self.bound = float(bound)
@@ -141,7 +142,7 @@ class Tracker:
         return flips
 
     def members(self) -> Members:
-        """The pairs inside at the last frame."""
+        """Return the pairs inside at the last frame."""
         now = self._last
         if now is None:
             return Members.none()
@@ -163,10 +164,11 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Of a directed rule, by atom of the file at the last frame, length; nan for atoms that do not look.
+        """Return thresholds of a directed rule at the last frame, by atom, length; nan for atoms other than
+        centers.
 
         Returns:
-            (distance under which a neighbor stays one, distance under which another would become one).
+            (distance below which a neighbor stays one, distance below which another atom would become one).
         """
         found = np.full((2, max(self._atoms, 0)), np.nan)
         if self._last is not None and self.rule.directed:
@@ -176,7 +178,7 @@ class Tracker:
     # ---- one frame
 
     def _moment(self, frame: Frame) -> Moment:
-        """A frame that can be decided on."""
+        """Check a frame, and prepare it for decisions."""
         atoms = len(frame.positions)
         if self._atoms < 0:
             self._atoms = atoms
@@ -204,7 +206,7 @@ class Tracker:
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
     def _decided(self, now: Moment) -> Moment:
-        """The same with its neighbors searched for, and their numbers noted."""
+        """Search for the neighbors at a frame; return it with them, and store their numbers."""
         rule, bound, who = self.rule, self.bound + now.rounding, self._who
         if isinstance(rule, Nearest | Capped):
             reach = rule.reach if np.isfinite(rule.reach) else 0.0
@@ -227,11 +229,11 @@ class Tracker:
         return replace(now, found=found, own=own)
 
     def _rows(self, moment: Moment) -> NeighborRows:
-        """The neighbors at a moment; searched for where they are not known."""
+        """Return the neighbors at a frame; search for them if they are unknown."""
         return moment.rows or rows_of(moment.found or self._searched(moment), len(moment.positions))
 
     def _searched(self, moment: Moment) -> Found:
-        """The pairs inside at a moment, searched for again."""
+        """Search for the pairs inside at a frame."""
         bound = self.bound + moment.rounding
         found = search(
             moment, self._who, INSIDE,
@@ -244,7 +246,7 @@ class Tracker:
     # ---- two frames
 
     def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
-        """The flips that tiles give; None where they cannot serve."""
+        """Return the flips that tiles give; None if the tiles cannot serve."""
         who, bound, horizon = self._who, self.bound + now.rounding, HORIZON * self._who.radius
         clear = max(bound, horizon)
         if self._list is not None and not self._list.serve(before, now, who.radius, clear):
@@ -259,7 +261,7 @@ class Tracker:
         return self._table(before, now, changed)
 
     def _flips(self, before: Moment, now: Moment) -> FlipTable:
-        """The flips between two moments that were searched for, or can be."""
+        """Return the flips between two frames by comparing their neighbors."""
         who = self._who
         parts = [compared(self._rows(before), self._rows(now), self.pairs // 2 + 4096)]
         for kind in np.flatnonzero(before.own != now.own):
@@ -271,7 +273,7 @@ class Tracker:
         return self._table(before, now, Changed._make(map(np.concatenate, zip(*parts, strict=True))))
 
     def _table(self, before: Moment, now: Moment, changed: Changed) -> FlipTable:
-        """The flips as columns, from indices among the atoms that take part."""
+        """Return the flips as a table, from indices among the participating atoms."""
         directed, who, count = self.rule.directed, self._who, len(changed.i)
         i, j, images = who.labels[changed.i], who.labels[changed.j], int(changed.rank.max(initial=0)) + 1
         if not directed:
@@ -305,7 +307,7 @@ def _participants(
     species: np.ndarray | None,
     atoms: int,
 ) -> Participants:
-    """Number the atoms that take part, in the order of the file."""
+    """Number the atoms that take part in a rule, in the order of the file."""
     first = np.arange(atoms) if first is None else first
     second = first if second is None else second
     for name, chosen in (("first", first), ("second", second)):
@@ -328,7 +330,7 @@ def _participants(
 
 
 def _by_place(who: Participants, frame: Frame) -> Participants:
-    """The same atoms numbered by where they are: what is near in space is near in memory."""
+    """Renumber participating atoms by position, so that atoms near in space are near in memory."""
     x, largest = _taken(frame.positions, who.labels)
     if not np.isfinite(largest) or not who.radius > 0:
         return who
@@ -341,13 +343,13 @@ def _by_place(who: Participants, frame: Frame) -> Participants:
 
 
 def _taken(positions: np.ndarray, labels: np.ndarray) -> tuple[Float[np.ndarray, "taken 3"], float]:
-    """The positions of some atoms, copied, and the largest coordinate: not finite where one is not."""
+    """Return a copy of the positions of some atoms, and the largest coordinate (not finite if one is not)."""
     x = np.take(np.asarray(positions, np.float64), labels, axis=0)
     return x, furthest(x)
 
 
 def _indices(chosen: Sequence[int] | np.ndarray | None, where: str) -> np.ndarray | None:
-    """Sorted atom numbers, each once."""
+    """Return sorted atom indices without duplicates."""
     if chosen is None:
         return None
     made = np.asarray(chosen)

@@ -1,8 +1,8 @@
-"""What every reader of trajectories gives: the frames asked for, in order, and what is known of the atoms.
+"""Base class of all trajectory readers: the requested frames, in order, and the properties of the atoms.
 
-Positions are those of the file: nothing is wrapped, made whole or centered. Readers differ in what they keep:
-ASE's and mdnum's own (gro, LAMMPS's text dumps) keep every digit, MDAnalysis's narrow every coordinate to
-float32 (`Trajectory.bits`).
+Positions are those of the file: nothing is wrapped, unwrapped or centered. Readers differ in precision: ASE's
+and mdnum's own (gro, LAMMPS's text dumps) keep every digit, MDAnalysis's reduce every coordinate to float32
+(`Trajectory.bits`).
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ SAMPLE = 8
 
 
 class Trajectory(ABC):
-    """Frames of one file, read lazily and in order, as often as wanted.
+    """Frames of one file, read lazily and in order, any number of times.
 
-    A reader says how many atoms there are (`has_atoms`), finds frames (`raw_frames`) and decodes them
-    (`decoded`). What it raises in doing so becomes an unreadable frame.
+    A subclass sets the number of atoms (`has_atoms`), finds frames (`raw_frames`) and decodes them
+    (`decoded`). An exception in these methods is reported as an unreadable frame.
 
     Args:
         path: the file.
-        topology: the file that says what the atoms are, where it is another one.
-        slice: the frames asked for.
+        topology: the file that identifies the atoms, if it is another file.
+        slice: the requested frames.
     """
 
     format: str  # the file's format in the reader's word ("XTC", "extxyz")
@@ -66,7 +66,7 @@ class Trajectory(ABC):
         self.path, self.topology, self.slice = path, topology, slice
 
     def has_atoms(self, atoms: int, table: AtomTable | None = None) -> None:
-        """Sets the table of atoms: the topology's, where there is one."""
+        """Set the table of atoms, from the topology if there is one."""
         check_claim(self.path, atoms)
         if self.topology is not None:
             table, _ = self.topology.read()
@@ -74,7 +74,7 @@ class Trajectory(ABC):
         self.table = AtomTable.plain(["X"] * atoms, named=False) if table is None else table
 
     def _belongs(self, topology: int, atoms: int) -> None:
-        """Refuses a topology with another number of atoms."""
+        """Reject a topology with another number of atoms."""
         if self.topology is not None and topology != atoms:
             seen = (
                 f"the topology {self.topology.path.name} has {topology:,} atoms and the trajectory {atoms:,}"
@@ -87,21 +87,21 @@ class Trajectory(ABC):
 
     @property
     def atoms(self) -> int:
-        """Atoms in every frame."""
+        """Number of atoms in every frame."""
         return len(self.table)
 
     @property
     def species(self) -> np.ndarray:
-        """Species of every atom, words, shape (atoms,)."""
+        """Species of every atom, as words, shape (atoms,)."""
         return self.table.species
 
     def other_box(self, number: int) -> tuple[str, Box] | None:
-        """(code of a finding, another box that a frame may be taken to have); None without one."""
+        """Return (code of a finding, another box that the frame may have); None if there is no other box."""
         return None
 
     @property
     def in_file(self) -> int | None:
-        """Frames in the file; None where they are not known without reading it."""
+        """Number of frames in the file; None if it is unknown without reading the file."""
         if self._count is None and any((end or 0) < 0 for end in (self.slice.start, self.slice.stop)):
             with self._opened() as get:
                 for number in chosen(slice(None), None):
@@ -113,14 +113,14 @@ class Trajectory(ABC):
 
     @property
     def count(self) -> int | None:
-        """Frames that `frames` gives; None where they are not known without reading the file."""
+        """Number of frames that `frames` yields; None if it is unknown without reading the file."""
         return None if self.in_file is None else len(range(*self.slice.indices(self.in_file)))
 
     def frames(self) -> Iterator[Frame]:
-        """The frames asked for, in order, one in memory at a time. Each call starts at the first again.
+        """Yield the requested frames in order, one in memory at a time. Each call starts at the first frame.
 
         Raises:
-            UnreadableFrame: one cannot be read. Those before it have been given.
+            UnreadableFrame: a frame cannot be read; the frames before it have been yielded.
             InputError: a frame has another number of atoms.
         """
         number = None
@@ -143,10 +143,10 @@ class Trajectory(ABC):
                 raise self._unreadable(end, rest)
 
     def sample(self) -> list[Frame]:
-        """The first of the frames asked for, `SAMPLE` of them; fewer where one of them cannot be read.
+        """Return the first `SAMPLE` of the requested frames, or fewer if one of them cannot be read.
 
         Raises:
-            InputError: there is none, or not even the first can be read.
+            InputError: there is no frame, or the first one cannot be read.
         """
         sample = []
         try:
@@ -161,7 +161,7 @@ class Trajectory(ABC):
 
     @property
     def slice_words(self) -> str:
-        """The frames asked for, as behind an @; empty for all."""
+        """Requested frames as written after an @; empty for all frames."""
         if self.slice == slice(None):
             return ""
         start, stop, step = self.slice.start, self.slice.stop, self.slice.step
@@ -170,18 +170,20 @@ class Trajectory(ABC):
 
     @abstractmethod
     def raw_frames(self) -> AbstractContextManager[Callable[[int], Any]]:
-        """Opens the file: gives frames by ascending number, as `decoded` takes them; None at the end."""
+        """Open the file; provide a function that returns raw frames by ascending number, and None at the
+        end.
+        """
 
     @abstractmethod
     def decoded(self, number: int, raw: Any) -> Frame:
-        """A frame, in the units that `length` and `time` name, from what `raw_frames` gave."""
+        """Decode a raw frame from `raw_frames`, in the units named by `length` and `time`."""
 
     def _behind(self) -> str | None:
-        """What is left in the file behind its last frame, in words."""
+        """Describe the data after the last frame of the file; return None if there are none."""
         return None
 
     def _by_id(self, number: int, ids: np.ndarray) -> np.ndarray:
-        """The order of a frame's atoms by their ids, which are those of the first frame."""
+        """Return the order of a frame's atoms by id; the ids must be those of the first frame."""
         order = np.argsort(ids, kind="stable")
         known = self._ids = ids[order] if self._ids is None else self._ids
         if not np.array_equal(known, ids[order]):
@@ -202,7 +204,7 @@ class Trajectory(ABC):
         return reading(self.path, number, by=self.reader)
 
     def in_order(self, following: Callable[[], Any]) -> Callable[[int], Any]:
-        """Frames by number, of a reader that goes forward only."""
+        """Return a function that gives frames by number, for a reader that only reads forward."""
         at = 0
 
         def get(number: int) -> Any:
@@ -220,7 +222,7 @@ class Trajectory(ABC):
         return get
 
     def first(self) -> Any:
-        """The first frame of the file, as `decoded` takes it."""
+        """Return the first frame of the file in raw form, as `decoded` takes it."""
         with self._opened() as get, self._reading(0):
             first = get(0)
         if first is None:
@@ -238,7 +240,7 @@ class Trajectory(ABC):
 
 
 def chosen(frames: slice, total: int | None) -> Iterator[int]:
-    """The numbers of the frames, upward; without an end where neither the slice nor a total has one."""
+    """Return the numbers of the frames, ascending; endless if neither the slice nor the total ends."""
     if total is not None:
         return iter(range(*frames.indices(total)))
     return islice(count(), frames.start, frames.stop, frames.step)

@@ -1,8 +1,8 @@
-"""How atoms get across the faces of the box from frame to frame, and where one frame does not follow another.
+"""Motion of atoms across the faces of the box, and frames that do not continue the frame before.
 
-An atom that is put into another cell of the box jumps by whole lattice vectors of the box at that frame, or
-what is computed from its path is wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153, 021101, 2020).
-Jumps are undone here by the vectors of the box of each frame, which keeps displacements as they are
+An atom that is wrapped into another cell has to jump by whole lattice vectors of the box at that frame;
+otherwise quantities computed from its path are wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153,
+021101, 2020). This module removes jumps by the lattice vectors of each frame, which preserves displacements
 (Bullerjahn, von Bülow, Heidari, Hénin and Hummer, J. Chem. Theory Comput. 19, 3406, 2023).
 """
 
@@ -33,7 +33,7 @@ _GROUPS = 8
 
 @dataclass
 class Unwrapping:
-    """Follows some of the atoms that matter, two of each `_PAIRS`, while there is a box along all axes."""
+    """Unwrapped paths of up to `_PAIRS` pairs of successive atoms, as long as the box is fully periodic."""
 
     atoms: AtomIndices
     _first: np.ndarray | None = None
@@ -42,7 +42,7 @@ class Unwrapping:
     _lengths: list[np.ndarray] = field(default_factory=list)  # distances in pairs at the first frames
 
     def see(self, frame: Frame) -> dict[str, Any] | None:
-        """A row of the table of motion for the next frame; None without a box."""
+        """Return the row of the motion table for the next frame; None without a box."""
         x, cell = frame.positions if self.atoms is None else frame.positions[self.atoms], frame.box.matrix
         if not frame.box.pbc.all() or len(x) < 2:
             return None
@@ -68,7 +68,7 @@ class Unwrapping:
         }  # fmt: skip
 
     def _pairs(self, here: np.ndarray, there: np.ndarray, cell: np.ndarray) -> dict[str, Any]:
-        """By how much pairs that keep their distance change it where they are in two cells, and in one."""
+        """Return by how much stiff pairs change their distance, for pairs across two cells and within one."""
         images = np.rint(there - here)
         split = images.any(axis=1) | (np.floor(here) != np.floor(there)).any(axis=1)
         lengths = np.linalg.norm((there - here - images) @ cell, axis=1)
@@ -84,7 +84,7 @@ class Unwrapping:
 
 
 def told(rows: Mapping[str, np.ndarray], atoms: int, timed: bool) -> dict[str, Any] | None:
-    """What the table of motion says of so many atoms that matter, as plain values; None for few frames."""
+    """Summarize the motion table of the given number of atoms as plain values; None for few frames."""
     if len(rows["frame"]) < 3:
         return None
     # before the first frame nothing moved
@@ -109,7 +109,7 @@ def told(rows: Mapping[str, np.ndarray], atoms: int, timed: bool) -> dict[str, A
 
 
 def _seams(number: np.ndarray, step: np.ndarray, jumps: np.ndarray, atoms: int) -> list[dict[str, Any]]:
-    """Frames that do not follow the one before: all atoms move, or many jump, as at no frame around it."""
+    """Return frames at which, unlike at the frames around them, all atoms move or many of them jump."""
     found = []
     for k in range(len(step)):
         around = np.r_[max(k - _AROUND, 0) : k, k + 1 : min(k + _AROUND, len(step) - 1) + 1]
