@@ -1,1 +1,1 @@
-"""What every verb shows: findings, sections, figures, one page."""
+"""Output that all verbs share: findings, sections, figures, and the page."""

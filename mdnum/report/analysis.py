@@ -1,4 +1,4 @@
-"""Analysis of a run's tables: chatter, stays, busiest pairs, margins in roundings, and energies."""
+"""Statistics of a run's tables: chatter, residence times, busiest pairs, margins in bounds, and energies."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ _LEAST_ROWS, _BLOCKS = 40, 10
 
 @dataclass(frozen=True)
 class Stays:
-    """How long pairs keep a decision, in steps, between two flips of the same pair."""
+    """Residence times of pairs inside and outside, in steps, between two flips of the same pair."""
 
     inside: Int[np.ndarray, "lengths"]  # from entering to leaving: how many stays last 0, 1, 2, ... steps
     outside: Int[np.ndarray, "lengths"]  # from leaving to entering again, likewise
 
     @property
     def total(self) -> int:
-        """Stays of both kinds."""
+        """Number of stays of both kinds."""
         return int(self.inside.sum() + self.outside.sum())
 
     def undone_within(self, steps: int) -> int:
-        """Number of flips that the same pair reverses within `steps` steps (chatter)."""
+        """Return the number of flips that the same pair reverses within `steps` steps (chatter)."""
         return int(self.inside[: steps + 1].sum() + self.outside[: steps + 1].sum())
 
 
 def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
-    """The median stay from the number of stays of 0, 1, 2, ... steps; None if there are no stays."""
+    """Return the median stay from the number of stays of 0, 1, 2, ... steps; None if there are no stays."""
     total = int(counts.sum())
     if not total:
         return None
@@ -50,7 +50,7 @@ def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
 
 @dataclass(frozen=True)
 class PairCounts:
-    """Pairs by the number of their flips, most first."""
+    """Pairs sorted by the number of their flips, in descending order."""
 
     i: Int[np.ndarray, "pairs"]
     j: Int[np.ndarray, "pairs"]
@@ -58,7 +58,7 @@ class PairCounts:
     terms: np.ndarray  # names of the terms whose decisions they are; "" where there are none
 
     def rows(self, most: int) -> list[dict[str, Any]]:
-        """The first pairs, in plain values."""
+        """Return the first pairs as plain values."""
         columns = {name: values[:most].tolist() for name, values in vars(self).items()}
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
@@ -66,12 +66,12 @@ class PairCounts:
 class Scan:
     """Statistics of a table of flips that may be larger than memory, read block by block.
 
-    Kept are a row for each pair, a count for each step and length of a stay, the rows nearest to their
-    threshold, and of each flip one number: its margin.
+    A scan stores one row per pair, one count per step and per length of a stay, the rows nearest to their
+    threshold, and the margin of every flip.
 
     Args:
         steps: rows of the run's series; a flip is at one of the steps 0 to steps - 1.
-        nearest: how many rows of the flips nearest to their threshold are kept.
+        nearest: number of rows nearest to their threshold that are kept.
     """
 
     def __init__(self, steps: int, nearest: int = 0):
@@ -95,10 +95,10 @@ class Scan:
         self.nearest: dict[str, np.ndarray] = {}
 
     def take(self, flips: Flips) -> None:
-        """The next rows of the table.
+        """Process the next rows of the table.
 
         Raises:
-            ValueError: a flip is at a step that the run did not make, or before one that came earlier.
+            ValueError: a flip is at a step outside the run, or at an earlier step than a flip before it.
         """
         step, steps = flips["step"], len(self.entered)
         self.total += len(step)
@@ -126,13 +126,13 @@ class Scan:
 
     @property
     def alternates(self) -> bool:
-        """Whether every pair's flips enter and leave in turn: one that does not has a flip missing."""
+        """True if the flips of every pair enter and leave alternately; otherwise a flip is missing."""
         self._follow()
         return self._alternates
 
     @property
     def ratios(self) -> Float[np.ndarray, "flips"]:
-        """|margin| of each flip over its rounding bound."""
+        """Ratio of |margin| to the rounding bound, for each flip."""
         self._ratios = [np.concatenate(self._ratios or [np.zeros(0)])]
         return self._ratios[0]
 
@@ -140,21 +140,21 @@ class Scan:
     def stays(self) -> Stays:
         """Residence times of pairs on either side of the cutoff.
 
-        The stay before a pair's first flip and after its last one are not seen whole and not counted,
-        so that long stays are underrepresented in a run that is not much longer than they are.
+        The stays before a pair's first flip and after its last one are incomplete and not counted, so long
+        stays are underrepresented in a run that is not much longer than they are.
         """
         self._follow()
         return Stays(inside=self._lengths[1], outside=self._lengths[0])
 
     @property
     def pairs(self) -> int:
-        """How many pairs flipped."""
+        """Number of pairs that flipped."""
         self._follow()
         return len(self._key)
 
     @property
     def busiest(self) -> PairCounts:
-        """The pairs that flipped, those that did so most often first."""
+        """Pairs that flipped, in descending order of the number of flips."""
         self._follow()
         order = np.argsort(-self._count, kind="stable")
         key = self._key[order]
@@ -164,7 +164,7 @@ class Scan:
         )
 
     def matches(self, series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
-        """At each step, whether the table of flips has as many as the series counted there."""
+        """Return, for each step, True if the table has as many flips as the series counted."""
         return (self.entered == series["entered"]) & (self.left == series["left"])
 
     def _follow(self) -> None:
@@ -195,16 +195,16 @@ class Scan:
 
 
 def scan(flips: Flips, steps: int | None = None, nearest: int = 0) -> Scan:
-    """Statistics of a table of flips that fits in memory."""
+    """Compute the statistics of a table of flips that fits in memory."""
     made = Scan(int(np.max(flips["step"], initial=-1)) + 1 if steps is None else steps, nearest)
     made.take(flips)
     return made
 
 
 def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
-    """|margin| of each flip over its rounding bound: at most 1 is ambiguous.
+    """Return the ratio of |margin| to the rounding bound of each flip; at most 1 is ambiguous.
 
-    A bound of zero (an exact comparison) makes any margin but zero infinitely safe.
+    If the bound is zero (an exact comparison), the ratio of any nonzero margin is infinite.
     """
     margin, bound = np.abs(flips["margin"]), flips["bound"]
     ratio = np.full(margin.shape, np.inf)
@@ -214,11 +214,11 @@ def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
 
 
 def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
-    """Expected number of flips within their rounding bound if the margins were spread evenly near zero.
+    """Return the expected number of flips within their rounding bound, for margins spread evenly near zero.
 
-    They are where atoms move freely through the cutoff. The density is taken from the lower
-    quarter of the margins; many more ambiguous flips than this mean that something holds pairs
-    at the cutoff, a crystal's shell for example.
+    Margins are spread evenly if atoms move freely through the cutoff. The density is taken from the lower
+    quarter of the margins; many more ambiguous flips mean that pairs are held at the cutoff, for example by
+    the shell of a crystal.
     """
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) < 4:
@@ -228,7 +228,7 @@ def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
 
 
 def closest(ratio: Float[np.ndarray, "flips"], most: int) -> Int[np.ndarray, "nearest"]:
-    """Rows of the flips nearest to their threshold, in units of rounding, nearest first."""
+    """Return the rows of the flips nearest to their threshold, in units of rounding, nearest first."""
     if len(ratio) > most:
         rows = np.argpartition(ratio, most)[:most]
     else:
@@ -237,7 +237,7 @@ def closest(ratio: Float[np.ndarray, "flips"], most: int) -> Int[np.ndarray, "ne
 
 
 def algebra_holds(series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
-    """At each step, whether pairs inside = pairs inside at the start + entered - left."""
+    """Return, for each step, True if pairs inside = pairs inside at the start + entered - left."""
     pairs = series["pairs"]
     net = np.cumsum(series["entered"].astype(np.int64) - series["left"])
     return pairs == pairs[0] + net - net[0]
@@ -245,7 +245,7 @@ def algebra_holds(series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]
 
 @dataclass(frozen=True)
 class Conservation:
-    """How well a run conserves energy over its second half."""
+    """Fluctuation and drift of the conserved energy of a run."""
 
     fluctuation: float  # standard deviation of the conserved energy over that of what moves
     drift: float  # of the conserved energy over the whole run, energy
@@ -258,14 +258,15 @@ class Conservation:
         kinetic: Float[np.ndarray, "rows"],
         least: float,
     ) -> Conservation | None:
-        """From one value of each a step; None of too few, or where nothing moves.
+        """Compute energy conservation from one value per step; None for few values or without motion.
 
-        A line is taken off before the fluctuation is: a drift is another matter. The first half is left out,
-        since a run that starts from a lattice turns half of its kinetic energy into potential energy.
+        The linear trend is removed before the fluctuation is computed, since drift is reported separately.
+        The first half is left out, because a run that starts from a lattice turns half of its kinetic energy
+        into potential energy.
 
         Args:
-            conserved: what should not change. kinetic: the kinetic energy.
-            least: what moves counts as at least so much; atoms that fly freely keep their kinetic energy.
+            conserved: the energy that should not change. kinetic: the kinetic energy.
+            least: lower limit of the kinetic fluctuation; atoms in free flight keep their kinetic energy.
         """
         rows = len(conserved)
         if rows < _LEAST_ROWS or not np.isfinite(conserved).all():
@@ -283,11 +284,11 @@ class Conservation:
 
 
 def range_table(label: Callable[[str], str], *tables: Mapping[str, np.ndarray]) -> Table:
-    """What quantities ask of a format, and the first steps at which narrower ones would not hold them.
+    """Tabulate the ranges of quantities, and the first steps at which narrower formats cannot hold them.
 
     Args:
-        label: of a quantity by its name.
-        tables: `step`, and at each of them the extremes of quantities (`ranges.columns`).
+        label: function that returns the label of a quantity from its name.
+        tables: `step`, and the extremes of quantities at each step (`ranges.columns`).
     """
     rows, forms = [], ("float32", "bfloat16", "float16")
     held = ((table, key) for table in tables for key in table if "largest_" in key and np.any(table[key]))

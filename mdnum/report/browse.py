@@ -1,4 +1,4 @@
-"""Tables that can be sorted, searched and paged in the browser, and read without a script."""
+"""Tables that can be sorted, searched and paged in the browser, and are readable without a script."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STATIC_ROWS = 20
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table that can be searched."""
+    """A column of a searchable table."""
 
     # name, unit: its heading
     name: str
@@ -42,7 +42,7 @@ class Column:
 
     @property
     def plain(self) -> list[list[Any]]:
-        """Lists of plain values, None for what is not finite."""
+        """Values of the column as lists of plain values; None for values that are not finite."""
         if self.kind == "pair":
             return [np.asarray(values).astype(int).tolist() for values in self.of]
         values = np.asarray(self.of)
@@ -55,7 +55,7 @@ class Column:
         return [[float(f"{x:.{kept}g}") if np.isfinite(x) else None for x in values.astype(float).tolist()]]
 
     def text(self, row: Sequence[Any], at: int) -> str:
-        """What the cell of a row says, whose value is at a place."""
+        """Return the text of a cell from its row and the index of its value in the row."""
         value = row[at]
         if self.kind == "pair":
             return f"{value}–{row[at + 1]}"
@@ -70,7 +70,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Browse:
-    """A table that can be sorted, searched and paged in the browser, and read without a script."""
+    """A table that can be sorted, searched and paged in the browser, and is readable without a script."""
 
     name: str  # id of the table
     noun: str  # what is searched, in the plural
@@ -79,23 +79,23 @@ class Browse:
 
     @cached_property
     def placed(self) -> list[tuple[int, Column]]:
-        """Columns, each with where in a row its value is."""
+        """Columns of the table, each with the index of its value in a row."""
         places = np.cumsum([0, *(1 + (column.kind == "pair") for column in self.columns)]).tolist()
         return list(zip(places, self.columns, strict=False))
 
     @cached_property
     def rows(self) -> list[list[Any]]:
-        """Plain values, None for what is not known."""
+        """Rows of the table as plain values; None for unknown values."""
         return [list(row) for row in zip(*(each for one in self.columns for each in one.plain), strict=True)]
 
     def is_ambiguous(self, row: Sequence[Any]) -> bool:
-        """Whether a row is marked."""
+        """Return True if a row is marked as ambiguous."""
         at = self.search["ambiguous"]
         return at is not None and row[at] is not None and row[at] <= 1
 
     @cached_property
     def search(self) -> dict[str, Any]:
-        """The search box's keywords, and the column that each of them searches."""
+        """Keywords of the search box, and the column that each of them searches."""
         found: dict[str, Any] = {"words": {}, "ranges": {}, "subjects": [], "nouns": [], "ambiguous": None}
         for at, one in self.placed:
             if one.kind == "word":
@@ -124,10 +124,10 @@ class Browse:
 
     @property
     def json(self) -> Markup:
-        """The rows, for a script element."""
+        """Rows of the table, as JSON for a script element."""
         return _script_safe(self.rows)
 
 
 def _script_safe(value: Any) -> Markup:
-    """JSON that can stand in a script element: "</script>" inside a string would end it."""
+    """Return JSON that is safe in a script element, which "</script>" inside a string would end."""
     return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))

@@ -1,4 +1,4 @@
-"""Plots drawn with plain matplotlib, in one style and one width, as SVG that follows the page."""
+"""Plots drawn with plain matplotlib, in one style and one width, as SVG that adapts to the page."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ MARKS = 1500
 
 
 def draw(figure: Figure | Plot) -> Canvas:
-    """A figure of a page as matplotlib has it."""
+    """Draw a figure of a page with matplotlib."""
     if isinstance(figure, Plot):
         height = 2.9 if figure.region is None else 5.6 if figure.y_names else 3.3
         return canvas(lambda empty: _plot(figure, empty), height)
@@ -59,11 +59,11 @@ def draw(figure: Figure | Plot) -> Canvas:
 
 
 def canvas(draw_into: Callable[[Canvas], None], height: float) -> Canvas:
-    """A figure in the report's style.
+    """Create a figure in the style of the report.
 
     Args:
-        draw_into: draws.
-        height: inches.
+        draw_into: function that draws into the figure.
+        height: height of the figure, inches.
     """
     with style():
         figure = Canvas(figsize=(WIDTH, height), layout="constrained")
@@ -87,7 +87,7 @@ def canvas(draw_into: Callable[[Canvas], None], height: float) -> Canvas:
 
 
 def line(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, label: str = "", **look: object) -> None:
-    """A line; of more points than fit, their mean and a band from the smallest to the largest."""
+    """Draw a line; if it has too many points, draw their mean and a band from smallest to largest."""
     low, middle, high, at = envelope(np.asarray(x), np.asarray(y))
     if len(y) > POINTS:
         axes.fill_between(at, low, high, color=color, alpha=0.3, lw=0)
@@ -97,7 +97,7 @@ def line(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, label: str = "", 
 def envelope(
     x: np.ndarray, y: np.ndarray, most: int = POINTS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(smallest, mean, largest, position) in at most n equal groups; a group of one is its value."""
+    """Return (smallest, mean, largest, position) of at most `most` equal groups of points."""
     if len(y) <= most:
         return y, y, y, x
     starts = np.unique(np.linspace(0, len(y), most, endpoint=False).astype(int))
@@ -111,7 +111,7 @@ def envelope(
 
 
 def legend(axes: Axes) -> None:
-    """The names of the lines above the axes, where nothing lies; of one line none but its own label's."""
+    """Draw a legend with the names of the lines above the axes, where it covers nothing."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         longest = max(len(label) for label in labels)
@@ -122,7 +122,7 @@ def legend(axes: Axes) -> None:
 
 
 def notes(plot: Figure | Plot) -> list[str]:
-    """What a plot cannot show, a sentence each."""
+    """Describe the values that a plot cannot show, one sentence each."""
     if isinstance(plot, Figure) or not plot.series:
         return []
     sentences = []
@@ -179,7 +179,7 @@ def _plot(plot: Plot, figure: Canvas) -> None:
 
 
 def _high(curves: list[Line2D], axes: Axes, x: float) -> bool:
-    """Whether curves run through the upper part of the axes beside this place, and none through the lower."""
+    """Return True if curves pass through the upper part of the axes near x, and none through the lower."""
     to_axes = axes.transData + axes.transAxes.inverted()
     points = [to_axes.transform(np.asarray(one.get_xydata(), float)) for one in curves]
     at = np.concatenate(points or [np.zeros((0, 2))])
@@ -189,7 +189,7 @@ def _high(curves: list[Line2D], axes: Axes, x: float) -> bool:
 
 
 def _values(plot: Plot, name: str) -> np.ndarray:
-    """All finite numbers along an axis."""
+    """Return all finite numbers along an axis."""
     sources = (*plot.series, *filter(None, [plot.region]))
     values = [np.ravel(getattr(source, name)).astype(float) for source in sources]
     joined = np.concatenate(values or [np.zeros(0)])
@@ -197,7 +197,7 @@ def _values(plot: Plot, name: str) -> np.ndarray:
 
 
 def _base(plot: Plot, name: str) -> float:
-    """What is subtracted from values that differ in their last digits only; 0 from others."""
+    """Return the number subtracted from values that differ only in their last digits; 0 for other values."""
     values = _values(plot, name)
     span = np.ptp(values) if len(values) else 0.0
     # differences of neighboring floats are exact, so none of them is lost
@@ -214,7 +214,7 @@ def _coincide(one: Series, other: Series) -> bool:
 def _apart(
     marks: tuple[tuple[float, str], ...], base: float, limits: tuple[float, float]
 ) -> list[tuple[float, str]]:
-    """Marked values with their words; one word for those too near to one another for two."""
+    """Return marked values with their labels, and join the labels of values that are too close together."""
     kept: list[tuple[float, str]] = []
     near = 0.025 * abs(limits[1] - limits[0])
     for value, word in sorted((value - base, word) for value, word in marks):
@@ -241,7 +241,7 @@ def _scale(axes: Axes, name: str, scale: str, plot: Plot) -> None:
 
 
 def _series(axes: Axes, series: Series, bases: dict[str, float], covered: int) -> None:
-    """Draws a series; broader where later ones lie upon it, so that it is still seen."""
+    """Draw a series, with a broader line if later series coincide with it, so that it stays visible."""
     x, y = (np.asarray(getattr(series, name), float) - bases[name] for name in "xy")
     # what is infinite, or too large for an axis to have room beyond it, leaves a gap
     there = (np.abs(x) < 1e250) & (np.abs(y) < 1e250)
@@ -282,7 +282,7 @@ def _region(axes: Axes, region: Region) -> None:
 
 
 def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
-    """Edges of cells about centers, halfway between neighbors as the axis shows them."""
+    """Return the edges of cells around centers, halfway between neighbors on the scale of the axis."""
     centers = np.log(centers) if log else np.asarray(centers, float)
     half = np.diff(centers) / 2 if len(centers) > 1 else np.array([0.5])
     edges = np.concatenate(
@@ -292,12 +292,12 @@ def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
 
 
 def _named(names: tuple[str, ...], value: float, _: int | None = None) -> str:
-    """The word for a place of an axis; nothing between two and beyond the last."""
+    """Return the name of an integer position on an axis; empty for other positions."""
     return names[round(value)] if value == round(value) and 0 <= value < len(names) else ""
 
 
 def _decade(value: float, _: int | None = None) -> str:
-    """A mark of a logarithmic axis; nothing between two decades."""
+    """Return the label of a decade on a logarithmic axis; empty between two decades."""
     exponent = np.log10(abs(value)) if value else 0.0
     if not np.isclose(exponent, round(exponent), atol=1e-6):
         return ""
@@ -316,11 +316,11 @@ def _engineering() -> ScalarFormatter:
 def thin_line(
     x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"], bins: int = BINS
 ) -> Int[np.ndarray, "kept"]:
-    """Which points of a line to keep: at most four a bin (first, lowest, highest, last), gaps kept.
+    """Choose the points of a line to keep: at most four per bin (first, lowest, highest, last), and all gaps.
 
     Args:
-        x: in the space of the axis (logarithms where it is logarithmic), NaN for a gap.
-        y: likewise.
+        x: positions on the scale of the axis (logarithms on a logarithmic axis), NaN for a gap.
+        y: values on the scale of their axis, NaN for a gap.
     """
     if len(x) <= 4 * bins:
         return np.arange(len(x))
@@ -347,10 +347,10 @@ def thin_line(
 def thin_points(
     x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"], bins: int = BINS
 ) -> Int[np.ndarray, "kept"]:
-    """Which points to keep: one for each place of a fine grid that has any.
+    """Choose the points to keep: one in each occupied cell of a fine grid.
 
     Args:
-        x, y: in the space of the axes.
+        x, y: coordinates on the scales of the axes.
     """
     finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(finite) <= bins:
@@ -374,7 +374,7 @@ def thin_points(
 
 
 def style() -> AbstractContextManager[None]:
-    """The settings under which figures are drawn, whatever the user's matplotlibrc says."""
+    """Return a context with the settings for all figures, independent of the user's matplotlibrc."""
     return mpl.rc_context(
         {
             # any backend will do, and to ask for the one in use imports pyplot
@@ -395,10 +395,10 @@ def style() -> AbstractContextManager[None]:
 
 
 def markup(figure: Canvas, name: str) -> str:
-    """A figure as an <svg> element whose colors are roles.
+    """Return a figure as an <svg> element whose colors are roles.
 
     Args:
-        name: makes the element's ids unique on a page.
+        name: prefix that makes the element's ids unique on a page.
     """
     sink = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
@@ -425,13 +425,13 @@ def markup(figure: Canvas, name: str) -> str:
 
 
 def inline(text: str, title: str) -> str:
-    """An <svg> element for an HTML page that defines the colors as custom properties."""
+    """Return an <svg> element for an HTML page that defines the colors as custom properties."""
     text = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" role="img">', text, count=1)
     return text.replace('role="img">', f'role="img" aria-label="{escape(title)}">', 1)
 
 
 def standalone(text: str) -> str:
-    """A whole SVG file, which carries both sets of colors and follows the viewer's preference."""
+    """Return a complete SVG file with light and dark colors, selected by the viewer's preference."""
     rules = (
         f"svg {{ {_properties(LIGHT)} }} "
         f"@media (prefers-color-scheme: dark) {{ svg {{ {_properties(DARK)} }} }} "

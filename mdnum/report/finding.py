@@ -1,6 +1,6 @@
-"""Findings, their sentences, and the verdict that summarizes them; every verb uses them.
+"""Findings of all verbs, their sentences, and the verdict that summarizes them.
 
-Code decides (code, values); a text file beside the verb has the sentences, by code, with named fields:
+Code determines a finding (code, values); a text file next to the verb has its sentences, with named fields:
 
     [LOST_PAIRS]
     severity = "error"
@@ -33,13 +33,13 @@ Code decides (code, values); a text file beside the verb has the sentences, by c
       { name = "distance", of = "distance", unit = "{length}" },
     ]
 
-Where a list has several texts, the first counts whose fields all have a value; without one the row is left
-out. A field is written as its format asks: `{x}` a number or text as people read it, `{x:3}` with 3
+If a list has several texts, the first one whose fields all have a value is used; without one, the row is left
+out. The format of a field determines its form: `{x}` a number or text as people read it, `{x:3}` with 3
 significant digits, `{x:+3}` with its sign, `{x:g}` without trailing zeros, `{x:%}` a percentage, `{n:# pair}`
-"2 pairs" (`{n:# life lives}` with an irregular plural, `{n:# pair_step}` with a space), `{n:? was were}` one
-word or the other. A `Measured` is written with its unit (`{x:3m}`: in thousandths of it, meV), `{x:=}` with
-the digits that its floor leaves, `{x.floor:1}` without; where a verb has a unit system, `{units.energy}` is
-the name of a unit.
+"2 pairs" (`{n:# life lives}` with an irregular plural, `{n:# pair_step}` with a space), `{n:? was were}` the
+first word for 1 and the second for others. A `Measured` is written with its unit (`{x:3m}`: in thousandths of
+it, meV), `{x:=}` with the digits that its floor leaves, `{x.floor:1}` without a unit; if a verb has a unit
+system, `{units.energy}` is the name of a unit.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _ORDER = ("error", "warning", "info")
 
 @dataclass(frozen=True)
 class Finding:
-    """One result that the reader should know about."""
+    """A result that the reader should know about."""
 
     code: str  # stable name, for scripts
     # error: do not use the numbers; warning: look before you do; info: good to know, which changes neither
@@ -111,11 +111,11 @@ class _Fields(string.Formatter):
 
 
 class Texts:
-    """The sentences of a verb.
+    """Sentences of a verb, read from its text file.
 
     Args:
-        module: `__file__` of the module; its text file lies beside it with the suffix .toml.
-        units: whose names `{units.energy}` and the like are.
+        module: `__file__` of the module; its text file lies next to it, with the suffix .toml.
+        units: unit system that provides the names for fields such as `{units.energy}`.
     """
 
     def __init__(self, module: str | Path, units: Units | None = None):
@@ -131,15 +131,15 @@ class Texts:
         cause: str = "",
         **values: Any,
     ) -> Finding:
-        """The finding of a code, its sentences filled in.
+        """Return the finding with a code, with its sentences filled in.
 
         Args:
             variants: alternatives to title, text and remedy, and further sentences (see the module).
-            severity, section: instead of those in the text file.
-            values: for the fields.
+            severity, section: values that replace those in the text file.
+            values: values of the fields.
 
         Raises:
-            KeyError: the text file lacks the code, or a value for one of its fields.
+            KeyError: the text file lacks the code, or a field has no value.
         """
         entry = self.entries[code]
         values = {name: value if isinstance(value, str) else _plain(value) for name, value in values.items()}
@@ -159,7 +159,7 @@ class Texts:
         )  # fmt: skip
 
     def __call__(self, name: str, /, **values: Any) -> str:
-        """A sentence of the table [sentences], its fields filled in."""
+        """Return a sentence of the table [sentences], with its fields filled in."""
         return fill(self.entries["sentences"][name], {"units": self.units, **values})
 
     def plot(
@@ -170,18 +170,20 @@ class Texts:
         horizontals: Iterable[tuple[float, str]] = (),
         **values: Any,
     ) -> Plot:
-        """The figure of a name in the table [plots], the fields of its words filled in."""
+        """Return the figure with this name in the table [plots], with its fields filled in."""
         told: Any = {part: fill(text, values) for part, text in self.entries["plots"][name].items()}
         marks = {"verticals": tuple(verticals), "horizontals": tuple(horizontals)}
         return Plot(name, series=tuple(series), **marks, **told)
 
     def rows(self, table: str, /, **values: Any) -> list[tuple[str, str]]:
-        """Names and texts of a table, their fields filled in; without those that show a value of None."""
+        """Return the names and texts of a table, with fields filled in, without rows that would show None."""
         rows = ((_first(name, values), _first(text, values)) for name, text in self.entries[table].items())
         return [(name, text) for name, text in rows if name is not None and text is not None]
 
     def keys(self, table: str = "keys", /, **values: Any) -> list[Key]:
-        """The numbers above a page, from a table of values and notes; without those that show None."""
+        """Return the key numbers of a page from a table of values and notes, without numbers that are
+        None.
+        """
         keys = []
         for label, texts in self.entries[table].items():
             for value, note in [texts] if isinstance(texts[0], str) else texts:
@@ -198,12 +200,12 @@ class Texts:
         /,
         **values: Any,
     ) -> Browse:
-        """A table to be searched, its columns those of a name in the table [browse] that the rows have.
+        """Return the searchable table with this name in [browse], with the columns present in `rows`.
 
         Args:
-            rows: equally long columns; a "pair" is of two of them.
-            choices: words of columns of words, by column, where the text file does not have them.
-            values: for fields in names and units of columns.
+            rows: equally long columns; a "pair" uses two of them.
+            choices: words of columns of words, by column, if the text file does not list them.
+            values: values of fields in names and units of columns.
         """
         entry, columns = self.entries["browse"][name], []
         for column in entry["columns"]:
@@ -221,13 +223,13 @@ def _plain(value: Any) -> Any:
 
 
 def _first(texts: str | Sequence[str], values: Mapping[str, Any]) -> str | None:
-    """The text, or the first of several, whose fields all have a value, with these filled in."""
+    """Return the first text whose fields all have a value, with its fields filled in; None without one."""
     several = [texts] if isinstance(texts, str) else texts
     return next((fill(text, values) for text in several if _known(text, values)), None)
 
 
 def _known(text: str, values: Mapping[str, Any]) -> bool:
-    """Whether all fields of a text have a value; a part of what has none has none either."""
+    """Return True if all fields of a text have a value; an attribute of a missing value is missing too."""
     names = (name for _, name, _, _ in string.Formatter().parse(text) if name)
     with suppress(TypeError):
         return all(_Fields().get_field(name, (), values)[0] is not None for name in names)
@@ -235,7 +237,7 @@ def _known(text: str, values: Mapping[str, Any]) -> bool:
 
 
 def fill(text: str, values: Mapping[str, Any]) -> str:
-    """A sentence with its fields filled in.
+    """Return a sentence with its fields filled in.
 
     Raises:
         KeyError: a field has no value.
@@ -255,11 +257,11 @@ class Verdict:
 
     @property
     def text(self) -> str:
-        """Headline and evidence."""
+        """Headline and evidence as one text."""
         return " ".join((self.headline, *self.evidence))
 
     def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """A summary of a kind of folder with headline, findings and verdict; an empty one is unfinished."""
+        """Return a folder's summary with headline, findings and verdict; an empty one means unfinished."""
         usual = {"status": "complete" if summary else "unfinished", "seconds": None}
         found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
         return headed(kind, {**usual, **summary, **found})
@@ -273,14 +275,14 @@ def conclude(
     best: Tone = "info",
     judged: bool = False,
 ) -> Verdict:
-    """The verdict on findings: its tone is that of the most severe finding, which the headline names.
+    """Return the verdict on findings: the most severe one sets its tone and is named in the headline.
 
     Args:
-        found: in the order in which they are to be read, whatever their severity.
-        evidence: what the verdict rests on, a sentence each.
+        found: findings in the order in which they are to be read, whatever their severity.
+        evidence: facts on which the verdict rests, one sentence each.
         headline: the answer to the verb's question.
-        best: tone where there is neither error nor warning.
-        judged: whether the headline follows from the findings already.
+        best: the tone if there is neither an error nor a warning.
+        judged: True if the headline follows from the findings already.
     """
     findings = tuple(sorted(found, key=lambda finding: _ORDER.index(finding.severity)))
     worst = findings[0] if findings else None
@@ -296,7 +298,7 @@ def conclude(
 
 
 def restore(kept: Mapping[str, Any]) -> Finding:
-    """Read a finding that was written into summary.json."""
+    """Restore a finding from its entry in summary.json."""
     severity: Any = kept.get("severity") if kept.get("severity") in _ORDER else "info"
     named = ("code", "title", "text", "remedy", "section", "cause")
     texts = {name: str(kept.get(name) or "") for name in named}

@@ -28,7 +28,7 @@ _HERE = files("mdnum.report")
 
 
 def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
-    """Writes report.html and figures/*.svg of any folder.
+    """Write report.html and figures/*.svg of a folder.
 
     Returns:
         the path of report.html.
@@ -64,7 +64,7 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
 
 
 def brief(page: Page, verdict: Verdict, path: Path, verb: str) -> str:
-    """Verdict, numbers, findings and first figure of the page of a folder, as HTML for a notebook."""
+    """Return verdict, key numbers, findings and first figure of a folder's page, as HTML for a notebook."""
     from mdnum.report import drawing
 
     parts = (part for section in page.sections for part in section.parts)
@@ -89,7 +89,7 @@ def _anchor(title: str) -> str:
 
 
 def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Finding]]]:
-    """Findings that have no cause among the others, each with the findings that name it as their cause."""
+    """Return the findings without a cause among the others, each with the findings that it causes."""
     findings = list(findings)
     codes = {finding.code for finding in findings}
     below: dict[str, list[Finding]] = {}
@@ -120,7 +120,7 @@ def _render(template: str, **content: Any) -> str:
 
 
 def _policy() -> str:
-    """Content security policy: a page may show itself and run its one script, whatever text it contains."""
+    """Return the content security policy: a page may display itself and run only its own script."""
     digest = base64.b64encode(hashlib.sha256(_text("report.js").encode()).digest()).decode()
     return (
         "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; style-src 'unsafe-inline'; "
@@ -129,7 +129,7 @@ def _policy() -> str:
 
 
 def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
-    """A table of a system file as a phrase: its kind first, then name and value of the rest."""
+    """Describe a table of a system file by a phrase: its kind, then name and value of the other entries."""
     parts = []
     for key, value in table.items():
         if isinstance(value, Mapping):
@@ -147,7 +147,7 @@ def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -
 
 
 def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """(name, text) of everything in nested tables, those of plain values in one line each."""
+    """Yield (name, text) for all entries of nested tables; plain values of a table share one line."""
     for key, item in value.items():
         name = f"{prefix}{key}".replace("_", " ")
         if isinstance(item, Mapping):

@@ -1,6 +1,6 @@
-"""Building blocks of every page and terminal answer: sections of text, tables and figures.
+"""Building blocks of every page and terminal output: sections of text, tables and figures.
 
-Nothing here draws or prints: `page` renders sections as HTML, `cli.output` prints them.
+Drawing and printing happen elsewhere: `page` renders sections as HTML, `cli.output` prints them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Role = Literal["first", "second", "third", "bad", "muted", "ink"]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of values under named columns."""
+    """Table of values under named columns."""
 
     # names, with their unit in parentheses; all empty for a table without a head, whose first column then
     # names its rows
@@ -36,7 +36,7 @@ class Table:
     bad: frozenset[int] = frozenset()  # rows that are marked, by their number
 
     def numeric(self, column: int) -> bool:
-        """Whether a column holds numbers alone, which are set flush right."""
+        """Return True if a column holds only numbers, which are right-aligned."""
         values = [row[column] for row in self.rows]
         return any(_is_number(value) for value in values) and all(
             value is None or _is_number(value) for value in values
@@ -44,7 +44,7 @@ class Table:
 
 
 def records(rows: Sequence[Mapping[str, Any]], title: str = "", shown: int = 20) -> Table:
-    """A table of dictionaries, its columns in the order in which they first occur."""
+    """Build a table from dictionaries, with columns in the order of their first occurrence."""
     columns = tuple(dict.fromkeys(name for row in rows for name in row))
     return Table(columns, [[row.get(name) for name in columns] for row in rows], title, shown)
 
@@ -56,12 +56,12 @@ def table_of(
     shown: int = 20,
     bad: Callable[[Any], Any] | None = None,
 ) -> Table:
-    """A table with a row for each record.
+    """Build a table with a row for each record.
 
     Args:
-        rows: mappings.
-        columns: by their head, the key whose value they show, or a function of the record.
-        bad: whether the row of a record is marked.
+        rows: records, as mappings.
+        columns: for each column heading, the key of its value or a function of the record.
+        bad: function that returns True if the row of a record is marked.
     """
     rows = list(rows)
     getters = [itemgetter(get) if isinstance(get, str) else get for get in columns.values()]
@@ -71,12 +71,12 @@ def table_of(
 
 
 def pairs(rows: Sequence[tuple[str, Any]], title: str = "") -> Table:
-    """A table of names and values, without a head."""
+    """Build a table of names and values, without a header."""
     return Table(("", ""), rows, title, shown=1000)
 
 
 def cell(value: Any) -> str:
-    """A value of a table as people read it."""
+    """Format a value of a table for readers."""
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool_):
@@ -118,7 +118,7 @@ ROLES: tuple[Role, ...] = ("first", "second", "third", "bad", "ink", "muted")
 
 
 def positive(values: np.ndarray) -> np.ndarray:
-    """Values with NaN wherever a logarithmic axis cannot show them: values ≤ 0 or not finite."""
+    """Return values with NaN for those that a logarithmic axis cannot show: values ≤ 0 or not finite."""
     values = np.asarray(values, float)
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
@@ -126,12 +126,12 @@ def positive(values: np.ndarray) -> np.ndarray:
 def curves(
     x: np.ndarray, lines: Mapping[str, np.ndarray], mark: Mark = "line", log: bool = True
 ) -> tuple[Series, ...]:
-    """Lines in the order of the roles.
+    """Build the series of several lines, with the roles in their order.
 
     Args:
-        x: of all of them.
-        lines: by label.
-        log: for a logarithmic axis: values above 0, and no line without any.
+        x: positions shared by all lines.
+        lines: values of each line, by label.
+        log: True for a logarithmic axis, without values ≤ 0 and lines that have no others.
     """
     if log:
         lines = {label: positive(y) for label, y in lines.items() if np.any(np.nan_to_num(y) > 0)}
@@ -142,7 +142,7 @@ def curves(
 
 
 def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.ndarray]:
-    """The table of a folder that holds the points of its figures: a row for each.
+    """Return the table of the points in a folder's figures, with a row for each point.
 
     Args:
         lines: part, curve, label, x and y of each line.
@@ -157,7 +157,7 @@ def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.n
 
 @dataclass(frozen=True)
 class Region:
-    """A map over a grid: small integers with a word for each (a stability map, say)."""
+    """Map over a grid: an integer class in each cell, with a word for each class (a stability map, say)."""
 
     # x, y: centers of the cells, shapes (columns,) and (rows,)
     x: np.ndarray
@@ -216,7 +216,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure that is drawn with matplotlib."""
+    """Figure drawn by a function that uses matplotlib."""
 
     name: str  # of figures/<name>.svg, unique on its page
     caption: str  # what to see in it
@@ -231,7 +231,7 @@ Part = Any  # str | Table | Browse | Code | Plot | Figure
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with its contents, in order."""
+    """Section of a page: a heading with its contents, in order."""
 
     title: str  # also what a finding names that this section shows
     parts: Sequence[Part] = ()  # paragraphs, tables, code, plots and figures
@@ -250,7 +250,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Page:
-    """A whole answer."""
+    """Complete page with the answer of a verb."""
 
     title: str  # heading
     about: str = ""  # one line below it

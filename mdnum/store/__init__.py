@@ -1,4 +1,4 @@
-"""One run = one folder: tables that survive a kill, exact frames, JSON and text, all written atomically."""
+"""Storage of a run in one folder: tables that survive a kill, exact frames, JSON and text, all atomic."""
 
 from __future__ import annotations
 

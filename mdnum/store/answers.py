@@ -1,9 +1,9 @@
-"""answers.json: what a verb has found out so far, so that one that was killed goes on with the rest.
+"""answers.json: the answers that a verb has found so far, so that a killed verb continues with the rest.
 
-A verb that asks many questions (`audit`, `conform`) keeps its options and its answers as one dataclass of
-plain values. It is written at once where an answer should not be lost and within a second otherwise; a
-resumed verb gets it back, each value of the kind that it was, and asks what has no answer yet. Tables are
-made from it.
+A verb with many questions (`audit`, `conform`) keeps its options and its answers as one dataclass of plain
+values. The file is written at once if an answer should not be lost, and otherwise within a second. A resumed
+verb restores all values with their types, and processes the questions without an answer. Tables are made from
+the answers.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NAME = "answers.json"
 
 
 class Timed(Protocol):
-    """A dataclass of numbers, text, lists, tuples, dictionaries and further dataclasses."""
+    """Dataclass of numbers, text, lists, tuples, dictionaries and further dataclasses."""
 
     seconds: float
 
@@ -34,11 +34,12 @@ T = TypeVar("T", bound=Timed)
 
 
 class Answers(Generic[T]):
-    """Writes a state into its folder.
+    """Writer of a verb's state into its folder.
 
     Args:
-        folder: open for writing.
-        state: changed in place while answers come; its `seconds` are those spent before, and are kept up.
+        folder: folder open for writing.
+        state: state that is changed in place as answers arrive; its `seconds`, the time spent before, are
+            updated.
     """
 
     def __init__(self, folder: RunFolder, state: T):
@@ -46,7 +47,7 @@ class Answers(Generic[T]):
         self._before, self._began, self._due = state.seconds, monotonic(), 0.0
 
     def save(self, urgent: bool = True) -> None:
-        """Makes this the point that a killed verb is resumed from; later, where that is soon enough."""
+        """Save the state from which a killed verb resumes; a save that is not urgent may be skipped."""
         now = monotonic()
         self.state.seconds = self._before + now - self._began
         if urgent or now >= self._due:
@@ -57,10 +58,11 @@ class Answers(Generic[T]):
 
 
 def take(path: str | Path, layout: Layout) -> RunFolder:
-    """The folder of a verb that is to be resumed, which from here on only this process writes.
+    """Open the folder of a verb to be resumed; from here on, only this process writes the folder.
 
     Raises:
-        FolderError: nothing of that verb to resume, another process writes it, or it was changed.
+        FolderError: the folder has nothing of that verb to resume, another process writes it, or it was
+            changed.
     """
     folder = RunFolder.open(path)
     if folder.kind != layout.kind or not (folder.path / NAME).is_file():
@@ -72,10 +74,10 @@ def take(path: str | Path, layout: Layout) -> RunFolder:
 
 
 def restored(folder: RunFolder, kind: type[T]) -> T:
-    """The state that a folder was left with.
+    """Return the state that is stored in a folder.
 
     Raises:
-        FolderError: the file holds another kind of thing, or nothing that can be read.
+        FolderError: the file is not readable, or holds another kind of state.
     """
     path = folder.path / NAME
     text = read_text(path)

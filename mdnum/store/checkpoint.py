@@ -1,4 +1,4 @@
-"""The state a killed run resumes from: arrays and plain values in one npz, bit for bit."""
+"""Checkpoint from which a killed run resumes: arrays and plain values in one npz file, bit for bit."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _META, _STORE = "mdnum meta", "mdnum store"
 def write(
     path: Path, state: Mapping[str, Any], store: Mapping[str, Any], beside: Mapping[str, list[str]]
 ) -> None:
-    """Replaces the checkpoint at path, and lists it in the manifest together with what it counts.
+    """Replace the checkpoint at path, and list it in the manifest together with the files that it counts.
 
     Args:
-        state: what the rollout wants back; arrays, and anything JSON has.
-        store: how far the tables, frames and log had come.
-        beside: digests of the files that came since the last checkpoint.
+        state: state of the rollout; arrays, and any values that JSON can hold.
+        store: lengths of the tables, frames and log.
+        beside: digests of the files written since the last checkpoint.
     """
     arrays, meta = _split(state)
     arrays |= {_META: np.array(json.dumps(meta)), _STORE: np.array(json.dumps(store))}
@@ -45,10 +45,11 @@ def write(
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(state, store) as given to `write`.
+    """Return (state, store) as given to `write`.
 
     Raises:
-        FolderError: it is damaged, or would unpack to more than its own size: a checkpoint is not packed.
+        FolderError: the checkpoint is damaged, or would unpack to more than its own size (mdnum does not
+            compress checkpoints).
     """
     try:
         with opened(path) as file:
@@ -119,14 +120,14 @@ _HEADER = struct.Struct("<qq")
 
 
 class FrameFile:
-    """`trajectory.traj`, opened at the first frame."""
+    """Writer of `trajectory.traj`; the file is opened at the first frame."""
 
     def __init__(self, path: Path):
         self.path = path
         self._writer: Any = None
 
     def append(self, atoms: Atoms) -> None:
-        """Writes one frame (positions, momenta, cell and what a single-point calculator holds).
+        """Append one frame (positions, momenta, cell and results of a single-point calculator).
 
         Raises:
             FolderError: the disk is full; the file is left with the frames before this one.
@@ -146,7 +147,7 @@ class FrameFile:
                 raise
 
     def mark(self) -> tuple[int, int, int]:
-        """(frames, position of the offset table, bytes) of the file now; zeros before the first frame."""
+        """Return (frames, position of the offset table, bytes) of the file; zeros before the first frame."""
         if not self.path.exists() or self.path.stat().st_size < _FRAMES_AT + _HEADER.size:
             return (0, 0, 0)
         with opened(self.path) as file:
@@ -155,9 +156,9 @@ class FrameFile:
         return (frames, table, self.path.stat().st_size)
 
     def truncate(self, mark: tuple[int, int, int]) -> None:
-        """Puts the file back to what it was at mark, a half-written frame included.
+        """Restore the file to its state at a mark, removing later frames even if half-written.
 
-        ASE moves its offset table as the file grows, hence the table's position in the mark.
+        ASE moves its offset table as the file grows, so the mark includes the position of the table.
         """
         self.close()
         frames, table, size = mark
@@ -177,7 +178,7 @@ class FrameFile:
             os.ftruncate(file.fileno(), size)
 
     def close(self) -> None:
-        """Closes the file; the next frame opens it again."""
+        """Close the file; the next frame opens it again."""
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.close()

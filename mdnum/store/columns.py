@@ -1,4 +1,4 @@
-"""What parquet files say of themselves: unit and description of every column, and which folder wrote them."""
+"""Metadata of parquet files: unit and description of every column, and the folder that wrote the file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DECLARED: Mapping[str, Mapping[str, Sequence[str]]] = beside(__file__)
 
 
 def meaning(table: str, column: str, own: Mapping[str, Mapping[str, Any]] | None = None) -> Sequence[str]:
-    """(unit in quantities, description) of a column, by `Layout.described`; empty where it has none."""
+    """Return (unit as quantities, description) of a column, by `Layout.described`; empty if undeclared."""
     if own is not None:
         said = _found(own.get(table, {}), column)
         return (_found(_DECLARED["columns"], said) if isinstance(said, str) else said) or ("", "")
@@ -33,13 +33,13 @@ def _json(value: Any) -> str:
 
 
 def described(schema: pa.Schema, table: str, about: Mapping[str, Any], own: Any = None) -> pa.Schema:
-    """A schema with metadata of its folder, keys `mdnum.*`, and `unit` and `description` of its columns.
+    """Return a schema with metadata: keys `mdnum.*` for the folder, `unit` and `description` for columns.
 
-    `mdnum.columns` has these once more, as JSON, for programs that read no metadata of columns.
+    `mdnum.columns` repeats the metadata of columns as JSON, for programs that read no metadata of columns.
 
     Args:
-        about: version, kind, system, run and units of the folder; what is empty is left out.
-        own: as for `meaning`.
+        about: version, kind, system, run and units of the folder; empty values are left out.
+        own: as in `meaning`.
     """
     fields, known = [], {}
     for field in schema:

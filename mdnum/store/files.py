@@ -1,4 +1,4 @@
-"""How a file of a folder is opened: whole or not there, never through a link, a full disk in one line."""
+"""Access to the files of a folder: atomic replacement, no links, and a one-line error for a full disk."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Turns what the operating system says about path into a FolderError with a remedy."""
+    """Convert errors of the operating system for a path into a FolderError with a remedy."""
     try:
         yield
     except OSError as error:
@@ -56,13 +56,13 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def opened(path: Path, mode: Literal["rb", "r+b", "ab"] = "rb") -> BinaryIO:
-    """Opens a file of a folder, which has to be a file and no link to one.
+    """Open a file of a folder; reject links and anything but a regular file.
 
     Args:
-        mode: "r+b" and "ab" write where the file is, so that a second name of it elsewhere is refused too.
+        mode: "r+b" and "ab" write in place, so a file with a second name (a hard link) is rejected too.
 
     Raises:
-        FolderError: it is a link, or no plain file. OSError: as `open`.
+        FolderError: the path is a link, or not a regular file. OSError: as `open`.
     """
     refuse_link(path, in_place=mode != "rb")
     try:
@@ -81,13 +81,13 @@ def opened(path: Path, mode: Literal["rb", "r+b", "ab"] = "rb") -> BinaryIO:
 
 
 def refuse_link(path: Path, in_place: bool = False) -> None:
-    """Refuses a file of a folder that leads out of it; one that is not there is none.
+    """Reject a file of a folder that leads out of the folder; accept a file that does not exist.
 
     Args:
-        in_place: whether it is to be written where it is.
+        in_place: True if the file is to be written in place.
 
     Raises:
-        FolderError: it, or the folder inside the folder that it is in, is a link; or it is no plain file.
+        FolderError: the file or its subfolder is a link, or the file is not a regular file.
     """
     if path.parent.name in SUBFOLDERS and path.parent.is_symlink():
         raise _linked(path.parent)
@@ -96,10 +96,10 @@ def refuse_link(path: Path, in_place: bool = False) -> None:
 
 
 def subfolder(root: Path, name: str) -> Path:
-    """A folder inside a folder, made where it is missing.
+    """Return a folder inside a folder, and create it if it is missing.
 
     Raises:
-        FolderError: it is a link, or cannot be made.
+        FolderError: the subfolder is a link, or cannot be created.
     """
     path = root / name
     if path.is_symlink():
@@ -111,9 +111,9 @@ def subfolder(root: Path, name: str) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A new file under a name that nobody foresees, moved to path at the end: a kill leaves old or new.
+    """Open a new file with an unpredictable name, and move it to path at the end: a kill leaves old or new.
 
-    A link at path is replaced; what it led to stays as it is.
+    A link at path is replaced; the file to which the link led is unchanged.
     """
     if path.parent.name in SUBFOLDERS and path.parent.is_symlink():
         raise _linked(path.parent)
@@ -134,10 +134,10 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
-    """Replaces a file of a folder by data; where the folder's manifest lists it, the manifest follows.
+    """Replace the contents of a file, and update the folder's manifest if it lists the file.
 
     Raises:
-        FolderError: the disk is full, or the folder cannot be written; nothing is left behind.
+        FolderError: the disk is full, or the folder cannot be written; no partial file remains.
     """
     # first both digests, then the file: it agrees with the manifest wherever a kill falls
     foretell(path, digest_of(data))
@@ -146,15 +146,15 @@ def write_bytes(path: Path, data: bytes | memoryview) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """As write_bytes, UTF-8."""
+    """Replace the contents of a file by text in UTF-8, as `write_bytes` does."""
     write_bytes(path, text.encode())
 
 
 def read_text(path: Path) -> str:
-    """The text of a file of a folder; empty where it is not there.
+    """Return the text of a file of a folder; empty if the file does not exist.
 
     Raises:
-        InputError: it is a link, not UTF-8, or larger than any text of a folder.
+        InputError: the file is a link, not UTF-8, or larger than any text of a folder.
     """
     try:
         with opened(path) as file:
@@ -197,7 +197,7 @@ _INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
 
 @dataclass
 class Manifest:
-    """A folder's manifest."""
+    """Manifest of a folder: its layout, its state, and the digests of its files."""
 
     layout: Layout | None  # what the folder holds; None where an earlier mdnum wrote it, which did not say
     finished: bool = False  # whether its writing came to an end
@@ -207,12 +207,12 @@ class Manifest:
 
 
 def digest_of(data: bytes | memoryview) -> str:
-    """Digest of the bytes of a file."""
+    """Return the digest of the bytes of a file."""
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
 def digest(path: Path) -> str:
-    """Digest of a file as it is; ABSENT where there is none."""
+    """Return the digest of a file as it is; ABSENT if the file does not exist."""
     try:
         with opened(path) as file:
             return digest_of_file(file)
@@ -221,7 +221,7 @@ def digest(path: Path) -> str:
 
 
 def digest_of_file(file: BinaryIO) -> str:
-    """Digest of all bytes of an open file."""
+    """Return the digest of all bytes of an open file."""
     file.seek(0)
     found = hashlib.blake2b(digest_size=16)
     while chunk := file.read(1 << 20):
@@ -230,10 +230,10 @@ def digest_of_file(file: BinaryIO) -> str:
 
 
 def load(root: Path) -> Manifest | None:
-    """The manifest of a folder; None where it has none (an older mdnum wrote none).
+    """Return the manifest of a folder; None without one (an older mdnum wrote none).
 
     Raises:
-        FolderError: it is damaged.
+        FolderError: the manifest is damaged.
     """
     path = root / NAME
     text = read_text(path)
@@ -262,7 +262,7 @@ def load(root: Path) -> Manifest | None:
 
 
 def save(root: Path, made: Manifest) -> None:
-    """Replaces the manifest of a folder."""
+    """Replace the manifest of a folder."""
     held = {**asdict(made), "files": dict(sorted(made.files.items()))}
     if made.layout is not None:
         held = {**held.pop("layout"), "tables": made.layout.spelled, **held}
@@ -278,7 +278,7 @@ def update(
     finished: bool | None = None,
     layout: Layout | None = None,
 ) -> None:
-    """Lists and forgets files, and changes what it says; nothing where the folder has no manifest."""
+    """Add files to a manifest, drop others, and change its state; do nothing without a manifest."""
     made = load(root)
     if made is None:
         return
@@ -293,14 +293,14 @@ def update(
 
 
 def place(path: Path) -> tuple[Path, str]:
-    """(folder, name in it) of a file."""
+    """Return (folder, name in the folder) of a file."""
     if path.parent.name in SUBFOLDERS and not (path.parent / NAME).exists():
         return path.parent.parent, f"{path.parent.name}/{path.name}"
     return path.parent, path.name
 
 
 def foretell(path: Path, new: str) -> None:
-    """Lets a file that the manifest lists have a new digest, beside the one it has."""
+    """Permit a new digest, in addition to the present one, for a file that the manifest lists."""
     root, name = place(path)
     if name == NAME or not (root / NAME).exists():
         return
@@ -317,14 +317,14 @@ def foretell(path: Path, new: str) -> None:
 
 
 def remove(path: Path) -> None:
-    """Removes a file of a folder, and from its manifest."""
+    """Remove a file from a folder, and from the folder's manifest."""
     root, name = place(path)
     update(root, {}, [name])
     path.unlink(missing_ok=True)
 
 
 def resumable(root: Path) -> bool:
-    """Whether the verb that made a folder would find something there to go on from."""
+    """Return True if a folder holds a state from which its verb can resume."""
     with suppress(FolderError, OSError):
         made = load(root)
         state = "" if made is None or made.layout is None else made.layout.resumes_from
@@ -333,7 +333,7 @@ def resumable(root: Path) -> bool:
 
 
 def listed_files(root: Path, names: Iterable[str]) -> dict[str, list[str]]:
-    """Digests of files as they are, those that are missing left out."""
+    """Return the digests of files as they are, without missing files."""
     return {name: [digest(root / name)] for name in names if os.path.lexists(root / name)}
 
 
@@ -347,16 +347,16 @@ _RUNS = Path("runs")
 
 
 def default_folder(system: str, runs: Path = _RUNS) -> Path:
-    """A new folder runs/NAME-N: the system's name in dashes, and the first N past those that exist.
+    """Create a new folder runs/NAME-N: the system's name in dashes, and the first N past existing numbers.
 
-    Making it takes the name: of processes that look at the same time no two get the same.
+    Creating the folder claims its name: processes that search at the same time get different folders.
 
     Args:
-        system: a system's name, or the path of its file.
+        system: name of a system, or the path of its file.
         runs: the folder of run folders.
 
     Raises:
-        FolderError: it cannot be made.
+        FolderError: the folder cannot be created.
     """
     path = Path(system)
     word = path.stem if path.suffix == ".toml" else system

@@ -1,4 +1,4 @@
-"""The run folder: what a rollout writes as it goes, what a report reads, what a killed run resumes from."""
+"""Run folder: files that a rollout writes, that reports read, and from which a killed run resumes."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ _EDITED = (SYSTEM_FILE, "log.txt")
 
 
 def system_tables(file: Path) -> dict[str, Any]:
-    """The tables of a system file in a run folder, or of the description of a simulation made of objects.
+    """Return the tables of a system file in a run folder, or of the description of a simulation of objects.
 
     Raises:
-        FolderError: it is no TOML, or no JSON.
+        FolderError: the file is not valid TOML or JSON.
     """
     return _parsed(file, manifest.read_text(file))
 
@@ -80,13 +80,12 @@ def _parsed(file: Path, text: str) -> Any:
 
 
 class RunFolder:
-    """One run on disk.
+    """Folder of one run on disk.
 
-    Rows, frames and log lines may be appended at any time; they count once a checkpoint has been
-    written after them. A run that is killed resumes from its last checkpoint: `resume()` drops
-    whatever came later and returns the state, so that the run continues as if it had never stopped.
-
-    Use `create` for a new run, `open` for one that is there (to read it, or to resume it).
+    Rows, frames and log lines may be appended at any time; they count once a checkpoint has been written
+    after them. A killed run resumes from its last checkpoint: `resume()` drops later data and returns the
+    state, so that the run continues as if it had never stopped. Use `create` for a new run, and `open` for an
+    existing one (to read it, or to resume it).
     """
 
     def __init__(self, path: Path, layout: Layout | None = None):
@@ -121,11 +120,11 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], layout: Layout) -> RunFolder:
-        """A new, empty run folder.
+        """Create a new, empty run folder.
 
         Args:
-            path: made if missing, parents included.
-            layout: what it is to hold.
+            path: path of the folder; created if missing, parents included.
+            layout: kind of the folder, with its tables.
 
         Raises:
             FolderError: the folder holds a run or other files, is a file, or cannot be written.
@@ -160,10 +159,10 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> RunFolder:
-        """A run folder that is there, finished or not, for reading (or `resume`).
+        """Open an existing run folder, finished or not, for reading (or `resume`).
 
         Raises:
-            FolderError: no such folder, or no run in it.
+            FolderError: the folder does not exist, or holds no run.
         """
         expect_path(path, "Give the folder of a run")
         folder = cls(Path(path))
@@ -178,10 +177,10 @@ class RunFolder:
 
     @property
     def layout(self) -> Layout:
-        """What the folder holds.
+        """Kind of the folder, with its tables.
 
         Raises:
-            FolderError: it has no manifest, or one of a version that did not write it down.
+            FolderError: the folder has no manifest, or its manifest is from a version that stored no layout.
         """
         if self._layout is None:
             seen = "is missing; it says what the tables of the folder are"
@@ -192,37 +191,37 @@ class RunFolder:
         return self._layout
 
     def read_as(self, layout: Layout) -> None:
-        """Reads what an earlier version wrote as if it had what its verb declares today."""
+        """Read a folder of an earlier version with the layout that its verb declares today."""
         self._layout = layout
 
     @property
     def kind(self) -> str:
-        """Its kind, as the verb that made it declares it."""
+        """Kind of the folder, as declared by the verb that made it."""
         return self.layout.kind
 
     # -- writing ---------------------------------------------------------------------------------
 
     def append(self, table: str, columns: Mapping[str, Any]) -> None:
-        """Adds rows to a table of its layout; cheap, kept in memory until a checkpoint.
+        """Append rows to a table of the layout; rows stay in memory until a checkpoint.
 
         Args:
-            columns: equally long arrays by column name, at least those that are declared.
+            columns: equally long arrays by column name, at least the declared ones.
 
         Raises:
-            ValueError: no such table is declared, or a column is missing, not expected or of another length.
+            ValueError: the table is not declared, or a column is missing, not expected or of another length.
         """
         self._stream(table).append(columns)
 
     def look_up(self, table: str, of: str, columns: Mapping[str, Any]) -> None:
-        """Adds columns that follow from one of indices (see `TableStream.look_up`)."""
+        """Add columns that follow from a column of indices (see `TableStream.look_up`)."""
         self._stream(table).look_up(of, columns)
 
     def append_frame(self, atoms: Atoms) -> None:
-        """Adds a frame to trajectory.traj, float64 bit for bit."""
+        """Append a frame to trajectory.traj, float64 bit for bit."""
         self._frames.append(atoms)
 
     def log(self, line: str) -> None:
-        """Adds a line to log.txt, readable at once by whoever watches the run."""
+        """Append a line to log.txt, which can be read while the run continues."""
         path = self.path / "log.txt"
         with disk_errors(path):
             if self._log is None:
@@ -232,11 +231,11 @@ class RunFolder:
         _LOGGER.debug("%s: %s", self.path.name, printable(line))
 
     def checkpoint_due(self) -> bool:
-        """Whether `checkpoint` would write now.
+        """Return True if `checkpoint` would write now.
 
-        The interval is 2 s at first and 1 % of the time the run has taken later on: a kill costs at
-        most that much, and a run of days has a thousand part files, not a hundred thousand. It is never less
-        than fifty times what the last one took.
+        The interval is 2 s at first, and later 1 % of the time that the run has taken: a kill costs at most
+        that much, and a run of days has a thousand part files, not a hundred thousand. The interval is never
+        less than fifty times the duration of the last checkpoint.
         """
         now = time.monotonic()
         due = now - self._written >= max(2.0, 0.01 * (now - self._began), 50 * self._cost)
@@ -244,15 +243,15 @@ class RunFolder:
         return due
 
     def checkpoint(self, state: Mapping[str, Any], force: bool = False) -> bool:
-        """Makes everything appended so far, and state, the point a killed run resumes from.
+        """Save the state and all data appended so far, as the point from which a killed run resumes.
 
         Args:
-            state: arrays (numpy, jax) and plain values (numbers, text, lists, dicts); all come back
-                bit for bit from `load_checkpoint`.
-            force: write even if the last checkpoint is recent (the first and the last of a run).
+            state: arrays (numpy, jax) and plain values (numbers, text, lists, dicts), which `load_checkpoint`
+                returns bit for bit.
+            force: True to write even if the last checkpoint is recent (the first and the last of a run).
 
         Returns:
-            whether it was written (see `checkpoint_due`); if not, `finalize` makes up for it.
+            True if the checkpoint was written (see `checkpoint_due`); if not, `finalize` makes up for it.
 
         Raises:
             FolderError: the disk is full; the checkpoint before this one remains valid.
@@ -265,9 +264,9 @@ class RunFolder:
         return True
 
     def checkpoint_beside(self, state: Callable[[], Mapping[str, Any]]) -> None:
-        """As a forced `checkpoint` of a state that a thread makes and writes beside what comes next.
+        """Write a forced `checkpoint` in a background thread, which also makes the state.
 
-        What goes wrong there is raised by the next checkpoint, or by `finalize`.
+        An error in the thread is raised by the next checkpoint, or by `finalize`.
         """
         self._settle()
         began = time.monotonic() if self._asked is None else self._asked
@@ -295,7 +294,7 @@ class RunFolder:
         self._writing = self._beside.submit(write)
 
     def finalize(self) -> None:
-        """Ends the writing: one parquet file a table, no part files; the folder can still be resumed."""
+        """Finish writing: one parquet file per table, no part files; the folder can still be resumed."""
         if self._pending is not None and self._pending[1] == self._rows():
             self.checkpoint(self._pending[0], force=True)
         for name in self.layout.always:
@@ -309,18 +308,18 @@ class RunFolder:
         self.close()
 
     def flush(self, *last: str) -> None:
-        """Writes what was appended, some tables after the others: a kill leaves no row of theirs too many."""
+        """Write all appended rows, tables in `last` after the others: a kill leaves no excess rows there."""
         for name in sorted(self._streams, key=last.count):
             self._streams[name].flush()
 
     def merge(self) -> None:
-        """Makes one file of each table that has rows; they can be read before the folder is finished."""
+        """Merge each table that has rows into one file, which can be read before the folder is finished."""
         self._settle()
         for stream in self._streams.values():
             stream.merge()
 
     def close(self) -> None:
-        """Closes files and gives up the lock; rows after the last checkpoint are dropped."""
+        """Close all files and release the lock; rows after the last checkpoint are dropped."""
         # also for one that began as the run was interrupted
         self._beside.shutdown()
         self._frames.close()
@@ -332,7 +331,7 @@ class RunFolder:
         self._log = self._lock = None
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Writes summary.json (NaN and infinity, which JSON does not have, become null)."""
+        """Write summary.json (NaN and infinity, which JSON does not have, become null)."""
         self._write_json("summary.json", summary)
         made = manifest.load(self.path) if self._owner else None
         if made is not None and made.finished:
@@ -340,7 +339,7 @@ class RunFolder:
             self._list_files()
 
     def write_provenance(self, provenance: Mapping[str, Any]) -> None:
-        """Writes provenance.json, when everything that a run starts from is in the folder."""
+        """Write provenance.json, once all files from which a run starts are in the folder."""
         self._write_json("provenance.json", provenance)
         if self._owner:
             names = {entry.name for entry in self.path.iterdir() if not entry.name.startswith(".")}
@@ -350,25 +349,25 @@ class RunFolder:
     # -- resuming --------------------------------------------------------------------------------
 
     def has_checkpoint(self) -> bool:
-        """Whether there is something to resume from."""
+        """Return True if the folder has a checkpoint from which to resume."""
         return (self.path / "checkpoint.npz").exists()
 
     def load_checkpoint(self) -> dict[str, Any]:
-        """The state given to the last `checkpoint` that was written.
+        """Return the state given to the last `checkpoint` that was written.
 
         Raises:
-            FolderError: there is none, or it cannot be read.
+            FolderError: there is no checkpoint, or it cannot be read.
         """
         return self._read_checkpoint()[0]
 
     def resume(self, layout: Layout | None = None) -> dict[str, Any]:
-        """Drops all rows, frames and log lines after the last checkpoint and returns its state.
+        """Drop all rows, frames and log lines after the last checkpoint, and return its state.
 
         Args:
-            layout: what it is to hold from now on, where its verb has further columns by now.
+            layout: the layout from now on, if the verb has added columns since the run began.
 
         Raises:
-            FolderError: no checkpoint, another process writes the folder, or files are missing.
+            FolderError: there is no checkpoint, another process writes the folder, or files are missing.
         """
         held = self.layout
         self._layout = layout or held
@@ -394,10 +393,10 @@ class RunFolder:
         return state
 
     def take(self, layout: Layout) -> None:
-        """Makes this the only process that writes a folder which is gone on with from answers.json.
+        """Make this process the only writer of a folder that is resumed from answers.json.
 
         Raises:
-            FolderError: another process writes the folder, or what it goes on from is not as it was written.
+            FolderError: another process writes the folder, or the files from which it resumes have changed.
         """
         self._layout = layout
         self._take_lock()
@@ -406,9 +405,9 @@ class RunFolder:
             self.check(name)
 
     def restart(self) -> None:
-        """Makes a folder that was taken an unfinished one, without its tables, which are written at its end.
+        """Mark a taken folder as unfinished, and remove its tables, which are written at its end.
 
-        Their part files go too, which a kill during `finalize` leaves behind.
+        Part files, which a kill during `finalize` leaves behind, are removed too.
         """
         with disk_errors(self.path):
             refuse_link(self.path / "log.txt", in_place=True)
@@ -424,16 +423,16 @@ class RunFolder:
     # -- reading ---------------------------------------------------------------------------------
 
     def table(self, name: str, columns: Sequence[str] | None = None, rows: int | None = None) -> pa.Table:
-        """A table as far as it is on disk; of a run that was killed, the rows its checkpoint counts.
+        """Return a table as it is on disk; for a killed run, the rows that its checkpoint counts.
 
         Args:
-            columns: only these.
-            rows: at most the first rows.
+            columns: names of the columns to read; None for all.
+            rows: largest number of rows to read, beginning with the first.
         """
         return self._reader(name).read(columns, min(self.rows(name), rows or sys.maxsize))
 
     def batches(self, name: str, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """The rows of `table` a part at a time, for a table that is larger than memory."""
+        """Yield the rows of `table` in batches, for a table that is larger than memory."""
         left = self.rows(name)
         for batch in self._reader(name).batches(columns):
             if left <= 0:
@@ -444,7 +443,7 @@ class RunFolder:
     def read(
         self, name: str, columns: Sequence[str] | None = None, rows: int | None = None
     ) -> dict[str, np.ndarray]:
-        """As `table`, a numpy array by column name, without the columns that this folder does not know."""
+        """Return a table as numpy arrays by column name, without columns unknown to this folder."""
         table = self.table(name, columns, rows)
         declared = {} if self._layout is None else self._layout.columns(name)
         gaps = {key: table[key].null_count for key in table.column_names if table[key].null_count}
@@ -455,7 +454,7 @@ class RunFolder:
         return {key: as_numpy(table[key]) for key in table.column_names if key not in unknown}
 
     def rows(self, name: str) -> int:
-        """Rows of a table that `table` gives."""
+        """Return the number of rows that `table` returns."""
         stream = self._reader(name)
         if stream.parts() and self.has_checkpoint():
             # series and flips of an unfinished run agree with one another only at a checkpoint
@@ -464,24 +463,24 @@ class RunFolder:
 
     @property
     def system_file(self) -> Path | None:
-        """What says what was run: the system file, or the description of objects; None without a system."""
+        """File that describes what was run: a system file, or a description of objects; None if missing."""
         return next((self.path / name for name in _SYSTEM if (self.path / name).exists()), None)
 
     @property
     def system(self) -> dict[str, Any]:
-        """The tables of the system that was run; empty if there is none.
+        """Tables of the system that was run; empty if there is none.
 
         Raises:
-            FolderError: its file is no TOML, or no JSON.
+            FolderError: the system file is not valid TOML or JSON.
         """
         file = self.system_file
         return {} if file is None else system_tables(file)
 
     @cached_property
     def about(self) -> dict[str, Any]:
-        """What the schemas of its tables say: version, kind, system, run (a digest) and units by quantity.
+        """Metadata of the tables: version, kind, system, run (a digest) and units by quantity.
 
-        Nothing in it depends on when it is asked, so that a run has the same bytes however it was cut.
+        The metadata do not depend on time, so that a run has the same bytes however it was interrupted.
         """
         made, system = self._read_json("provenance.json"), self.system
         named = system.get("units") or system.get("world")
@@ -503,21 +502,21 @@ class RunFolder:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """summary.json; empty if the run has not come that far."""
+        """Contents of summary.json; empty if the run has not yet written it."""
         return self._read_json("summary.json")
 
     @property
     def again(self) -> str:
-        """What can be done about a folder that was not finished, an imperative sentence."""
+        """Remedy for an unfinished folder, as an imperative sentence."""
         return _again(self.path)
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """provenance.json; empty if it was not written."""
+        """Contents of provenance.json; empty if it was not written."""
         return self._read_json("provenance.json")
 
     def damaged(self) -> dict[str, str]:
-        """Files that are not as they were written: what is wrong with them, by name.
+        """Return the files that differ from what was written, with the problem of each, by name.
 
         Raises:
             FolderError: the manifest itself is damaged.
@@ -525,10 +524,10 @@ class RunFolder:
         return {name: wrong for name in self._listed() if (wrong := self._wrong(name))}
 
     def check(self, name: str) -> None:
-        """Compares a file with the manifest; one that is not listed is not compared.
+        """Compare a file with the manifest; a file that the manifest does not list is not compared.
 
         Raises:
-            FolderError: it changed since it was written, or is gone.
+            FolderError: the file changed since it was written, or is missing.
         """
         if wrong := self._wrong(name):
             others = self.damaged()
@@ -540,12 +539,13 @@ class RunFolder:
 
     @contextmanager
     def explained(self) -> Iterator[None]:
-        """Whatever goes wrong in here because the folder is not what was written is reported in one line.
+        """Report an exception that is due to wrong contents of the folder in one line.
 
         Raises:
-            FolderError: the folder is damaged, or unfinished, or has no manifest; or its digests are those of
-                files that mdnum would not write, for which the place in its code is named. What goes wrong
-                with a whole folder that this object wrote is a mistake of mdnum and remains what it is.
+            FolderError: the folder is damaged or unfinished, or has no manifest; or its digests match, but
+                mdnum would not write such files, and the message names the place in mdnum's code. An
+                exception with an intact folder that this object wrote is a bug in mdnum, and is raised
+                unchanged.
         """
         try:
             yield
@@ -567,10 +567,10 @@ class RunFolder:
             raise FolderError(message, remedy=_RESTORE, where=str(self.path)) from error
 
     def check_start(self) -> None:
-        """Compares what a run begins with, its system and what belongs to it, with the manifest.
+        """Compare the input of a run (its system and the files that belong to it) with the manifest.
 
         Raises:
-            FolderError: it was changed, so that a run of it would be another one.
+            FolderError: the input was changed, so that a new run would differ from the recorded one.
         """
         for name in self._listed():
             written = name in _FILES or name.endswith(".parquet")
@@ -579,7 +579,7 @@ class RunFolder:
                 self.check(name)
 
     def noted(self) -> list[str]:
-        """A line for each file that is not as it was written, and for a folder in which that is unknown."""
+        """Return one line for each file that has changed, and for a folder that cannot be checked."""
         if not (self.path / manifest.NAME).exists():
             return [
                 f"{self.path}: has no {manifest.NAME}, so that nothing in it could be checked for damage."
@@ -589,7 +589,7 @@ class RunFolder:
     # -- inside ----------------------------------------------------------------------------------
 
     def _usable(self) -> list[str]:
-        """Names in a folder in which a run may begin; none where it is not there."""
+        """Return the names in a folder in which a run may begin; none if the folder does not exist."""
         there = self.path.iterdir() if self.path.is_dir() else ()
         present = sorted(entry.name for entry in there if entry.name != _LOCK)
         if present and not _came_to_nothing(self.path, present):
@@ -613,7 +613,7 @@ class RunFolder:
         return TableStream(self.path, name, self._layout, lambda path: self.check(manifest.place(path)[1]))
 
     def _sweep(self, *patterns: str) -> None:
-        """Removes what a kill left of files that were being replaced, and files of these patterns."""
+        """Remove temporary files that a kill left behind, and files that match the patterns."""
         for pattern in (*patterns, ".*.part", *(f"{name}/.*.part" for name in SUBFOLDERS)):
             for file in self.path.glob(pattern):
                 if not (file.parent.is_symlink() and file.parent != self.path):
@@ -633,7 +633,7 @@ class RunFolder:
         return self._manifest[1]
 
     def _wrong(self, name: str) -> str:
-        """What is wrong with a file that the manifest lists; nothing where it does not."""
+        """Return the problem of a file that the manifest lists; empty if it is intact or not listed."""
         allowed = self._listed().get(name)
         if allowed is None:
             return ""
@@ -655,7 +655,7 @@ class RunFolder:
         return self._checked[name][1]
 
     def _list_files(self, finished: bool | None = None) -> None:
-        """Lists the files of this folder that nobody else lists, and again those that grew."""
+        """List this folder's unlisted files in the manifest, and update the entries of files that grew."""
         listed = self._listed()
         there = [f"structures/{entry.name}" for entry in (self.path / "structures").glob("*.extxyz")]
         there += [entry.name for entry in self.path.iterdir() if entry.name not in self._foreign]
@@ -672,7 +672,7 @@ class RunFolder:
         return {name: stream.rows for name, stream in self._streams.items()}
 
     def _settle(self) -> None:
-        """Waits for the checkpoint that is being written, and raises what has kept it from that."""
+        """Wait for the checkpoint that is being written, and raise the error that prevented it, if any."""
         if self._writing is not None:
             written, self._writing = self._writing, None
             written.result()
@@ -732,10 +732,10 @@ class RunFolder:
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """What goes wrong in here because a file holds what mdnum would not write there is reported in one line.
+    """Report exceptions due to contents that mdnum would not write into a file, in one line.
 
     Raises:
-        FolderError: it does.
+        FolderError: the file has such contents.
     """
     try:
         yield
@@ -749,17 +749,17 @@ def restoring(path: Path) -> Iterator[None]:
 
 
 def expect(right: object, seen: str) -> None:
-    """Refuses what is restored where it is not right; inside of `restoring`.
+    """Reject a restored value unless a condition is true; for use inside `restoring`.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the condition is false.
     """
     if not right:
         raise ValueError(seen)
 
 
 def _came_to_nothing(path: Path, present: Sequence[str]) -> bool:
-    """Whether a folder holds what a start left behind that was stopped before anything was computed."""
+    """Return True if a folder holds only the remains of a run that stopped before it computed anything."""
     made = manifest.load(path)
     if made is None or made.finished or (path / "parts").is_symlink():
         return False
@@ -771,7 +771,7 @@ def _came_to_nothing(path: Path, present: Sequence[str]) -> bool:
 
 
 def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
-    """Raises what there is to say of a folder that is not empty."""
+    """Raise the error for a folder that is not empty, with its remedy."""
     if not any(name in (*_FILES, "parts", manifest.NAME) for name in present):
         seen = f"is not empty (it holds {present[0]!r})"
         raise FolderError(seen, remedy="Choose an empty or a new folder", where=str(path))
@@ -785,7 +785,7 @@ def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
 
 
 def _again(path: Path) -> str:
-    """What can be done about a folder that was not finished."""
+    """Return the remedy for an unfinished folder."""
     made = manifest.load(path)
     if made is None or made.layout is None:
         return "Run again in a new folder"

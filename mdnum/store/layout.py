@@ -1,4 +1,4 @@
-"""What a folder holds, as whoever makes it declares it, and as the folder's manifest keeps it."""
+"""Layout of a folder, as declared by the verb that makes the folder, and as stored in its manifest."""
 
 from __future__ import annotations
 
@@ -25,22 +25,23 @@ _MOST_TABLES, _MOST_COLUMNS = 100, 1000
 
 @dataclass(frozen=True)
 class Layout:
-    """The kind of a folder: what makes it, what it is resumed from, and the columns of its tables.
+    """Kind of a folder: the command that makes it, the file from which it resumes, and its tables.
 
     Args:
-        kind: its name.
-        command: that makes such folders, without `mdnum`.
-        tables: names of columns by table, with spaces between. `name:type` is a column of a type of `TYPES`,
-            float64 without one. `name?` may be unknown to who writes the table, and is null then. A folder
-            has every table, with rows or without, but for those whose own name ends in a question mark.
-        usual: values of columns where rows leave them out, by table.
-        resumes_from: the file that its command is resumed from; empty where it cannot be resumed.
-        further: files beside tables that are read or shown, as patterns with spaces between.
+        kind: name of the kind.
+        command: command that makes such folders, without `mdnum`.
+        tables: names of columns by table, separated by spaces. `name:type` is a column of a type of `TYPES`,
+            float64 by default. `name?` is a column that may be unknown when the table is written, and is then
+            null. A folder has every table, with rows or without, except those whose own name ends in a
+            question mark.
+        usual: values of columns that rows leave out, by table.
+        resumes_from: the file from which the command resumes; empty if it cannot be resumed.
+        further: files other than tables that are read or shown, as patterns separated by spaces.
         described: [unit, description] of columns, by table, or the name of a column of store/columns.toml
-            with the same meaning; None where that file describes all of them.
+            with the same meaning; None if that file describes all of them.
 
     Raises:
-        ValueError: a name, type or value is none that a folder could have.
+        ValueError: a name, type or value is not valid for a folder.
     """
 
     kind: str
@@ -80,12 +81,12 @@ class Layout:
         return tuple(name for name in self.tables if not name.endswith("?"))
 
     def keeps(self, name: str) -> bool:
-        """Whether a file beside the tables is one of the kind, so that it is compared with its digest."""
+        """Return True if a file other than a table belongs to the kind, so that its digest is checked."""
         fixed = ("summary.json", self.resumes_from)
         return name in fixed or any(fnmatchcase(name, pattern) for pattern in self.further.split())
 
     def columns(self, table: str) -> Mapping[str, tuple[str, bool]]:
-        """The type of each column of a table, and whether it may be unknown; empty for one not declared."""
+        """Return (type, whether it may be unknown) of each column of a table; empty if undeclared."""
         return self._columns.get(table, {})
 
     @cached_property
@@ -103,7 +104,7 @@ class Layout:
 
     @property
     def spelled(self) -> dict[str, str]:
-        """`tables` with the type of every column, as the manifest keeps them."""
+        """Declared tables with the type of every column, as the manifest stores them."""
         spelled = {}
         for table in self.tables:
             columns = self.columns(table.rstrip("?")).items()

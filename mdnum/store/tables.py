@@ -1,6 +1,6 @@
-"""A table that grows by part files named after their first row, and is merged into one file at the end.
+"""Tables that grow by part files named after their first row, and are merged into one file at the end.
 
-That of a folder which nobody resumes needs no parts: a thread writes its file as rows come.
+A table of a folder that is never resumed needs no parts: a thread writes its file as rows arrive.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ _DISTINCT = frozenset({"i", "j", "distance", "before", "margin", "margin_before"
 class TableStream:
     """Rows 0, 1, 2, ... of one table, spread over `<name>.parquet` and `parts/<name>-<first row>.parquet`.
 
-    Which rows a file holds follows from its name, so no step of writing, merging or truncating
-    leaves a folder whose rows cannot be told apart, wherever it was killed.
+    The name of a file determines which rows it holds, so that a kill at any step of writing, merging or
+    truncating leaves a folder whose rows can be identified.
     """
 
     def __init__(
@@ -82,17 +82,17 @@ class TableStream:
 
     @property
     def rows(self) -> int:
-        """Rows appended so far, those still in memory included."""
+        """Number of rows appended so far, including those still in memory."""
         return self.flushed + self._buffered
 
     def parts(self) -> list[tuple[int, Path]]:
-        """(first row, path) of the part files, in order."""
+        """Return (first row, path) of the part files, in order."""
         found = self.parts_folder.glob(f"{self.name}-*.parquet")
         named = re.compile(re.escape(self.name) + r"-(\d{12,})\.parquet")
         return sorted((int(match[1]), path) for path in found if (match := named.fullmatch(path.name)))
 
     def files(self) -> list[tuple[Path, int]]:
-        """(path, rows) of the files that make up the table, gap-free; parts already merged are skipped."""
+        """Return (path, rows) of the files that form the table, without gaps or parts already merged."""
         files: list[tuple[Path, int]] = []
         rows = 0
         if self.merged_path.exists():
@@ -113,11 +113,11 @@ class TableStream:
         return files
 
     def append(self, columns: Mapping[str, Any]) -> None:
-        """Adds rows, in memory until the next flush.
+        """Append rows, which stay in memory until the next flush.
 
         Args:
-            columns: equally long arrays by column name, or a word for all rows; at least the table's own,
-                but for those that may be unknown.
+            columns: equally long arrays by column name, or a text for all rows; at least the table's own
+                columns, except those that may be unknown.
         """
         schema = self._schema
         if schema is None:
@@ -148,11 +148,11 @@ class TableStream:
             self.flush()
 
     def look_up(self, of: str, columns: Mapping[str, Any]) -> None:
-        """Adds columns that follow from one of indices, before the first row; made when the table is written.
+        """Add columns, before the first row, that follow from a column of indices when the table is written.
 
         Args:
-            of: the column of indices.
-            columns: what belongs to each index, by name: texts or integers.
+            of: name of the column of indices.
+            columns: texts or integers for each index, by column name.
         """
         for name, values in columns.items():
             kind = _WORD if isinstance(values[0], str) else pa.int64()
@@ -161,7 +161,7 @@ class TableStream:
             self._usual[name] = lambda table, found=found: found.take(table[of])
 
     def flush(self) -> None:
-        """Writes what is in memory as one part file, or hands it to the thread that writes the table."""
+        """Write the rows in memory as one part file, or pass them to the thread that writes the table."""
         if not self._buffered:
             return
         held, schema = together(self._buffer), cast(pa.Schema, self._schema)
@@ -182,7 +182,7 @@ class TableStream:
         self._buffer, self._buffered = [], 0
 
     def truncate(self, rows: int) -> None:
-        """Keeps the first rows of the table, in memory and on disk."""
+        """Keep only the first rows of the table, in memory and on disk."""
         self._buffer, self._buffered = [], 0
         files = self.files()
         have = sum(count for _, count in files)
@@ -210,7 +210,7 @@ class TableStream:
         self.flushed = rows
 
     def merge(self) -> None:
-        """Writes all rows into one file and removes the parts; a table without a row gets an empty file."""
+        """Write all rows into one file and remove the parts; a table without rows gets an empty file."""
         self.flush()
         if self._writing is not None:
             self._writing.end()
@@ -230,13 +230,13 @@ class TableStream:
                 path.unlink()
 
     def close(self) -> None:
-        """Discards the file of a table that is still being written."""
+        """Discard the unfinished file of a table."""
         if self._writing is not None:
             self._writing.end(whole=False)
             self._writing = None
 
     def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """The rows on disk in order, a file or row group at a time."""
+        """Return an iterator over the rows on disk, a file or row group at a time."""
         return (self._whole(table, columns) for table in self._on_disk(columns))
 
     def _on_disk(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
@@ -247,11 +247,11 @@ class TableStream:
                     yield file.read_row_group(group, columns=columns)
 
     def read(self, columns: Sequence[str] | None = None, rows: int | None = None) -> pa.Table:
-        """The rows on disk as one table.
+        """Return the rows on disk as one table.
 
         Args:
-            columns: only these.
-            rows: only the first rows.
+            columns: names of the columns to read; None for all.
+            rows: number of rows to read, beginning with the first; None for all.
         """
         tables: list[pa.Table] = []
         have = 0
@@ -275,7 +275,7 @@ class TableStream:
         self._replace(self.merged_path, groups, self._describe(cast(pa.Schema, self._schema)))
 
     def _whole(self, table: pa.Table, columns: Sequence[str] | None = None) -> pa.Table:
-        """Rows with the columns that they leave out, in order; all columns where none are named."""
+        """Return rows with the columns that they leave out, in order; all columns if none are named."""
         there = table.column_names
         known = [name for name in self._known if name in there or name in self._usual]
         names = columns or [*known, *(name for name in there if name not in self._known)]
@@ -294,9 +294,9 @@ class TableStream:
             return file.metadata.num_rows
 
     def _replace(self, path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
-        """Writes rows into a file of this table, which the manifest expects before it is there.
+        """Write rows into a file of this table, whose new digest is listed in the manifest before it exists.
 
-        Every page carries a checksum, which whoever reads the file can ask for.
+        Every page carries a checksum, which readers of the file can verify.
         """
         # a part is read once more and removed: packing it takes longer than all the rest
         packed = "zstd" if path == self.merged_path else "none"
@@ -319,7 +319,7 @@ class TableStream:
         self.written[name] = [found]
 
     def _refuse_columns(self, path: Path, schema: pa.Schema, wanted: Sequence[str] | None) -> None:
-        """Refuses columns of another type than this table's, and a file without those that are wanted."""
+        """Reject columns of another type than in this table, and a file without the requested columns."""
         found = {field.name: field.type for field in schema}
         other = [name for name, kind in self._known.items() if found.get(name, kind) != kind]
         missing = [name for name in wanted or () if name not in found and name not in self._usual]
@@ -333,7 +333,7 @@ class TableStream:
 
 
 class _Writing:
-    """A file that a thread writes of the tables it is given, most of the time outside of Python's lock."""
+    """File that a thread writes from the tables it receives, mostly outside of Python's global lock."""
 
     def __init__(self, write: Callable[[Iterator[pa.Table]], None]):
         # with a limit: where the disk is slower than what makes the rows, that waits
@@ -350,7 +350,7 @@ class _Writing:
             raise RuntimeError("rows are missing")
 
     def put(self, table: pa.Table | None) -> None:
-        """Waits until there is room; raises what has ended the writing."""
+        """Add a table, waiting for space in the queue; raise the error that has ended the writing, if any."""
         while not self._done.ready():
             with suppress(Full):
                 self._tables.put(table, timeout=1.0)
@@ -358,7 +358,7 @@ class _Writing:
         self._done.get()
 
     def end(self, whole: bool = True) -> None:
-        """Waits until all is written; a file that is not whole is removed, and nothing raised."""
+        """Wait until all tables are written; with whole=False, discard the file and ignore errors."""
         self._whole = whole
         with nullcontext() if whole else suppress(Exception):
             self.put(None)
@@ -367,24 +367,24 @@ class _Writing:
 
 
 def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The rows of tables of the same columns; a word is that of all rows."""
+    """Concatenate the rows of tables with the same columns; a text stands for all rows."""
     columns = {name: [part[name] for part in parts] for name in parts[0]}
     return {name: one[0] if isinstance(one[0], str) else np.concatenate(one) for name, one in columns.items()}
 
 
 def _repeats(values: Any, value: Any) -> bool:
-    """Whether a column is this value in all rows, by how it is given: a word, or a broadcast array."""
+    """Return True if a column is known to have this value in all rows: a text, or a broadcast array."""
     if isinstance(values, np.ndarray) and values.strides == (0,):
         values = values[0]
     return value is not None and np.ndim(values) == 0 and bool(values == value)
 
 
 def as_arrow(values: Any, kind: pa.DataType, rows: int = 0) -> pa.Array:
-    """A column of values of a kind, by its buffers: `pa.array` imports pandas, which takes half a second.
+    """Build a column of a type from its buffers, since `pa.array` imports pandas, which takes half a second.
 
     Args:
-        values: one for each row; one for all of them; or None for a column that is not known.
-        rows: needed where there is not one value for each.
+        values: one value per row; one value for all rows; or None for a column that is not known.
+        rows: number of rows; required unless there is one value per row.
     """
     if values is None:
         return pa.nulls(rows, kind)
@@ -406,7 +406,7 @@ def as_arrow(values: Any, kind: pa.DataType, rows: int = 0) -> pa.Array:
 
 
 def as_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
-    """A column without gaps as numpy, by its buffers: `to_numpy` imports pandas."""
+    """Return a column without gaps as a numpy array, from its buffers, since `to_numpy` imports pandas."""
     parts = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
     if pa.types.is_string(column.type):
         return np.array([text for part in parts for text in part.to_pylist()], object)
@@ -427,7 +427,7 @@ def as_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
 
 @contextmanager
 def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
-    """A parquet file whose pages are compared with their checksums as they are read."""
+    """Open a parquet file whose pages are verified by their checksums as they are read."""
     try:
         with opened(path) as raw, pq.ParquetFile(raw, page_checksum_verification=True) as file:
             head, size = file.metadata, os.fstat(raw.fileno()).st_size

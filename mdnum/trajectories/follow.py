@@ -321,9 +321,7 @@ class SetDifference:
 
 
 def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[np.ndarray, "pairs"]:
-    """Return the distances of pairs in a frame through the image of the given rank, length; inf without
-    one.
-    """
+    """Return the distances of pairs in a frame, through the image of the given rank, length; inf if none."""
     i, j, rank = np.array(pairs, np.int64).reshape(-1, 3).T
     at = Placed(np.ascontiguousarray(frame.positions), lattice_of(frame.box), 0.0)
     return image_distances(at, np.minimum(i, j), np.maximum(i, j), rank, directed)

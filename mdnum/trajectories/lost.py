@@ -74,8 +74,8 @@ class FrameMotion:
         *,
         timed: bool = True,
     ) -> FrameMotion | None:
-        """Measure the motion of the atoms in pairs over consecutive frames; None for few frames or no
-        motion.
+        """Measure the motion of the atoms in pairs over successive frames; None if frames or motion are
+        few.
         """
         sides = [slice(None) if one is None else one for one in (first, first if second is None else second)]
         atoms, grid = min(len(sample[0].positions[side]) for side in sides), resolution.usual_step(sample[0])

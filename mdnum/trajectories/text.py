@@ -190,9 +190,7 @@ def _is_cut(word: str, others: Sequence[str]) -> bool:
 
 
 def _digits(word: str) -> tuple[int, int, int] | None:
-    """Return (decimals, significant digits, digits of the exponent or -1); None if the word is not a
-    number.
-    """
+    """Return (decimals, significant digits, digits of the exponent or -1); None for text without a number."""
     match = _NUMBER.fullmatch(word)
     if match is None:
         return None

@@ -1,5 +1,4 @@
-"""Decisions on all near pairs at each frame, sixteen at once; only decisions that changed are processed
-further.
+"""Decisions on all near pairs of each frame, sixteen at once; only changed decisions are processed further.
 
 Atoms are sorted into clusters of sixteen by halving space. Two clusters and the lattice vector between them
 form a tile: a row of sixteen decisions, as bits, for each atom of the first cluster. At each frame, the rows
@@ -85,9 +84,7 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Follow the atoms to a frame; return True if all pairs within `clear` of their radius are in
-        tiles.
-        """
+        """Follow atoms to a frame; return True if all pairs within `clear` of their radius are in tiles."""
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
@@ -167,9 +164,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if a pair that approached by `moved` is inside by one image only, the same in both
-    frames.
-    """
+    """Return True if a pair that approaches by `moved` is inside by one and the same image in both frames."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
@@ -319,8 +314,7 @@ def _halved(x, order):
 
 @njit
 def _nodes(boxes, runs):
-    """Return the boxes around the clusters of each run, around its halves, and so on; halves follow their
-    whole.
+    """Return boxes around the clusters of each run, around its halves, and so on; halves follow their whole.
 
     The first half of a node begins one node further; the second half begins further by twice the number of
     clusters in the first half.
@@ -506,9 +500,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
 
 @njit(inline="never")
 def _settled(inside, doubtful, i, slot, code, numbers, limits):
-    """Decide the doubtful pairs of a row; return (bits inside, number within the bound, smallest
-    |margin|).
-    """
+    """Decide the doubtful pairs of a row; return (bits inside, number within bound, smallest |margin|)."""
     close, smallest, vectors, order = 0, np.inf, numbers.vectors, numbers.order
     n0, n1, n2 = np.intp(code // 9) - 1, np.intp(code // 3 % 3) - 1, np.intp(code % 3) - 1
     while doubtful != np.uintp(0):

@@ -191,8 +191,7 @@ class Topology:
 
 
 def topology_universe(topology: str | Path) -> Any:
-    """Return a Universe of a topology, without coordinates, whose readers may write files next to the
-    topology.
+    """Return a Universe of a topology, without coordinates, whose readers may write files next to it.
 
     Raises:
         InputError: MDAnalysis cannot read the file.
@@ -281,8 +280,7 @@ class Boxes:
 
 
 def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
-    """Return the box with these lengths, Å, and angles, degrees: a along x, b in the xy plane, as in
-    MDAnalysis.
+    """Return the box with these lengths, Å, and angles, degrees: a along x, b in xy, as in MDAnalysis.
 
     None stands for no box; an axis of length 0 with right angles does not repeat.
 

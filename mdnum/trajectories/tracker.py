@@ -164,8 +164,7 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return thresholds of a directed rule at the last frame, by atom, length; nan for atoms other than
-        centers.
+        """Return thresholds of a directed rule at the last frame, by atom, length; nan if not a center.
 
         Returns:
             (distance below which a neighbor stays one, distance below which another atom would become one).

@@ -170,9 +170,7 @@ class Trajectory(ABC):
 
     @abstractmethod
     def raw_frames(self) -> AbstractContextManager[Callable[[int], Any]]:
-        """Open the file; provide a function that returns raw frames by ascending number, and None at the
-        end.
-        """
+        """Open the file; provide a function that returns raw frames by ascending number, then None."""
 
     @abstractmethod
     def decoded(self, number: int, raw: Any) -> Frame:
