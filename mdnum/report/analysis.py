@@ -70,7 +70,7 @@ class Scan:
     threshold, and the margin of every flip.
 
     Args:
-        steps: rows of the run's series; a flip is at one of the steps 0 to steps - 1.
+        steps: number of steps in the run's series; flips are at the steps 0 to steps - 1.
         nearest: number of rows nearest to their threshold that are kept.
     """
 
@@ -202,7 +202,8 @@ def scan(flips: Flips, steps: int | None = None, nearest: int = 0) -> Scan:
 
 
 def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
-    """Return the ratio of |margin| to the rounding bound of each flip; at most 1 is ambiguous.
+    """Return the ratio of |margin| to the rounding bound of each flip; a flip is ambiguous up to a ratio of
+    1.
 
     If the bound is zero (an exact comparison), the ratio of any nonzero margin is infinite.
     """
@@ -288,7 +289,7 @@ def range_table(label: Callable[[str], str], *tables: Mapping[str, np.ndarray]) 
 
     Args:
         label: function that returns the label of a quantity from its name.
-        tables: `step`, and the extremes of quantities at each step (`ranges.columns`).
+        tables: columns `step`, and the extremes of quantities at each step (`ranges.columns`).
     """
     rows, forms = [], ("float32", "bfloat16", "float16")
     held = ((table, key) for table in tables for key in table if "largest_" in key and np.any(table[key]))

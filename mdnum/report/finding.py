@@ -37,7 +37,7 @@ If a list has several texts, the first one whose fields all have a value is used
 out. The format of a field determines its form: `{x}` a number or text as people read it, `{x:3}` with 3
 significant digits, `{x:+3}` with its sign, `{x:g}` without trailing zeros, `{x:%}` a percentage, `{n:# pair}`
 "2 pairs" (`{n:# life lives}` with an irregular plural, `{n:# pair_step}` with a space), `{n:? was were}` the
-first word for 1 and the second for others. A `Measured` is written with its unit (`{x:3m}`: in thousandths of
+first word for 1 and the second otherwise. A `Measured` is written with its unit (`{x:3m}`: in thousandths of
 it, meV), `{x:=}` with the digits that its floor leaves, `{x.floor:1}` without a unit; if a verb has a unit
 system, `{units.energy}` is the name of a unit.
 """
@@ -181,9 +181,7 @@ class Texts:
         return [(name, text) for name, text in rows if name is not None and text is not None]
 
     def keys(self, table: str = "keys", /, **values: Any) -> list[Key]:
-        """Return the key numbers of a page from a table of values and notes, without numbers that are
-        None.
-        """
+        """Return the key numbers of a page from a table of values and notes, without those that are None."""
         keys = []
         for label, texts in self.entries[table].items():
             for value, note in [texts] if isinstance(texts[0], str) else texts:
@@ -261,7 +259,9 @@ class Verdict:
         return " ".join((self.headline, *self.evidence))
 
     def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a folder's summary with headline, findings and verdict; an empty one means unfinished."""
+        """Return a summary with headline, findings and verdict; an empty summary means an unfinished
+        folder.
+        """
         usual = {"status": "complete" if summary else "unfinished", "seconds": None}
         found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
         return headed(kind, {**usual, **summary, **found})

@@ -111,7 +111,7 @@ def subfolder(root: Path, name: str) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a new file with an unpredictable name, and move it to path at the end: a kill leaves old or new.
+    """Open a temporary file that is moved to path at the end, so that a kill leaves the old or new file.
 
     A link at path is replaced; the file to which the link led is unchanged.
     """

@@ -217,7 +217,7 @@ class RunFolder:
         self._stream(table).look_up(of, columns)
 
     def append_frame(self, atoms: Atoms) -> None:
-        """Append a frame to trajectory.traj, float64 bit for bit."""
+        """Append a frame to trajectory.traj; its float64 values are exact to the last bit."""
         self._frames.append(atoms)
 
     def log(self, line: str) -> None:
@@ -539,7 +539,7 @@ class RunFolder:
 
     @contextmanager
     def explained(self) -> Iterator[None]:
-        """Report an exception that is due to wrong contents of the folder in one line.
+        """Convert exceptions caused by invalid contents of the folder into one-line errors.
 
         Raises:
             FolderError: the folder is damaged or unfinished, or has no manifest; or its digests match, but
@@ -732,7 +732,7 @@ class RunFolder:
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """Report exceptions due to contents that mdnum would not write into a file, in one line.
+    """Convert exceptions caused by contents that mdnum would not write into a file into one-line errors.
 
     Raises:
         FolderError: the file has such contents.

@@ -30,7 +30,7 @@ class Layout:
     Args:
         kind: name of the kind.
         command: command that makes such folders, without `mdnum`.
-        tables: names of columns by table, separated by spaces. `name:type` is a column of a type of `TYPES`,
+        tables: names of columns by table, separated by spaces. `name:type` is a column with a type of `TYPES`,
             float64 by default. `name?` is a column that may be unknown when the table is written, and is then
             null. A folder has every table, with rows or without, except those whose own name ends in a
             question mark.

@@ -148,7 +148,7 @@ class TableStream:
             self.flush()
 
     def look_up(self, of: str, columns: Mapping[str, Any]) -> None:
-        """Add columns, before the first row, that follow from a column of indices when the table is written.
+        """Declare columns, before the first row, that are looked up from a column of indices on writing.
 
         Args:
             of: name of the column of indices.
@@ -275,7 +275,7 @@ class TableStream:
         self._replace(self.merged_path, groups, self._describe(cast(pa.Schema, self._schema)))
 
     def _whole(self, table: pa.Table, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return rows with the columns that they leave out, in order; all columns if none are named."""
+        """Return rows completed by the columns that they omit, in order; all columns if none are named."""
         there = table.column_names
         known = [name for name in self._known if name in there or name in self._usual]
         names = columns or [*known, *(name for name in there if name not in self._known)]

@@ -127,8 +127,8 @@ class NeighborFlips(AnalysisBase):
 
     Raises:
         InputError: a group is empty or changing, the groups belong to two universes, there is no valid rule,
-            no atom has a requested species, there are no residues, or the bound is negative. Raised by `run`
-            without a bound: transformations change distances, or were applied in memory.
+            no atom has a requested species, there are no residues, or the bound is negative. Without a
+            bound, `run` also raises it if transformations change distances or were applied in memory.
 
     Error: MDAnalysis provides coordinates in float32; all later operations use float64.
     """
@@ -328,7 +328,7 @@ class NeighborFlips(AnalysisBase):
         return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
 
     def _bound_of(self, frame: Frame) -> float:
-        """Return the error bound of a distance in the frame that was read last, length."""
+        """Return the error bound of a distance in the frame read last, in length units."""
         if self._resolution is None:
             return 0.0
         atoms, raw = self._check.atoms, self.library.raw
@@ -380,7 +380,7 @@ class NeighborFlips(AnalysisBase):
 
 
 def _changed(before: Frame, after: Frame) -> float:
-    """Return the largest change of a distance between successive atoms due to transformations, length.
+    """Return the largest change (length) of a distance between successive atoms due to transformations.
 
     Shifts of atoms by lattice vectors and rotations of the system do not count as changes.
     """

@@ -177,7 +177,7 @@ class ArrayFrames(Trajectory):
         return self._waiting[0]
 
     def sample(self) -> list[Frame]:
-        """Return the first frames, as far as they are available yet."""
+        """Return the first frames that are available so far."""
         return list(self._first)
 
     @contextmanager

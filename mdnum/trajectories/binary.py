@@ -49,7 +49,7 @@ _TEN = np.float32(10)
 
 
 def opened(trajectory: Any) -> XdrFile | None:
-    """Open the file of an MDAnalysis trajectory with a checking reader; None if it is neither xtc nor trr."""
+    """Open the file of an MDAnalysis trajectory with a reader that checks frames; None for other formats."""
     path, kind = file_of(trajectory), {"XTC": XtcFile, "TRR": TrrFile}.get(str(trajectory.format))
     return None if kind is None or path is None else kind(path)
 
@@ -102,7 +102,7 @@ class XdrFile:
         self.start(number + 1)
 
     def _stream(self, number: int, look: bool = False) -> None:
-        """Move the file position to the end of a frame; with look, verify the coordinates on the way."""
+        """Move the file position to the end of a frame; with `look`, verify the coordinates on the way."""
         raise NotImplementedError
 
     def _read(self, count: int) -> bytes:
@@ -236,7 +236,7 @@ class TrrFile(XdrFile):
         return 8 * self.head(0)[1]
 
     def head(self, number: int) -> tuple[int, int, list[int]]:
-        """Return (atoms, bytes per number, bytes of the ten blocks) of a frame; stop at its time."""
+        """Read a frame header: (atoms, bytes per number, bytes of the ten blocks); stop at the time field."""
         self._file.seek(self.start(number))
         magic, _, _, word, *numbers = _TRR.unpack(self._read(_TRR.size))
         sizes, atoms, box = numbers[:10], numbers[10], numbers[_BOX]

@@ -1,4 +1,4 @@
-"""Detection of impossible motions of all atoms together, left by damage whose numbers are still finite.
+"""Detection of impossible motions of all atoms together, caused by damage that leaves finite numbers.
 
 An overflowed counter sets one coordinate of every atom to a single value, and a misread offset shifts all
 atoms. Planar and linear systems, drift, and wrapping are not reported.
@@ -40,8 +40,8 @@ class Collective:
         Args:
             x: positions of a sample of the atoms, which represents all atoms.
             atoms: number of all atoms.
-            side: the shortest lattice vector, length; 0 without a periodic direction.
-            far: the displacement between two frames that counts as far in this box, length; 0 without a box.
+            side: length of the shortest lattice vector; 0 without a periodic direction.
+            far: the length of a displacement that is far between two frames in this box; 0 without a box.
         """
         now, least, last, alike = spreads(x), self.least, self.last, self.alike
         share, axis, value = _most_alike(x)
@@ -69,7 +69,9 @@ class Collective:
         return None
 
     def left(self, x: Float[np.ndarray, "some 3"], atoms: int) -> str:
-        """Return the coordinates shared in all earlier frames, if atoms lost them too suddenly; else ""."""
+        """Describe the coordinates that all atoms shared in earlier frames and suddenly lost, or return
+        "".
+        """
         last, was, level = self.last, self.level, (x == x[0]).all(axis=0)
         self.level = level if was is None else was & level
         if last is None or was is None or atoms <= _FEW or not was.any() or np.any(self.level):
@@ -84,13 +86,13 @@ class Collective:
 
 
 def spreads(x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "3"]:
-    """Return the standard deviations along the principal axes, length, in ascending order."""
+    """Return the standard deviations along the principal axes, in length units and ascending order."""
     away = x - x.mean(axis=0)
     return np.sqrt(np.maximum(np.linalg.eigvalsh(away.T @ away / len(x)), 0.0))
 
 
 def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> str | None:
-    """Describe the plane, line or point on which atoms with these spreads lie for the first time, or None.
+    """Describe the plane, line or point into which all atoms have collapsed; None if they have not.
 
     Rippled sheets and bent chains may become flat and straight. A collapse is therefore reported only if the
     earlier spread across the sheet or chain exceeded the distance of neighbors along it or, if a coordinate
@@ -122,7 +124,7 @@ def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
 
 
 def _shift(before: np.ndarray, now: np.ndarray, far: float) -> float:
-    """Return the common displacement of all atoms, length; 0 if it is small or not common to all."""
+    """Return the length of the common displacement of all atoms; 0 if it is small or not common to all."""
     moved = now - before
     if len(now) < 2 or not far or np.abs(moved).max() <= far / (2 * _SUDDEN):
         return 0.0

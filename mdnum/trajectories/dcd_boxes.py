@@ -131,7 +131,7 @@ def _plausible(frames: Examined, fit: list[str]) -> list[str]:
 
 
 def _contacts(number: int, x: np.ndarray, cell: np.ndarray, name: str) -> Float[np.ndarray, "pairs"]:
-    """Return the distances of all pairs closer than the mean spacing of the atoms, length."""
+    """Return the distances, in length units, of all pairs closer than the mean spacing of the atoms."""
     boxes = conventions(cell)
     volume = max(abs(float(np.linalg.det(one))) for one in boxes.values())
     tracker = Tracker(CutoffRule(float(np.cbrt(volume / len(x)))))

@@ -1,4 +1,4 @@
-"""Reading of one trajectory, or of two with the same atoms in step: frames are checked, flips passed on.
+"""Reading of one trajectory, or of two trajectories in step, with checks of frames and flips of neighbors.
 
 The neighbor sets of two trajectories are compared once, at the first frame. From then on, the flips of both
 trajectories update the difference, so the cost of a frame is proportional to its changes.
@@ -321,7 +321,7 @@ class SetDifference:
 
 
 def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[np.ndarray, "pairs"]:
-    """Return the distances of pairs in a frame, through the image of the given rank, length; inf if none."""
+    """Return the distances of pairs through images given by rank, in length units; inf without an image."""
     i, j, rank = np.array(pairs, np.int64).reshape(-1, 3).T
     at = Placed(np.ascontiguousarray(frame.positions), lattice_of(frame.box), 0.0)
     return image_distances(at, np.minimum(i, j), np.maximum(i, j), rank, directed)
@@ -348,12 +348,12 @@ class ComparedSide:
         return self.tracker.step(frame, bound=self.bound)
 
     def position_bound(self, periods: int) -> float:
-        """Return the error bound of a position across `periods` box periods, at the last frame, length."""
+        """Return the error bound (length) of a position across `periods` box periods at the last frame."""
         # a distance has two atoms that are off
         return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
 
     def speed_bound(self, frame: Frame) -> float:
-        """Return the error bound of an atom's velocity, length per time."""
+        """Return the error bound of an atom's velocity, in length per time."""
         if self.speeds is None or frame.velocities is None:
             return 0.0
         return self.speeds.bound(velocities_of(frame)) / 2
@@ -388,7 +388,7 @@ def differing_rows(
 def _thresholds(
     i: np.ndarray, j: np.ndarray, inside: np.ndarray, rule: Rule, side: ComparedSide
 ) -> Float[np.ndarray, "pairs"]:
-    """Return the distance below which each pair is inside, length; by center for nearest-neighbor rules."""
+    """Return the distance (length) below which each pair is inside, by center for nearest neighbors."""
     if isinstance(rule, CutoffRule):
         return np.full(len(i), rule.radius)
     if isinstance(rule, SpeciesCutoffs):

@@ -50,14 +50,14 @@ class Box:
 
     @cached_property
     def longest(self) -> float:
-        """Longest lattice vector, length; 0 unless the box repeats along all axes with finite vectors."""
+        """Length of the longest lattice vector; 0 unless the box repeats along all finite vectors."""
         if not np.all(self.pbc) or not np.isfinite(self.matrix).all():
             return 0.0
         return float(np.linalg.norm(self.matrix, axis=1).max())
 
     @cached_property
     def shortest(self) -> float:
-        """Shortest lattice vector among the periodic directions, length; 0 without a periodic direction."""
+        """Length of the shortest lattice vector among the periodic directions; 0 without such a direction."""
         return float(np.linalg.norm(self.matrix[self.pbc], axis=1).min()) if self.periodic else 0.0
 
     @cached_property
@@ -85,11 +85,11 @@ class Frame:
 
     @cached_property
     def furthest(self) -> float:
-        """Largest absolute coordinate, length; not finite if any coordinate is not; 0 without atoms."""
+        """Largest absolute coordinate, in length units; not finite if any coordinate is not; 0 if empty."""
         return furthest(self.positions)
 
     def furthest_of(self, atoms: AtomIndices) -> float:
-        """Return the largest absolute coordinate of the given atoms, length."""
+        """Return the largest absolute coordinate of the given atoms, in length units."""
         return self.furthest if atoms is None else furthest(self.positions[atoms])
 
 
@@ -201,7 +201,7 @@ def far_out(
     bits: int = 64,
     before: Float[np.ndarray, "some 3"] | None = None,
 ) -> tuple[int, int, str] | None:
-    """Return the atom furthest out, if it is further out than possible; arguments as in `FrameCheck`.
+    """Return the most distant atom if it is impossibly far out; arguments as in `FrameCheck`.
 
     Positions of some atoms one frame earlier give the size of the system even if half of it is damaged.
 
@@ -241,7 +241,7 @@ def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, flo
     Wrapping of one atom, or of all atoms at once after a long time, is not a leap.
 
     Returns:
-        (the atom, its displacement, length); None if there is no leap.
+        (the atom, the length of its displacement); None if there is no leap.
     """
     x = now.positions if atoms is None else now.positions[atoms]
     moved = x - (before.positions if atoms is None else before.positions[atoms])

@@ -95,7 +95,7 @@ class History:
 
 
 def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return (a stable order that sorts by all columns, mask of sorted rows unlike the row before)."""
+    """Return (a stable order that sorts by all columns, mask of sorted rows that begin a new group)."""
     if not len(columns[0]):
         return np.zeros(0, np.int64), np.zeros(0, bool)
     sizes = [int(column.max()) + 1 for column in columns]
@@ -213,7 +213,7 @@ def doublings(frames: int) -> list[int]:
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:
     """Count the decisions that change if all atoms move in straight lines for a short time.
 
-    The root mean square displacement in this time is `move`, length: small compared with the distance over
+    The root mean square displacement in this time is the length `move`: small compared with the distance over
     which paths bend, and large enough that many pairs cross. `count` returns the flips between two frames.
 
     Returns:

@@ -67,7 +67,7 @@ class ImageFlips:
         self._before: tuple[Frame, np.ndarray] | None = None
 
     def step(self, frame: Frame, pairs: Members) -> dict[str, Any] | None:
-        """Return the columns of a frame's flips, or None; `pairs` are inside by a symmetric rule."""
+        """Return the columns of a frame's flips, or None; `pairs` are those inside by a symmetric rule."""
         matrix, inverse = cell_of(frame)
         now = np.column_stack([pairs.i, pairs.j, image_shifts(frame, pairs)])
         known, self._before = self._before, (frame, now)

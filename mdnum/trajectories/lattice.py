@@ -48,7 +48,7 @@ class ReducedLattice(NamedTuple):
 
     @property
     def narrowest(self) -> float:
-        """Smallest width of the box, length; no lattice vector is shorter."""
+        """Smallest width of the box, in length units; no lattice vector is shorter."""
         return float(self.widths.min())
 
     @property
@@ -57,7 +57,7 @@ class ReducedLattice(NamedTuple):
         return float(1.0 / abs(np.linalg.det(self.inverse)))
 
     def rounding(self, largest: float, radius: float) -> float:
-        """Return the rounding error of a distance near `radius`, length, for coordinates up to `largest`.
+        """Return the rounding error, a length, of a distance near `radius`, for coordinates up to `largest`.
 
         Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1.
         """
@@ -231,7 +231,7 @@ def image_square(x, i, j, rank, lattice):
 
 @dataclass(frozen=True)
 class Participants:
-    """Atoms that take part in a rule, with consecutive indices of their own."""
+    """Atoms that take part in a rule, numbered consecutively."""
 
     labels: Int[np.ndarray, "atoms"]  # their numbers in the file
     centers: Bool[np.ndarray, "atoms"]  # whose neighbors are wanted
@@ -241,7 +241,7 @@ class Participants:
 
     @property
     def radius(self) -> float:
-        """Largest radius of all pairs of species, length."""
+        """Largest radius of all pairs of species, in length units."""
         return float(self.radii.max(initial=0.0))
 
     @property
@@ -352,8 +352,8 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
 def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[np.ndarray, "3"]):
     """Return (bins, reach, step): number of bins along each axis, range of a pair in bins, width of a bin.
 
-    There are no more than about twice as many bins as atoms. `extent` is the extent of the atoms along each
-    nonperiodic axis, length.
+    There are no more than about twice as many bins as atoms. `extent` is the length that atoms span along
+    each nonperiodic axis.
     """
     bins, reach, step = np.ones(3, np.int64), np.ones(3, np.int64), np.ones(3)
     room = max(64.0, 2.0 * atoms)
@@ -489,7 +489,7 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
 def meet(atoms, limits, found):
     """Record the pairs of all centers; return the numbers of certain and of open pairs.
 
-    Pairs of one set are visited once, by examining half of the bins around each bin. Otherwise all bins
+    Pairs within one set are visited once, by examining half of the bins around each bin. Otherwise all bins
     around each center are examined; a pair of atoms that are on both sides is visited twice and counted once.
     """
     written, left = 0, 0

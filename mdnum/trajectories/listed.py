@@ -1,8 +1,8 @@
 """Pairs inside a cutoff that are missing from a program's own neighbor list, with their duration.
 
-A list is incomplete because the skin was exceeded, a buffer overflowed or images are not supported; in all
-cases the program is affected by the pairs that are missing while they are inside. Missing pairs within the
-error bound of the cutoff are due to rounding and are not counted.
+A list may be incomplete because the skin was exceeded, a buffer overflowed or images are not supported; in
+all cases the program is affected by the pairs that are missing while they are inside the cutoff. Missing
+pairs within the error bound of the cutoff are due to rounding and are not counted.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class GivenList(NamedTuple):
         return _has(self.first, self.j, self.image, i, j, image, self.shifted)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
-        """Return from how many of its atoms each pair is missing: 0 or 1, or up to 2 in a full list."""
+        """Return, for each pair, from how many of its atoms it is missing: up to 1, or 2 in a full list."""
         i, j, image, near = pairs.i, pairs.j, np.zeros(len(pairs), np.int64), pairs.rank == 0
         if self.shifted:
             image, near = _image(*image_shifts(frame, pairs).T), np.True_
@@ -273,7 +273,7 @@ class ListCheck:
         return bool((distance <= self._radii[self._kinds[i], self._kinds[j]] + placed.rounding).any())
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
-        """Return rows of the given pairs, missing up to a frame; by default, of all pairs still missing."""
+        """Return rows of pairs that were missing up to a frame; by default, of all pairs still missing."""
         names = ("i", "j", "rank", "missing", "begin", "number", "deepest", "end")
         held = sorted((self._open if stays is None else stays).items())
         rows = [(*key, *told, at) for key, told in held if told[-1] > bound]

@@ -74,9 +74,7 @@ class FrameMotion:
         *,
         timed: bool = True,
     ) -> FrameMotion | None:
-        """Measure the motion of the atoms in pairs over successive frames; None if frames or motion are
-        few.
-        """
+        """Measure how far atoms move over successive frames; None for too few frames or too little motion."""
         sides = [slice(None) if one is None else one for one in (first, first if second is None else second)]
         atoms, grid = min(len(sample[0].positions[side]) for side in sides), resolution.usual_step(sample[0])
         pairs = list(pairwise(sample))
@@ -124,7 +122,7 @@ def lost_flips(
         found: flips that remain at each stride.
         motion: motion of the atoms that form pairs.
         flux: number of crossings by velocities, "crossed", and the share that is "lost"; None without any.
-        reach: distance of the threshold, length, if there is one.
+        reach: distance of the threshold, in length units, if there is one.
     """
     if len(found.stride) < 3 or tuple(found.stride[:3]) != (1, 2, 4) or not found.of.all():
         return None

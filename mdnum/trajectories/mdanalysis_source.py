@@ -71,7 +71,7 @@ class LibraryFrames:
         self._guard = opened(trajectory)
 
     def timestep(self, number: int, forward: bool = False) -> Any:
-        """Return MDAnalysis's timestep of a frame; `forward` if the reader is at the frame before.
+        """Return MDAnalysis's timestep of a frame; set `forward` if the reader is at the previous one.
 
         Raises:
             UnreadableFrame: the frame cannot be read, reading it would end the process, or its last number is
@@ -252,7 +252,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factors(trajectory: Any) -> tuple[float, float]:
-    """Return (ratio of the times in a DCD file to MDAnalysis's, which ignores byte order; `swapped`)."""
+    """Return two ratios of DCD time steps: file to MDAnalysis's value, and byte-swapped to file value."""
     read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
     if not read:
         return 1.0, math.nan
@@ -333,7 +333,7 @@ def _behind_text(file: Any) -> str | None:
 
 
 def _last_bytes(path: Path) -> tuple[bytes, int]:
-    """Return (the last bytes of a file, its size); a compressed file is read completely, uncompressed."""
+    """Return (the last bytes of a file, its size) after decompression, which reads the file completely."""
     from MDAnalysis.lib.util import anyopen
 
     packed = path.suffix in (".gz", ".bz2")
@@ -356,7 +356,7 @@ def _text(trajectory: Any) -> tuple[Path, str] | None:
 
 
 class NetcdfFile(netcdf_file):
-    """A NetCDF file in classic format whose complete records can be read, however many its header states."""
+    """A NetCDF file in classic format; complete records can be read whatever number its header states."""
 
     # where the first record begins, bytes
     _begin = sys.maxsize

@@ -1,8 +1,8 @@
-"""Detection of frames that repeat earlier ones bit for bit, or their times: restarts, or no motion at all.
+"""Detection of frames that repeat the data or the times of earlier ones, after restarts or without motion.
 
 A run that continues from a checkpoint writes some frames again, concatenated files have frames in common, and
-a stopped simulation or a rejected Monte Carlo move repeats the previous frame. Times do not always reveal it.
-A restart with different rounding repeats times but not bits; the first of the two frames is kept.
+a stopped simulation or a rejected Monte Carlo move repeats the previous frame. Times do not always reveal
+this. A restart with different rounding repeats times but not bits; the first of the two frames is kept.
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ class ResidueTracker:
         rule: membership rule for atoms.
         residues: residues, and the atoms that count.
         species: species of each atom of the file; required by some rules.
-        bound: error of a distance due to the resolution of the file, length.
+        bound: error of a distance, in length units, due to the resolution of the file.
 
     Error: smallest distances have the rounding error of distances between atoms.
     """
@@ -147,7 +147,7 @@ class ResidueTracker:
 
     @property
     def bound(self) -> float:
-        """Error bound of a distance at the last frame, length."""
+        """Error bound of a distance at the last frame, in length units."""
         return self._atoms.bound
 
     def step(self, frame: Frame, bound: float | None = None) -> FlipTable:
@@ -186,7 +186,7 @@ class ResidueTracker:
         return Members(i, j, np.zeros_like(i), self._closest(self._last, i, j)[0])
 
     def _closest(self, frame: Frame, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (distance, threshold) of the atom pair that is deepest inside or least outside, length."""
+        """Return the lengths (distance, threshold) of the atom pair deepest inside or least outside."""
         placed, found = self._placed(frame), np.full((2, len(i)), np.inf)
         for begin in range(0, len(i), _TOGETHER):
             part = slice(begin, begin + _TOGETHER)

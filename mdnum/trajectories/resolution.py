@@ -70,13 +70,13 @@ class Resolution:
     def bound(self, frame: Frame, atoms: AtomIndices = None) -> float:
         """Return the largest error of a distance in this frame due to rounding when the file was written.
 
-        The bound is the worst case, length: both atoms are moved by half a step along every axis in opposite
-        directions, and a pair across the boundary also by the rounding of the box. For float64, the bound is
-        the rounding of the distance. A margin to a cutoff has the same error bound; a margin among the
-        nearest neighbors (the difference of two distances) has twice that. If atoms are given, only their
+        The bound, in length units, is the worst case: both atoms are moved by half a step along every axis in
+        opposite directions, and a pair across the boundary also by the rounding of the box. For float64, the
+        bound is the rounding of the distance. A margin to a cutoff has the same error bound; a margin among
+        the nearest neighbors (the difference of two distances) has twice that. If atoms are given, only their
         distances count.
 
-        Error: valid for a pair through one period of the box; each further period adds the part of the box
+        Error: valid for a pair through one period of the box; each further period adds the error of the box
             again.
         """
         if atoms is not None or not np.isfinite(frame.furthest):
@@ -100,7 +100,7 @@ class Resolution:
         return float(2 * np.sqrt(3) * coordinate + box + arithmetic)
 
     def usual_step(self, frame: Frame) -> float:
-        """Return the root mean square value of the last digit of a coordinate, length."""
+        """Return the root mean square value of the last digit of a coordinate, in length units."""
         if not len(frame.positions):
             return 0.0
         if not self.step:
@@ -117,7 +117,7 @@ class Resolution:
         return self.kind in ("float32", "unknown") or self.bits == 32
 
     def _half(self, frame: Frame) -> float:
-        """Return the largest half step along an axis, length."""
+        """Return the largest half step along an axis, in length units."""
         if not self.step or not len(frame.positions):
             return 0.0
         if self.kind == "fractions":
@@ -271,10 +271,10 @@ def grid_effect(
     Args:
         resolution: resolution of the file.
         sample: consecutive frames at the stride of the analysis.
-        radius: the cutoff, length; if `ranked`, the approximate distance of the last of the nearest.
-        first: atoms on one side of a pair, whose neighbors are meant; None for all.
+        radius: the cutoff length; if `ranked`, the approximate distance of the last nearest neighbor.
+        first: atoms on one side of a pair, whose neighbors are counted; None for all.
         second: atoms on the other side; None for the same atoms.
-        ranked: True if the order of distances decides, and no length.
+        ranked: True if the order of distances decides, not a cutoff.
         draws: number of pairs or triples drawn.
 
     Returns:
@@ -341,7 +341,7 @@ def _drawn(
 
 
 def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
-    """Return the vectors of the grid of positions, as rows, length."""
+    """Return the vectors of the grid of positions as rows, in length units."""
     if resolution.kind == "fractions" and not resolution.digits:
         return resolution.step * frame.box.matrix
     return resolution.usual_step(frame) * np.eye(3)

@@ -47,7 +47,7 @@ class _Membership:
 
     @property
     def reach(self) -> float:
-        """Distance beyond which no atom is a neighbor, length."""
+        """Distance beyond which no atom is a neighbor, in length units."""
         return self.radius
 
     @property
@@ -64,7 +64,7 @@ class _Membership:
 
 @dataclass(frozen=True)
 class CutoffRule(_Membership):
-    """Rule by which a pair is inside if r < radius, a length.
+    """Rule by which a pair is inside if its distance r is less than `radius`, a length.
 
     The decision compares r² with radius² in float64, as most codes do; a pair within rounding error of the
     radius is ambiguous, whichever way it is decided.
@@ -82,7 +82,7 @@ class CutoffRule(_Membership):
 
 @dataclass(frozen=True)
 class SpeciesCutoffs(_Membership):
-    """Rule with a radius, length, for each pair of species, in either order; other pairs are never inside."""
+    """Rule with a radius (length) for each pair of species, in either order; other pairs are never inside."""
 
     radii: Mapping[tuple[str, str], float]
 
@@ -168,7 +168,7 @@ class Nearest(_Membership):
 
 @dataclass(frozen=True)
 class Capped(_Membership):
-    """Cutoff rule, length, that keeps at most the `most` nearest of the atoms inside; the rule is directed.
+    """Cutoff rule that keeps at most the `most` nearest of the atoms inside the radius; the rule is directed.
 
     Graph builders with a maximum number of neighbors that keep the nearest ones follow this rule.
     """

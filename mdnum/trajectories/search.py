@@ -87,7 +87,7 @@ def search(
             band.
         band: pairs this close to their radius are decided from the coordinates as stored, length; at least
             the rounding error of a distance.
-        bound: pairs this close to their radius are counted as close, length; at most the band.
+        bound: pairs within this length of their radius are counted as close; at most the band.
         room, open_room: expected numbers of pairs inside and of pairs in the band, if known.
 
     Raises:
@@ -381,7 +381,7 @@ def image_distances(
     rank: Int[np.ndarray, "pairs"],
     directed: bool = False,
 ) -> Float[np.ndarray, "pairs"]:
-    """Return distances to the images that have `rank` nearer images, length; inf without such an image.
+    """Return distances, in length units, to the images with `rank` nearer images; inf without such an image.
 
     With a directed rule, both images of a ± pair of an atom itself are neighbors.
     """

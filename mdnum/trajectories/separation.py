@@ -52,7 +52,7 @@ def displacements(
 def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
     """Return True if two boxes generate the same lattice, whichever lattice vectors they list.
 
-    A component of a lattice vector may differ by the tolerance, length.
+    A component of a lattice vector may differ by the tolerance, in length units.
     """
     if (np.asarray(one.pbc, bool) != np.asarray(other.pbc, bool)).any():
         return False
@@ -82,7 +82,7 @@ def separation(
 
 
 def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[np.ndarray, "3"]:
-    """Return the displacement that most atoms have in common, up to lattice vectors, length."""
+    """Return the displacement that most atoms have in common, up to lattice vectors, in length units."""
     shift = displacements(one, other, atoms)[0][0]
     for _ in range(2):
         # nearest images about one atom lie on both sides of the box if that atom is on the other; about the
@@ -104,7 +104,7 @@ def velocities_differ(a: Frame, b: Frame, atoms: AtomIndices, bound: float) -> d
     """Describe a difference between the velocities of two frames, beyond a vector common to all atoms.
 
     Args:
-        bound: error bound of the difference of two velocities, length per time.
+        bound: error bound of the difference of two velocities, in length per time.
 
     Returns:
         None if neither frame has velocities, or they agree; kind "zero" and the side without velocities; or
@@ -135,7 +135,7 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
     """Compare displacements between two frames with velocities; return None without velocities or motion.
 
     `moved` is near 1 if atoms fly straight, below 1 if they turn around in between, and never far above 1.
-    `factor` is near 1 if velocities keep their direction and have the unit of positions over times.
+    `factor` is near 1 if velocities keep their direction and are in units of position over time.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None
@@ -160,7 +160,7 @@ def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
     """Return the contradiction of displacements with velocities and times, from medians over some frames.
 
     If atoms turn around between two frames, they move less than velocities predict, without contradiction.
-    Too small a displacement counts only if velocities kept their directions and displacements are parallel to
+    A smaller displacement counts only if velocities kept their directions and displacements are parallel to
     them.
 
     Returns:

@@ -3,14 +3,14 @@
 Three quantities describe how long contacts last:
 
 - the **lifetime** of a contact whose beginning was observed: the product-limit estimate (Kaplan and Meier, J.
-  Am. Stat. Assoc. 53, 457, 1958), which uses contacts that outlast the last frame for the time observed;
-- the **mean by rate**: time inside divided by the number of leaves, which uses every frame of every contact,
-  whether its ends were observed or not, and is the mean lifetime if pairs leave at a constant rate;
+  Am. Stat. Assoc. 53, 457, 1958), in which contacts that outlast the last frame count for the time observed;
+- the **mean by rate**: time inside divided by the number of departures, which uses every frame of every
+  contact, whether its ends were observed or not, and is the mean lifetime if pairs leave at a constant rate;
 - the **residence**: of the pairs inside at some frame, the share still inside, without a break, after a given
   lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more often, so
   residence differs from lifetime.
 
-Durations are in frames; times come from the frames' own. Counts for subsets of the pairs are additive.
+Durations are in frames; times are those of the frames. Counts for subsets of the pairs are additive.
 """
 
 from __future__ import annotations
@@ -114,9 +114,9 @@ def survival(found: Durations) -> Survival:
 
 
 def mean_by_rate(found: Durations) -> tuple[float, float]:
-    """Return (frames inside per leave, standard error) over all contacts; inf if no pair was seen to leave.
+    """Return (frames inside per departure, standard error) over all contacts; inf without departures.
 
-    The error assumes independent leaves (Poisson); chatter makes the true error larger.
+    The error assumes independent departures (Poisson); chatter makes the true error larger.
     """
     if not found.leaves:
         return float("inf"), float("nan")
@@ -146,7 +146,7 @@ def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[
     pairs are additive). Each lag is from 0 to frames - 1.
 
     Returns:
-        by lag, the number of times that a pair was inside both times, and that it was inside the first time.
+        for each lag, the number of times that a pair was inside at both frames, and at the first frame.
     """
     both, once = np.zeros(len(lags), np.int64), np.zeros(len(lags), np.int64)
     pairs = np.append(np.flatnonzero(_new_pairs(stays)), len(stays))
@@ -248,7 +248,7 @@ class ClassTally(Sums):
 
     @property
     def mean_stay(self) -> Float[np.ndarray, "classes classes"]:
-        """Mean number of frames inside per leave; nan if no pair left."""
+        """Mean number of frames inside per departure; nan if no pair left."""
         none = np.full(self.left.shape, np.nan)
         return np.divide(self.exposure, self.left, out=none, where=self.left > 0)
 
@@ -375,7 +375,7 @@ class Statistics(Sums):
     def of(
         cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
     ) -> tuple[Statistics, Contacts]:
-        """Compute statistics of some pairs, added to earlier ones, and the contacts of these pairs.
+        """Return statistics of some pairs, added to earlier statistics, and the contacts of these pairs.
 
         Within a window of frames, a flip that is reversed is chatter, and an absence is ignored in an
         intermittent contact.

@@ -82,7 +82,7 @@ class AseFrames(Trajectory):
 
 
 def _ids(atoms: Any) -> np.ndarray | None:
-    """Return the ids of the atoms; None if there are none, or not a different one for each atom."""
+    """Return the ids of the atoms; None if they are missing or not unique."""
     ids = atoms.arrays.get("id")
     return ids if ids is not None and ids.ndim == 1 and len(np.unique(ids)) == len(ids) else None
 
@@ -149,7 +149,7 @@ def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
 
     Args:
         lines: lines of a frame, all with a number in the last place.
-        like: words to compare with instead.
+        like: numbers to compare with instead of those in the lines.
 
     Raises:
         ValueError: the last number was cut.
@@ -237,7 +237,7 @@ def _whole_number(line: str, what: str) -> int:
 
 
 def _rows(lines: Any, head: int, atoms: int, cut: bool = True) -> list[str]:
-    """Return `head` lines and the lines of the given number of atoms after them."""
+    """Read `head` lines and, after them, one line for each atom."""
     if atoms < 0:
         raise ValueError(f"expected the number of atoms; found {atoms}")
     rows = list(islice(lines, head + atoms))
@@ -495,7 +495,9 @@ def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray,
 
 
 def _gro_box(line: str) -> Box:
-    """Return the box of three diagonal elements, or of v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros: no box."""
+    """Return the box from three diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros for no
+    box.
+    """
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
         raise ValueError(f"the box line has {len(values)} numbers")

@@ -98,7 +98,7 @@ class Tiles:
         )
 
     def _follow(self, before: Placed, now: Placed, change: np.ndarray) -> tuple[float, float, float]:
-        """Update columns and boxes; return the (largest, second, root mean square) displacement, length."""
+        """Update columns and boxes; return (largest, second, root mean square) displacement lengths."""
         lattice = now.lattice
         most, second, total = _follow(
             before.positions, now.positions, self.order, self.home, lattice.vectors, change, lattice.inverse,
@@ -108,7 +108,7 @@ class Tiles:
         return math.sqrt(most), math.sqrt(second), math.sqrt(total / max(len(now.positions), 1))
 
     def doubt(self, now: Placed, radius: float) -> float:
-        """Return the float32 error bound of a distance near the radius, length."""
+        """Return the float32 error bound of a distance near the radius, in length units."""
         largest = float(np.abs(self.boxes).max(initial=0.0))
         vectors = float(np.abs(now.lattice.vectors).sum())
         # rounding of two coordinates and a shift, of a difference with each, and of the square
@@ -120,7 +120,7 @@ class Tiles:
         """Decide all pairs at the frame to which the atoms were followed last.
 
         Args:
-            bound: pairs this close to their radius are counted, length.
+            bound: pairs within this length of their radius are counted.
             horizon: the smallest |margin| is determined up to this length.
             pairs: approximate number of pairs inside.
             record: True to return the pairs that flipped.
@@ -164,7 +164,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if a pair that approaches by `moved` is inside by one and the same image in both frames."""
+    """Return True if pairs that approach by `moved` are inside through one image, the same in both frames."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
@@ -314,7 +314,7 @@ def _halved(x, order):
 
 @njit
 def _nodes(boxes, runs):
-    """Return boxes around the clusters of each run, around its halves, and so on; halves follow their whole.
+    """Return the bounding box of the clusters of each run, followed by those of its halves, and so on.
 
     The first half of a node begins one node further; the second half begins further by twice the number of
     clusters in the first half.

@@ -205,7 +205,7 @@ def topology_universe(topology: str | Path) -> Any:
 
 
 def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
-    """Return the number of atoms in a trajectory; None if unknown. Some readers need that of the topology."""
+    """Return the number of atoms in a trajectory, or None; some readers need the number in the topology."""
     from MDAnalysis.core._get_readers import get_reader_for
 
     for known in ({}, {"n_atoms": topology}):

@@ -49,7 +49,7 @@ def atoms_of(groups: Groups) -> AtomIndices:
 
 @dataclass(frozen=True)
 class Moment(Placed):
-    """One frame with the neighbors that were decided."""
+    """One frame of a trajectory with its decided neighbors."""
 
     own: Int[np.ndarray, "species"]  # images of an atom itself that are inside, by species
     last_in: Float[np.ndarray, "limits"]  # thresholds of each atom, where the rule is directed
@@ -68,14 +68,14 @@ class Tracker:
         first: atoms of the file on one side; None for all. A directed rule searches for neighbors of these.
         second: atoms on the other side; None for the same atoms as first. An atom may be on both sides.
         species: species of each atom of the file; required by some rules.
-        bound: error bound of a margin due to the resolution of the file, length. The rounding error of
-            float64 is added to it.
+        bound: error bound of a margin, in length units, due to the resolution of the file. The rounding
+            error of float64 is added to it.
 
     Attributes:
         pairs: number of pairs inside at the last frame.
         near: number of pairs at the last frame with a |margin| of at most the bound, inside or not.
-        min_margin: smallest |margin| at the last frame, length; inf if no pair is within `HORIZON` of its
-            radius. For nearest neighbors without a radius, there is no such limit.
+        min_margin: smallest |margin| at the last frame, a length; inf if no pair is within `HORIZON` of
+            its radius. For nearest neighbors without a radius, there is no such limit.
 
     Raises:
         InputError: indices are not integers from 0, or required species are missing.
@@ -116,7 +116,7 @@ class Tracker:
 
         Args:
             frame: the next frame; its own index does not matter.
-            bound: error bound of margins from this frame on, length; None to keep the previous one.
+            bound: error bound of margins (length) from this frame on; None to keep the previous one.
 
         Raises:
             FrameError: a position is not finite, a periodic direction has no vector, the number of atoms
@@ -164,7 +164,7 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return thresholds of a directed rule at the last frame, by atom, length; nan if not a center.
+        """Return threshold distances of a directed rule at the last frame, by atom; nan if not a center.
 
         Returns:
             (distance below which a neighbor stays one, distance below which another atom would become one).
@@ -205,7 +205,7 @@ class Tracker:
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
     def _decided(self, now: Moment) -> Moment:
-        """Search for the neighbors at a frame; return it with them, and store their numbers."""
+        """Search for the neighbors at a frame, store their numbers, and return the frame with neighbors."""
         rule, bound, who = self.rule, self.bound + now.rounding, self._who
         if isinstance(rule, Nearest | Capped):
             reach = rule.reach if np.isfinite(rule.reach) else 0.0

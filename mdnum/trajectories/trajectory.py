@@ -238,7 +238,7 @@ class Trajectory(ABC):
 
 
 def chosen(frames: slice, total: int | None) -> Iterator[int]:
-    """Return the numbers of the frames, ascending; endless if neither the slice nor the total ends."""
+    """Return the frame numbers of a slice, ascending; endless if neither the slice nor the total ends."""
     if total is not None:
         return iter(range(*frames.indices(total)))
     return islice(count(), frames.start, frames.stop, frames.step)

@@ -68,7 +68,7 @@ class Unwrapping:
         }  # fmt: skip
 
     def _pairs(self, here: np.ndarray, there: np.ndarray, cell: np.ndarray) -> dict[str, Any]:
-        """Return by how much stiff pairs change their distance, for pairs across two cells and within one."""
+        """Return the change of distance in stiff pairs, for pairs in two cells and for pairs in one cell."""
         images = np.rint(there - here)
         split = images.any(axis=1) | (np.floor(here) != np.floor(there)).any(axis=1)
         lengths = np.linalg.norm((there - here - images) @ cell, axis=1)
