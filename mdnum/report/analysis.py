@@ -202,8 +202,7 @@ def scan(flips: Flips, steps: int | None = None, nearest: int = 0) -> Scan:
 
 
 def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
-    """Return the ratio of |margin| to the rounding bound of each flip; a flip is ambiguous up to a ratio of
-    1.
+    """Return the ratio of |margin| to the rounding bound of each flip; a flip is ambiguous up to ratio 1.
 
     If the bound is zero (an exact comparison), the ratio of any nonzero margin is infinite.
     """

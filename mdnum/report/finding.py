@@ -259,9 +259,7 @@ class Verdict:
         return " ".join((self.headline, *self.evidence))
 
     def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a summary with headline, findings and verdict; an empty summary means an unfinished
-        folder.
-        """
+        """Return a summary with headline, findings and verdict; an empty one means an unfinished folder."""
         usual = {"status": "complete" if summary else "unfinished", "seconds": None}
         found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
         return headed(kind, {**usual, **summary, **found})

@@ -30,10 +30,10 @@ class Layout:
     Args:
         kind: name of the kind.
         command: command that makes such folders, without `mdnum`.
-        tables: names of columns by table, separated by spaces. `name:type` is a column with a type of `TYPES`,
-            float64 by default. `name?` is a column that may be unknown when the table is written, and is then
-            null. A folder has every table, with rows or without, except those whose own name ends in a
-            question mark.
+        tables: names of columns by table, separated by spaces. `name:type` is a column with a type of
+            `TYPES`, float64 by default. `name?` is a column that may be unknown when the table is written,
+            and is then null. A folder has every table, with rows or without, except those whose own name ends
+            in a question mark.
         usual: values of columns that rows leave out, by table.
         resumes_from: the file from which the command resumes; empty if it cannot be resumed.
         further: files other than tables that are read or shown, as patterns separated by spaces.

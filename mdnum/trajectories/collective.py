@@ -69,9 +69,7 @@ class Collective:
         return None
 
     def left(self, x: Float[np.ndarray, "some 3"], atoms: int) -> str:
-        """Describe the coordinates that all atoms shared in earlier frames and suddenly lost, or return
-        "".
-        """
+        """Describe the coordinates that all atoms shared in earlier frames and suddenly lost; "" if none."""
         last, was, level = self.last, self.level, (x == x[0]).all(axis=0)
         self.level = level if was is None else was & level
         if last is None or was is None or atoms <= _FEW or not was.any() or np.any(self.level):

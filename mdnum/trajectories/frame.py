@@ -50,7 +50,7 @@ class Box:
 
     @cached_property
     def longest(self) -> float:
-        """Length of the longest lattice vector; 0 unless the box repeats along all finite vectors."""
+        """Length of the longest lattice vector; 0 unless all directions repeat and all vectors are finite."""
         if not np.all(self.pbc) or not np.isfinite(self.matrix).all():
             return 0.0
         return float(np.linalg.norm(self.matrix, axis=1).max())

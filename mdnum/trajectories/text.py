@@ -495,9 +495,7 @@ def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray,
 
 
 def _gro_box(line: str) -> Box:
-    """Return the box from three diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros for no
-    box.
-    """
+    """Return the box from three diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros: no box."""
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
         raise ValueError(f"the box line has {len(values)} numbers")
