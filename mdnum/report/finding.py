@@ -221,7 +221,7 @@ def _plain(value: Any) -> Any:
 
 
 def _first(texts: str | Sequence[str], values: Mapping[str, Any]) -> str | None:
-    """Return the first text whose fields all have a value, with its fields filled in; None without one."""
+    """Return the first text whose fields all have a value, with its fields filled in; None if none has."""
     several = [texts] if isinstance(texts, str) else texts
     return next((fill(text, values) for text in several if _known(text, values)), None)
 

@@ -454,7 +454,7 @@ class RunFolder:
         return {key: as_numpy(table[key]) for key in table.column_names if key not in unknown}
 
     def rows(self, name: str) -> int:
-        """Return the number of rows that `table` returns."""
+        """Return the number of rows of a table, as returned by `table`."""
         stream = self._reader(name)
         if stream.parts() and self.has_checkpoint():
             # series and flips of an unfinished run agree with one another only at a checkpoint

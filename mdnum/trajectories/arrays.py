@@ -103,7 +103,7 @@ class ArrayFrames(Trajectory):
         return Frame(int(step), int(step) * self._timestep, x, here, v)
 
     def put(self, frame: Frame) -> None:
-        """Append the next frame."""
+        """Append the next frame to the trajectory."""
         self._waiting.append(frame)
         if len(self._first) < SAMPLE and len(frame.positions) == self.atoms:
             self._first.append(frame)

@@ -320,7 +320,7 @@ def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
 
 
 def _behind_text(file: Any) -> str | None:
-    """Describe the lines after the last frame, without blank ones at the end; return None without any."""
+    """Describe the lines after the last frame, without blank ones at the end; None if there are none."""
     if file is None or file.closed:
         return None
     lines = 0
@@ -369,7 +369,7 @@ class NetcdfFile(netcdf_file):
 
     @property
     def record(self) -> int:
-        """Bytes of a record; 0 without any record."""
+        """Size of a record in bytes; 0 if the file has no records."""
         return int(vars(self)["_recsize"])
 
     @property
@@ -379,7 +379,7 @@ class NetcdfFile(netcdf_file):
 
     @property
     def whole(self) -> int:
-        """Number of complete records."""
+        """Number of complete records in the file."""
         room = max(self._behind, 0) // self.record
         return room if self.told < 0 else min(room, self.told)
 
@@ -388,7 +388,7 @@ class NetcdfFile(netcdf_file):
 
     @property
     def rest(self) -> int:
-        """Number of bytes after the complete records."""
+        """Number of bytes after the last complete record."""
         return self._behind - self.whole * self.record
 
     @property

@@ -191,5 +191,5 @@ Rule = CutoffRule | SpeciesCutoffs | Nearest | Capped
 
 
 def smallest_radius(rules: Sequence[Rule]) -> float:
-    """Return the shortest length with which any of the rules compares distances; infinite without one."""
+    """Return the shortest length with which any of the rules compares distances; infinite if none does."""
     return float(min((one.shortest for one in rules), default=math.inf))

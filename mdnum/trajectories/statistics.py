@@ -205,7 +205,7 @@ class Labels:
 
     @classmethod
     def of(cls, table: AtomTable) -> Labels:
-        """Build the classes from a topology."""
+        """Build the classes of atoms from a topology."""
         if not any(table.residue_names):
             return cls(Classes.by(table.species), None, None)
         first = np.unique(table.residues, return_index=True)[1]

@@ -70,7 +70,7 @@ class _Limits(NamedTuple):
 
 @dataclass
 class Tiles:
-    """Tiles in use, with the followed coordinates of the atoms."""
+    """Tiles currently in use, with the followed coordinates of the atoms."""
 
     order: Int[np.ndarray, "slots"]
     kinds: list[tuple[float, Tiled]]  # (radius, tiles) of each two kinds of atoms that can be neighbors
@@ -173,7 +173,7 @@ def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool
 def tiles_of(
     before: Placed, now: Placed, who: Participants, clear: float, pairs: int, spare: Tiles | None = None
 ) -> Tiles | None:
-    """Build tiles that serve from one frame to the next, with the decisions of the first frame.
+    """Build tiles that are valid from one frame to the next, with the decisions of the first frame.
 
     The result is None if atoms move too far, or the box repeats too soon. `pairs` is the approximate number
     of pairs inside; the memory of `spare`, tiles that are no longer needed, is reused.

@@ -245,7 +245,7 @@ class Tracker:
     # ---- two frames
 
     def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
-        """Return the flips that tiles give; None if the tiles cannot serve."""
+        """Return the flips found with tiles; None if the tiles are not valid for this frame."""
         who, bound, horizon = self._who, self.bound + now.rounding, HORIZON * self._who.radius
         clear = max(bound, horizon)
         if self._list is not None and not self._list.serve(before, now, who.radius, clear):
