@@ -333,7 +333,7 @@ def resumable(root: Path) -> bool:
 
 
 def listed_files(root: Path, names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the digests of files as they are, without missing files."""
+    """Return the present digests of files, leaving out missing files."""
     return {name: [digest(root / name)] for name in names if os.path.lexists(root / name)}
 
 

@@ -251,7 +251,7 @@ class RunFolder:
             force: True to write even if the last checkpoint is recent (the first and the last of a run).
 
         Returns:
-            True if the checkpoint was written (see `checkpoint_due`); if not, `finalize` makes up for it.
+            True if the checkpoint was written (see `checkpoint_due`); if not, `finalize` writes it later.
 
         Raises:
             FolderError: the disk is full; the checkpoint before this one remains valid.
@@ -480,7 +480,8 @@ class RunFolder:
     def about(self) -> dict[str, Any]:
         """Metadata of the tables: version, kind, system, run (a digest) and units by quantity.
 
-        The metadata do not depend on time, so that a run has the same bytes however it was interrupted.
+        The metadata do not depend on the time of writing, so a run has the same bytes however it was
+        interrupted.
         """
         made, system = self._read_json("provenance.json"), self.system
         named = system.get("units") or system.get("world")

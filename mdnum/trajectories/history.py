@@ -22,7 +22,7 @@ _ROOM = 2**62
 
 
 class Sums:
-    """Counts for a subset of the pairs; addition combines two subsets field by field, and None stays None."""
+    """Counts for a subset of the pairs; addition combines two subsets field by field, and keeps None."""
 
     # what is the same for all pairs
     _common: tuple[str, ...] = ()

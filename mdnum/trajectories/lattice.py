@@ -350,7 +350,7 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
 
 
 def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[np.ndarray, "3"]):
-    """Return (bins, reach, step): number of bins along each axis, range of a pair in bins, width of a bin.
+    """Return (bins, reach, step): bins along each axis, how many bins apart a pair can be, width of a bin.
 
     There are no more than about twice as many bins as atoms. `extent` is the length that atoms span along
     each nonperiodic axis.

@@ -117,7 +117,7 @@ class Resolution:
         return self.kind in ("float32", "unknown") or self.bits == 32
 
     def _half(self, frame: Frame) -> float:
-        """Return the largest half step along an axis, in length units."""
+        """Return half of the largest decimal step along an axis, in length units."""
         if not self.step or not len(frame.positions):
             return 0.0
         if self.kind == "fractions":
@@ -233,7 +233,7 @@ def _fixed(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values
 
 
 def _chance(parts: Float[np.ndarray, "values"]) -> float:
-    """Return the logarithm of the probability that random values all fall into these parts of a step."""
+    """Return the logarithm of the probability that random values all fall into given fractions of a step."""
     return float(np.log(np.maximum(parts, 1e-300)).sum())
 
 
@@ -341,7 +341,7 @@ def _drawn(
 
 
 def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
-    """Return the vectors of the grid of positions as rows, in length units."""
+    """Return the vectors of the grid on which positions lie, as rows, in length units."""
     if resolution.kind == "fractions" and not resolution.digits:
         return resolution.step * frame.box.matrix
     return resolution.usual_step(frame) * np.eye(3)
@@ -368,7 +368,7 @@ def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]
 
 
 def unrounded(variance: float, size: float) -> float:
-    """Return the true variance of displacements whose ends, rounded to multiples of size, show this variance.
+    """Return the variance that displacements had before positions were rounded to multiples of size.
 
     If a displacement exceeds a whole number of steps by a fraction f, rounding adds size² f (1 - f) on
     average over starting points. For normally distributed displacements of variance v, this averages (by its

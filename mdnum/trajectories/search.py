@@ -64,7 +64,7 @@ class NeighborRows(NamedTuple):
     square: Float[np.ndarray, "stored"]  # squared distances, where the rule is directed; else empty
 
     def pairs(self) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Return (i, j) of all rows, one row after another."""
+        """Return the pairs (i, j) of all rows, row by row."""
         i = np.repeat(np.arange(len(self.first)), self.count)
         inside = np.arange(len(i)) - np.repeat(np.cumsum(self.count) - self.count, self.count)
         return i, self.other[self.first[i] + inside].astype(np.int64)

@@ -43,7 +43,7 @@ class Separation:
 def displacements(
     start: Frame, end: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | float = 0.0
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """Return (displacements to another frame less a shift, numbers of its lattice vectors removed)."""
+    """Return (displacements between two frames less a shift, numbers of lattice vectors removed)."""
     x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
     shared = np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool)
     return shortest(y - x - shift, Box(end.box.matrix, shared))

@@ -316,7 +316,7 @@ def _halved(x, order):
 def _nodes(boxes, runs):
     """Return the bounding box of the clusters of each run, followed by those of its halves, and so on.
 
-    The first half of a node begins one node further; the second half begins further by twice the number of
+    The first half of a node is the next node; the second half follows at a distance of twice the number of
     clusters in the first half.
     """
     nodes, spans = np.empty((2 * runs[-1], 6), np.float32), np.empty((2 * runs[-1], 2), np.int64)
