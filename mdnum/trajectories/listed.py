@@ -92,9 +92,7 @@ class GivenList(NamedTuple):
         return cls(shifted, full, np.searchsorted(i, np.arange(atoms + 1, dtype=i.dtype)), i, j, image)
 
     def has(self, i: np.ndarray, j: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, "pairs"]:
-        """Return True for each given entry that the list contains; the search is fastest in the order of
-        i.
-        """
+        """Return True for each given entry that the list contains; the search is fastest if i is sorted."""
         return _has(self.first, self.j, self.image, i, j, image, self.shifted)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
