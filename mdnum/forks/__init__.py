@@ -1,9 +1,10 @@
-"""Forks: where two runs diverge, which decision did it, and whether it mattered; once for both worlds.
+"""Forks: where two runs diverge, which decision made them diverge, and whether it mattered.
 
-A pair of programs (`Twin`) is made by a choice (`forks.choices`) or from two folders (`forks.folders`), and
-followed (`fork`). Maps along a number are in `forks.boundaries`, exact arithmetic in `forks.exact`; of
-molecular dynamics alone are `forks.replays` (overridden decisions, minimal causes), `forks.linearized`
-(exponents and forecasts), `forks.processes` (compilers) and `forks.benign` (ensembles).
+The code serves both worlds, molecular dynamics and the ball. A pair of programs (`Twin`) is made by a choice
+(`forks.choices`) or from two folders (`forks.folders`); `fork` follows both runs. `forks.boundaries` maps
+decisions along a number, `forks.exact` runs exact arithmetic. Four modules serve molecular dynamics only:
+`forks.replays` (overridden decisions, minimal causes), `forks.linearized` (exponents and forecasts),
+`forks.processes` (compilers) and `forks.benign` (ensembles).
 """
 
 from __future__ import annotations

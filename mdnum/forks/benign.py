@@ -1,14 +1,14 @@
-"""Is a fork benign: do two programs whose runs diverge still give the same measurements?
+"""Test whether a fork is benign: whether two programs whose runs diverge still give the same measurements.
 
-B is compared with an ensemble of A, at a step that a calibration chooses. Too early, the ensemble differs by
-less than rounding may; too late, every run has forgotten its start and a changed program gives the same
-scatter. Between the two lies a window, and it belongs to the system: so planted changes are run, and the step
-is taken at which all of them are distinguished from rounding.
+B is compared with an ensemble of A at a step that is found by calibration. Too early, the ensemble differs by
+less than rounding errors may; too late, every run has forgotten its start, and a changed program gives the
+same scatter. The window between these limits depends on the system. Therefore planted changes are run, and
+the comparison takes place at a step at which all of them can be distinguished from rounding.
 
-The rule is that of the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018):
-features are standardized by the ensemble and projected on its principal components; a run stands out when two
-of its components lie beyond a limit, and three runs fail when two of them stand out. That is, when the median
-over the runs of their second largest component is beyond the limit.
+The rule is that of the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
+Features are standardized by the ensemble and projected onto its principal components. A run is an outlier if
+two of its components exceed a limit, and three runs fail if two of them are outliers. In other words, the
+median over the runs of the second largest component exceeds the limit.
 """
 
 from __future__ import annotations
@@ -79,7 +79,9 @@ class Space:
 
     @classmethod
     def of(cls, features: Float[np.ndarray, "runs features"]) -> Space:
-        """The components that explain an ensemble's variance: two to ten, and at most a third of its runs."""
+        """Compute the components that explain an ensemble's variance: two to ten, at most a third of its
+        runs.
+        """
         mean, spread = features.mean(axis=0), features.std(axis=0, ddof=1)
         # nothing can be said of a feature that is constant, such as a distance that no pair has
         spread = np.where(spread > _ROUNDING * np.abs(mean), spread, np.inf)
@@ -94,27 +96,27 @@ class Space:
     def standardized(
         self, features: Float[np.ndarray, "*runs features"]
     ) -> Float[np.ndarray, "*runs features"]:
-        """Features in standard deviations of the ensemble."""
+        """Return features in standard deviations of the ensemble."""
         return (features - self.mean) / self.spread
 
     def scores(self, features: Float[np.ndarray, "runs features"]) -> Float[np.ndarray, "runs components"]:
-        """Components in standard deviations of the ensemble; not a number for a run that blew up."""
+        """Return components in standard deviations of the ensemble; NaN for a run that blew up."""
         return self.standardized(features) @ self.axes.T / self.sigma
 
     def second(self, features: Float[np.ndarray, "runs features"]) -> Float[np.ndarray, "runs"]:
-        """Each run's second largest component: it stands out where that is beyond the limit.
+        """Return the second largest component of each run; a run is an outlier if this exceeds the limit.
 
-        Infinite for a run that blew up, which stands out in everything.
+        The value is infinite for a run that blew up, which is always an outlier.
         """
         scores = np.abs(self.scores(features))
         return np.sort(np.where(np.isnan(scores), np.inf, scores), axis=1)[:, -2]
 
 
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
-    """Standard deviations beyond which a component stands out: two, or more so that at most a tenth of the
-    ensemble's own runs do.
+    """Return the number of standard deviations beyond which a component counts as an outlier.
 
-    Each run is judged in the components of others: one stands out less in those that it shaped.
+    The limit is two, or larger if needed for at most a tenth of the ensemble's own runs to be outliers. Each
+    run is judged by components of other runs, because a run stands out less in components that it influenced.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -124,18 +126,18 @@ def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
 
 
 def triples(seconds: Float[np.ndarray, "runs"]) -> Float[np.ndarray, "tries"]:
-    """The median of each three runs in turn: what the rule compares with its limit."""
+    """Return the median of each group of three successive runs, which the rule compares with its limit."""
     tries = len(seconds) // RUNS
     return np.median(seconds[: RUNS * tries].reshape(tries, RUNS), axis=1)
 
 
 def two_of_three(rate: float) -> float:
-    """How often two of three runs stand out where one does at a given rate."""
+    """Return the probability that at least two of three runs are outliers, given the rate for one run."""
     return 3 * rate**2 - 2 * rate**3
 
 
 def bounds(count: int, of: int) -> tuple[float, float]:
-    """The exact (Clopper-Pearson) 95 % interval of a rate of which `count` of `of` were seen."""
+    """Compute the exact (Clopper-Pearson) 95 % interval of a rate from `count` events in `of` tries."""
     tail = 0.025
     low = betaincinv(count, of - count + 1, tail) if count else 0.0
     high = betaincinv(count + 1, of - count, 1 - tail) if count < of else 1.0
@@ -158,7 +160,8 @@ class Planted:
 
     @property
     def ok(self) -> bool:
-        """Seen every time, or not more often than chance allows."""
+        """True if a change that must fail failed every time, or another one no more often than chance allows.
+        """
         if self.must_fail:
             return self.failures == self.tries
         return bounds(self.failures, self.tries)[0] <= ACCEPTED
@@ -166,7 +169,7 @@ class Planted:
 
 @dataclass(frozen=True)
 class Window:
-    """One step at which runs could be compared."""
+    """One step at which runs could be compared, with the components and the limit for it."""
 
     step: int  # of the comparison
     space: Space  # components of the ensemble
@@ -175,18 +178,18 @@ class Window:
 
     @property
     def power(self) -> float:
-        """The least that a change that must fail is beyond the limit, in limits; infinity without any."""
+        """Smallest score, in limits, of all planted changes that must fail; infinity if there are none."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property
     def ok(self) -> bool:
-        """Whether every planted change was distinguished."""
+        """True if the rule gave the expected result for every planted change."""
         return all(one.ok for one in self.table)
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """An ensemble that runs can be compared with."""
+    """An ensemble with which runs can be compared."""
 
     nodes: Float[np.ndarray, "nodes"]  # of the pair histogram that features are measured on
     window: Window  # the one that was chosen
@@ -197,12 +200,12 @@ class Calibration:
 
     @property
     def rate(self) -> float:
-        """False positives per verdict, from how often single runs that were held out stand out."""
+        """False positives per verdict, estimated from the rate of outliers among the held-out single runs."""
         return two_of_three(self.alone / self.held_out) if self.held_out else float("nan")
 
     @property
     def rate_bounds(self) -> tuple[float, float]:
-        """Its exact 95 % interval."""
+        """Exact 95 % interval of the rate of false positives."""
         low, high = bounds(self.alone, self.held_out)
         return two_of_three(low), two_of_three(high)
 
@@ -221,20 +224,20 @@ def calibrate(
     """Run an ensemble, and choose the step at which planted changes are distinguished from rounding.
 
     Args:
-        simulation: the program.
-        start: where it begins; default the system's own start.
-        members: runs of the ensemble.
-        held_out: further runs, which the rate of false positives is taken from.
-        tries: verdicts on each planted change, three runs each; one on the other list search, which is slow.
-        steps: the only step to compare at; default chosen, up to where two members have split.
-        changes: that are planted; default all of `planted(simulation)`.
-        progress: called with runs done, runs in all, and figures.
+        simulation: the program of the ensemble.
+        start: start of the ensemble; default the system's own start.
+        members: number of runs of the ensemble.
+        held_out: number of further runs, from which the rate of false positives is estimated.
+        tries: verdicts on each planted change, three runs each; only one on the slow other list search.
+        steps: step of the comparison; default the best step before two members split.
+        changes: planted changes; default all of `planted(simulation)`.
+        progress: called with the number of runs done, their total, and a dictionary of figures.
 
     Raises:
-        InputError: too few runs, a program that blows up, or no step at which planted changes can be
-            distinguished from rounding.
+        InputError: there are too few runs, the program blows up, or planted changes cannot be distinguished
+            from rounding at any step.
 
-    Error: statistical. The limit is a quantile over the members, see `Calibration.rate_bounds`.
+    Error: statistical; the limit is a quantile over the members, see `Calibration.rate_bounds`.
     """
     if members < FEWEST:
         raise InputError(
@@ -287,10 +290,10 @@ def calibrate(
 
 
 def choose(windows: Sequence[Window], name: str) -> Window:
-    """The latest window in which every planted change is clear, else the one that does it best.
+    """Choose the latest window in which every planted change is clear, or else the window that is clearest.
 
     Raises:
-        InputError: there is none.
+        InputError: no window distinguishes the planted changes.
     """
     good = [window for window in windows if window.ok and window.power > 1]
     clear = [window for window in good if window.power >= _CLEAR]
@@ -357,17 +360,17 @@ def benign(
 ) -> Benign:
     """Compare three runs of B with an ensemble of A.
 
-    B fails where two of the three have two or more principal components of their features beyond the limit.
-    Where it passes, the choice made no difference larger than the smallest noise of a start does.
+    B fails if, in two of the three runs, two or more principal components of the features exceed the limit.
+    If B passes, the choice had no larger effect than the smallest perturbation of a start.
 
     Args:
-        twin: the programs. B's frame does not matter: no feature knows the labels of atoms or the axes.
-        steps: step of the comparison; default calibrated.
-        calibration: of A's ensemble, where there is one.
-        progress: called with runs done, runs in all, and figures.
+        twin: the programs. B's frame does not matter, because no feature depends on atom labels or axes.
+        steps: step of the comparison; default the step found by calibration.
+        calibration: an existing calibration of A's ensemble.
+        progress: called with the number of runs done, their total, and a dictionary of figures.
 
     Raises:
-        InputError: programs that cannot be compared, or no step at which planted changes are clear.
+        InputError: the programs cannot be compared, or planted changes are not distinguishable at any step.
     """
     _check(twin)
     found = calibration or calibrate(twin.a.simulation, start=twin.a.begin, steps=steps, progress=progress)
@@ -384,7 +387,7 @@ def benign(
 
 
 def _check(twin: Twin) -> None:
-    """Refuse programs that an ensemble of one cannot judge the other by."""
+    """Raise an error if an ensemble of one program cannot be used to judge the other."""
     twin.a.check(twin.b)
     keys = [one.simulation.integrator.random for one in (twin.a, twin.b)]
     a, b = (() if key is None else np.asarray(jax.random.key_data(key)) for key in keys)
@@ -397,7 +400,7 @@ def _check(twin: Twin) -> None:
 
 
 def _failing(calibration: Calibration, rows: np.ndarray, scores: np.ndarray) -> dict[str, float]:
-    """The features that the components beyond the limit are made of, by their share in them."""
+    """Return the features that contribute most to the components beyond the limit, largest share first."""
     space, limit = calibration.window.space, calibration.window.limit
     z = np.median(space.standardized(rows), axis=0)
     middle = np.median(scores, axis=0)

@@ -1,7 +1,7 @@
-"""Where along a number of a system the decisions of a run change, to the last bit.
+"""Values of a number of a system at which the decisions of a run change, located to the last bit.
 
-Between two boundaries a run is one smooth function of the number. At a boundary something is decided
-otherwise between two adjacent floats, and everything after it may jump.
+Between two boundaries a run is one smooth function of the number. At a boundary, two adjacent floats lead to
+different decisions, and every later quantity may jump.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MOST, MOST_BALL = 24, 64
 
 @dataclass(frozen=True)
 class Side:
-    """A run on one side of a boundary."""
+    """The run on one side of a boundary."""
 
     at: float  # the number, as the float next to the boundary
     digest: str  # of its decisions
@@ -46,7 +46,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Boundary:
-    """Two adjacent floats with different histories, and the decision that makes the difference."""
+    """Two adjacent floats whose runs have different histories, and the first differing decision."""
 
     # below, above: the two sides; above.at is the float after below.at
     below: Side
@@ -64,13 +64,13 @@ class Boundary:
 
     @property
     def jump(self) -> float:
-        """Loss above minus loss below."""
+        """Loss above the boundary minus loss below it."""
         return self.above.loss - self.below.loss
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A stretch of the number on which every run made had one history."""
+    """An interval of the number in which all computed runs have the same history."""
 
     # low, high: its ends; both were run
     low: float
@@ -116,7 +116,7 @@ class BoundaryMap:
 
     @property
     def histories(self) -> int:
-        """How many distinct histories were seen."""
+        """Number of distinct histories that were found."""
         return len({interval.digest for interval in self.intervals})
 
 
@@ -124,8 +124,8 @@ class NumberLine:
     """Runs of one program along one number, addressed by the ordinal of a float.
 
     Args:
-        program: with the system's own value.
-        loss: of the final state, as the world's `history` takes it.
+        program: the program with the system's own value of the number.
+        loss: loss function of the final state, as accepted by the world's `history`.
     """
 
     def __init__(
@@ -136,31 +136,31 @@ class NumberLine:
         self.known: dict[int, DecisionHistory] = {}
 
     def value(self, place: int) -> float:
-        """The float of an ordinal."""
+        """Return the float with the given ordinal."""
         return float(neighbor(np.zeros((), self.number.dtype), place, self.number.dtype))
 
     def places(self, values: Any) -> list[int]:
-        """The ordinals of some floats, ascending, each once."""
+        """Return the ordinals of some floats, ascending and without duplicates."""
         return sorted({int(place) for place in ordinal(np.asarray(values, self.number.dtype))})
 
     def at(self, place: int) -> Any:
-        """The program at a float."""
+        """Return the program for the float with the given ordinal."""
         return self.number.at(self.value(place))
 
     def run(self, place: int) -> DecisionHistory:
-        """The run at a float."""
+        """Compute the history for the float with the given ordinal."""
         history = self.at(place).history(self.steps, self.loss)
         self.known[place] = replace(history, marks=history.marks[:0], x=history.x[:0])
         return history
 
     def digest(self, place: int) -> str:
-        """What the run at a float decided."""
+        """Return the digest of the decisions for the float with the given ordinal."""
         if place not in self.known:
             self.run(place)
         return self.known[place].digest
 
     def bisect(self, a: int, b: int, pending: list[tuple[int, int]]) -> tuple[int, int]:
-        """Adjacent ordinals between two whose histories differ; the halves not followed go to `pending`."""
+        """Bisect to adjacent ordinals with different histories; push halves not followed onto `pending`."""
         while b - a > 1:
             middle = (a + b) // 2
             here = self.digest(middle)
@@ -173,7 +173,7 @@ class NumberLine:
         return a, b
 
     def boundary(self, below: int, above: int) -> Boundary | None:
-        """What differs between two ordinals with different histories; None where a run fails first."""
+        """Compare the runs at two ordinals with different histories; return None if a run fails first."""
         places = (below, above)
         runs = [self.run(place) for place in places]
         step = runs[0].first_difference(runs[1])
@@ -212,23 +212,23 @@ def boundaries(
     confirm: bool = True,
     progress: Progress | None = None,
 ) -> BoundaryMap:
-    """Changes of history along a number, as far as a grid can tell, each to adjacent floats.
+    """Find the boundaries of a run's history along a number, within the resolution of a grid.
 
-    The interval is run on a grid. A cell whose ends differ is bisected until its ends are adjacent floats; a
-    half that differs too is searched as well, from the lowest float on: where there are more than asked for,
-    those left lie above all that were found. All runs are by the program that a user runs (for the cutoff
-    radius: by one that is given the radius as an argument), and both sides of every boundary are run again by
-    a fresh process.
+    The system is run at every point of a grid. A cell whose ends have different histories is bisected until
+    its ends are adjacent floats. If the other half contains a change too, that half is searched later. The
+    search proceeds upward from the lowest float, so boundaries beyond the requested number lie above all that
+    were found. All runs use the program that a user runs (for the cutoff radius, a program that takes the
+    radius as an argument). A fresh process repeats the runs on both sides of every boundary.
 
     Args:
-        steps: last step; default the system's own. What is not named here is as for `mdnum.fork_map`.
-        cells: of the grid. With at least as many as there are floats, all are run.
-        progress: called with what is done of what there is to do, and figures: the phase, what is counted.
+        steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.
+        cells: number of grid cells. If this is at least the number of floats, every float is run.
+        progress: called with the number of items done, their total, and a dictionary: the phase and the unit.
 
     Raises:
-        InputError: no such number, an empty interval, or values that make no sense.
+        InputError: the number does not exist, the interval is empty, or a value is invalid.
 
-    Error: none in a boundary: its sides are adjacent floats, and their runs decided differently.
+    Error: boundaries are exact: the two sides are adjacent floats whose runs made different decisions.
     """
     most = (MOST_BALL if isinstance(system, BallSystem) else MOST) if most is None else most
     if cells < 1 or most < 1:
@@ -261,10 +261,10 @@ def boundaries(
 
 
 def checked(program: Program, key: str, low: float, high: float) -> Number:
-    """The number of a key, an interval of which makes sense for this program.
+    """Return the number of a key, after checking that an interval of its values is valid for this program.
 
     Raises:
-        InputError: no such number, or what is wrong with the interval.
+        InputError: the number does not exist, or the interval is invalid (the message gives the reason).
     """
     number = program.number(key)
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
@@ -279,7 +279,7 @@ def checked(program: Program, key: str, low: float, high: float) -> Number:
 
 
 def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
-    """Ordinals of the grid's floats: evenly spread, or all of them."""
+    """Return the ordinals of the grid points: evenly spaced floats, or all floats of the interval."""
     first, final = line.places([low, high])[0], line.places([low, high])[-1]
     if final - first <= cells:
         return list(range(first, final + 1))
@@ -287,7 +287,7 @@ def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
 
 
 def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progress) -> list[Boundary]:
-    """The same boundaries, compared with what a fresh process finds on either side."""
+    """Mark each boundary as confirmed or not, by repeating the runs on both sides in a fresh process."""
     sides = [side for boundary in found for side in (boundary.below, boundary.above)]
     digests = digests_elsewhere(
         system,
@@ -301,7 +301,7 @@ def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progr
 
 
 def _mapped(line: NumberLine, found: list[Boundary]) -> BoundaryMap:
-    """Everything that was run, put in order."""
+    """Assemble the boundary map from all runs, sorted by the value of the number."""
     places = sorted(line.known)
     values = [line.value(place) for place in places]
     points = [line.known[place] for place in places]

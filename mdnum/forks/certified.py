@@ -1,13 +1,13 @@
-"""How far the decisions of runs can be trusted: each by itself, and one against the other.
+"""Reliability of the decisions of runs: each run by itself, and one run relative to another.
 
-Three dates. Up to its *certified horizon* no decision of a run was within its rounding bound: in exact
-arithmetic, from the same states, every one would have come out the same. Up to the end of their *protection*
-the pair of atoms next to its cutoff was further from it than the separation of the runs can have moved it. As
-long as both hold, no decision can differ. And where one program is the wider one in every role, the other
-agrees with it on every decision up to the *shadow horizon*.
+There are three dates. Up to the *certified horizon* of a run no decision was within its rounding bound: exact
+arithmetic, applied to the same states, would have given every decision the same result. Up to the end of
+*protection*, the pair closest to its cutoff was further from it than the separation of the runs can have
+moved the pair. As long as both conditions hold, no decision can differ. If one program is the wider one in
+every role, the other program agrees with all its decisions up to the *shadow horizon*.
 
-All of this is about one step at a time. A decision that is right given the state is right for this run, which
-may have left the exact history long before (that is what `forks.exact.certify` dates).
+All dates refer to decisions given the state at their step. A decision that is correct for its state is
+correct for this run, which may have left the exact history long before (`forks.exact.certify` finds when).
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Certified:
 
 
 def certified(fork: Fork) -> Certified:
-    """The dates of a pair that was followed."""
+    """Compute the three dates of a pair of runs."""
     twin, last = fork.twin, fork.steps
     if twin.a.imposable or twin.b.imposable:
         return Certified({}, None, None, None)
@@ -92,10 +92,12 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 
 
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """How far the nearest pair is from its cutoff at each step, and how far it would have to be, length.
+    """Return, at each step, the distance of the nearest pair from its cutoff, and the required distance;
+    lengths.
 
-    Two atoms may each be off by the separation, so their distance by twice that. Margins are those of the run
-    whose own rounding is smaller, which is allowed for.
+    Each of two atoms may be displaced by the separation of the runs, so their distance may be wrong by twice
+    the separation. The margins are those of the run with the smaller rounding error, which is added to the
+    required distance.
     """
     deciders = {"A": fork.twin.a.simulation.decider, "B": fork.twin.b.simulation.decider}
     a, b = deciders.values()
@@ -106,15 +108,15 @@ def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray
 
 
 def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
-    """What is compared with, in the program's dtype, as a distance."""
+    """Return the thresholds of the decisions, in the program's dtype, as distances."""
     values = np.array([threshold.value for threshold in decider.thresholds])
     return np.sqrt(values) if decider.space == "r2" else values
 
 
 def wider(twin: Twin) -> str | None:
-    """The program that has at least the other's precision in every role and more in one; None for neither.
+    """Return the program that has at least the other's precision in every role and more in one, or None.
 
-    Only of programs that are otherwise the same: what another time step decides differently is no rounding.
+    The programs must be identical otherwise: the effect of another time step, for example, is not rounding.
     """
     a, b = twin.a.simulation, twin.b.simulation
     if twin.a.begin is not None or twin.b.begin is not None or _but_for_roles(a) != _but_for_roles(b):
@@ -130,7 +132,7 @@ def wider(twin: Twin) -> str | None:
 
 
 def _but_for_roles(run: Simulation) -> tuple[Any, ...]:
-    """What must be the same in a program and its shadow."""
+    """Return the properties of a program that must be the same in its shadow."""
     tables = program(run)
     tables["precision"] = {key: value for key, value in tables["precision"].items() if key not in ROLES["md"]}
     return tables, repr(run.reduction)
@@ -156,7 +158,7 @@ class AmbiguousDecision:
 
 @dataclass(frozen=True)
 class CertifiedHorizon:
-    """Which decisions of one run are certain, given the states of that run."""
+    """The certain decisions of one run, given the states of that run."""
 
     # first step with an ambiguous decision; every decision before it would have come out the same in exact
     # arithmetic from the same states. None where there is none
@@ -168,10 +170,11 @@ class CertifiedHorizon:
 
 
 def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
-    """Every decision of a run of pairs against its bound, and the ambiguous ones in exact arithmetic.
+    """Compare every pair decision of a run with its rounding bound; repeat ambiguous ones in exact
+    arithmetic.
 
     Raises:
-        InputError: a rebuild rule that may miss pairs.
+        InputError: the rebuild rule may miss pairs.
     """
     if not simulation.rule.safe:
         raise InputError(
@@ -203,14 +206,14 @@ def exact_margin(
     end: Float[np.ndarray, "3"],
     kind: int = 0,
 ) -> tuple[Fraction, bool]:
-    """The margin of a pair without rounding, and the decision that it asks for.
+    """Compute the margin of a pair without rounding, and the decision that follows from it.
 
-    Positions are the floats of the state; the threshold and the lattice vectors are the doubles of the
-    system, as in the exact program, whatever the decision holds. In the space of r the margin is good to 400
-    binary digits, the decision exact.
+    Positions are the floats of the state. The threshold and the lattice vectors are the doubles of the
+    system, as in the exact program, whatever the dtype of the decision. In the space of r the margin is
+    accurate to 400 binary digits; the decision is exact.
 
     Args:
-        start, end: positions, length.
+        start, end: positions of the two atoms, length.
         kind: pair type.
     """
     matrix = np.asarray(cell.matrix, np.float64)

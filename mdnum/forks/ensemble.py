@@ -1,7 +1,7 @@
-"""Ensembles: one program from starts that differ by a little noise, measured at a few steps; planted changes.
+"""Ensembles of runs of one program from slightly perturbed starts, measured at a few steps; planted changes.
 
-Every feature is continuous in the positions, so that in a short run, where members of an ensemble differ by
-little, it differs by little too: pairs are counted with hats and not in boxes.
+Every feature is a continuous function of the positions, so small differences between the members of a short
+run remain small in the features. Therefore pairs are counted with hat functions and not in boxes.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ _NUMBERS = (
 
 
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
-    """Distances at which the hats of the pair histogram peak, and where it ends, length, ascending.
+    """Return the distances (length, ascending) at which the hats of the pair histogram peak, and its end.
 
-    From the closest pairs of a start to as far as pairs are counted.
+    The distances range from that of the closest pairs of a start to the largest distance that is counted.
     """
     simulation = simulation.in_row(start.state.cells[0])
     half = float(np.min(simulation.cell.widths)) / 2
@@ -54,16 +54,16 @@ def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]
 
 
 def feature_names(nodes: Float[np.ndarray, "nodes"]) -> tuple[str, ...]:
-    """The features, in the order in which `measure` gives them."""
+    """Return the names of the features in the order in which `measure` returns their values."""
     return (*_NUMBERS, *(f"pairs at distance {r:.3g}" for r in nodes[:-1]))
 
 
 def measure(
     simulation: Simulation, segment: Segment, nodes: Float[np.ndarray, "nodes"]
 ) -> Float[np.ndarray, "features"]:
-    """The features at the last step of a segment, in the internal units of the system.
+    """Compute the features at the last step of a segment, in the internal units of the system.
 
-    Energies, virial and forces are the run's own; pairs are counted by a list of their own.
+    Energies, virial and forces are taken from the run; the pairs are counted with a separate neighbor list.
     """
     potential, kinetic, virial = (
         float(segment.rows_of(name)[-1]) for name in ("potential", "kinetic", "virial")
@@ -92,7 +92,7 @@ def _forces(force, x, tables):
 def pair_distances(
     simulation: Simulation, x: Float[np.ndarray, "atoms 3"], reach: float
 ) -> Float[np.ndarray, "pairs"]:
-    """Distances of the pairs of wrapped positions that are closer than `reach`, length."""
+    """Return the distances (length) of all pairs of wrapped positions that are closer than `reach`."""
     table = VerletList(BUILDERS["host"], RebuildRule(0.0), reach).build(x, simulation.cell)
     slots, columns = np.nonzero(table.index < len(x))
     i, j = table.order[columns], table.order[table.index[slots, columns]]
@@ -104,10 +104,10 @@ def pair_distances(
 def hats(
     distances: Float[np.ndarray, "pairs"], nodes: Float[np.ndarray, "nodes"]
 ) -> Float[np.ndarray, "hats"]:
-    """A histogram in which a distance between two nodes counts for both, by how near it is to each.
+    """Count distances in a histogram of hat functions: a distance between two nodes is shared between both.
 
-    Distances below the first node count for it; the last node only ends the histogram, so that a pair that
-    leaves does not jump.
+    Every node receives a share that grows linearly with proximity. Distances below the first node count for
+    that node. The last node only ends the histogram, so a pair that moves out of range causes no jump.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)
@@ -121,19 +121,19 @@ def hats(
 
 
 def noise_size(simulation: Simulation) -> float:
-    """Displacement of the furthest atom of a start, length."""
+    """Return the displacement (length) of the furthest atom when a start is perturbed."""
     largest = np.abs(np.asarray(first_state(simulation).state.x)).max()
     return NOISE * float(np.spacing(np.float32(largest)))
 
 
 def starts(simulation: Simulation, count: int, seed: int, start: Start | None = None) -> list[Start]:
-    """Starts of an ensemble: the simulation's own, each with other noise."""
+    """Create the starts of an ensemble: the simulation's own start with different noise for each member."""
     programs = MdProgram(simulation, start).nudged(noise_size(simulation), count, seed)
     return [program.start for program in programs]
 
 
 def stretches(simulation: Simulation, start: Start, steps: Iterable[int]) -> Iterator[Segment]:
-    """The segments of a run that end with each of some steps, ascending; they end where it blows up."""
+    """Run to each of some ascending steps, yielding the segment that ends there; stop if the run blows up."""
     for step in steps:
         for segment in Engine(simulation, step, start=start, record=False).segments():
             if segment.closes in FAILURES:
@@ -149,12 +149,12 @@ def ensemble(
     nodes: Float[np.ndarray, "nodes"],
     note: Callable[[], None] | None = None,
 ) -> Float[np.ndarray, "windows runs features"]:
-    """Features of every run at every window; not a number from where a run blew up.
+    """Measure the features of every run at every window; NaN from the window at which a run blew up.
 
     Args:
         begin: a start for each run.
         windows: steps, ascending.
-        nodes: of the comparison, see `nodes_of`.
+        nodes: nodes of the pair histogram, see `nodes_of`.
         note: called after each run.
     """
     out = np.full((len(windows), len(begin), len(feature_names(nodes))), np.nan)
@@ -171,9 +171,9 @@ def ensemble(
 
 
 def steps_to_diverge(simulation: Simulation, start: Start | None, separation: float, seed: int) -> int | None:
-    """The step at which two members of an ensemble are a given length from each other.
+    """Return the step at which two members of an ensemble are separated by a given length.
 
-    None where they are not within 20,000 steps, or blow up.
+    The result is None if their separation is smaller for 20,000 steps, or if a run blows up.
     """
     steps = range(_EVERY, _LONGEST + 1, _EVERY)
     pair = [stretches(simulation, one, steps) for one in starts(simulation, 2, seed, start)]
@@ -190,7 +190,7 @@ def steps_to_diverge(simulation: Simulation, start: Start | None, separation: fl
 
 @dataclass(frozen=True)
 class Change:
-    """A program that is changed on purpose."""
+    """A program that was changed on purpose."""
 
     name: str  # of the change, for readers
     must_fail: bool  # whether it is another model; else only other rounding
@@ -199,10 +199,11 @@ class Change:
 
 
 def planted(a: Simulation) -> tuple[Change, ...]:
-    """The changes that apply to a simulation: a longer time step and a shorter cutoff, which must fail;
-    forces in the other precision, pairs in another order and lists by the other search, which must pass.
+    """Create the planted changes that apply to a simulation.
 
-    The cutoff and the precision of a many-body potential cannot be changed, so those are left out.
+    A longer time step, and a shorter cutoff must fail. Forces in the other precision, pairs in another order
+    and lists built by the other search must pass. The cutoff and the precision of a many-body potential
+    cannot be changed, so these two changes are omitted for such a potential.
     """
     longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
     search = next(name for name in BUILDERS if name != a.builder)
@@ -218,7 +219,7 @@ def planted(a: Simulation) -> tuple[Change, ...]:
 
 
 def shorter(a: Simulation, factor: float) -> Simulation:
-    """The same simulation with all its cutoff radii, and where a switch sets in, scaled."""
+    """Scale all cutoff radii of a simulation, and the radii at which switching functions begin."""
 
     def ends(model):
         return jax.tree.leaves([(part.r_cut, part.r_onset) for part in model.parts])

@@ -1,11 +1,11 @@
-"""Two finished runs of one world: where they diverge, from what they stored, and what was different.
+"""Where two finished runs of one world diverge, and how the runs differ, according to their folders.
 
-Nothing is run. The first differing bit and the fork are read from the tables of both folders; when the
-positions are wanted, the runs are in the folders too (`twin_of`), and `mdnum.forks.fork` follows them again.
+No run is repeated. The first differing bit and the fork are read from the tables of both folders. To compare
+positions, `twin_of` rebuilds both programs from the folders, and `mdnum.forks.fork` runs them again.
 
-Two runs are of different systems where no step or subject of one corresponds to one of the other: other
-atoms, another box, another potential or contact. Every number and every choice of a program is a difference
-and may be large.
+Two runs belong to different systems if their steps or subjects do not correspond: different atoms, another
+box, another potential or another contact. Any other difference, in a number or in a choice of the program, is
+allowed, however large.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _SAME = 1e-6
 
 @dataclass(frozen=True)
 class StoredFlip:
-    """A stored flip that one of two runs has and the other has not."""
+    """A stored flip that only one of two runs has."""
 
     # run, step: which run has it, "A" or "B", and when
     run: str
@@ -69,7 +69,7 @@ class StoredFlip:
 
 @dataclass(frozen=True)
 class FolderFork:
-    """Where two runs diverge, as read from their folders."""
+    """The point at which two runs diverge, as read from their folders."""
 
     # world, a, b: "md" or "ball", and the folders
     world: str
@@ -91,15 +91,15 @@ class FolderFork:
 
 
 def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> FolderFork:
-    """Where two finished runs diverge.
+    """Find where two runs diverge, using their folders.
 
     Args:
-        a, b: run folders of one world, finished or not; or folders of `mdnum flips` and `mdnum.Recorder`,
+        a, b: folders of runs of one world, finished or not; or folders of `mdnum flips` and `mdnum.Recorder`,
             whose steps are frames.
 
     Raises:
-        InputError: the runs are of different worlds or systems, so that no step of theirs corresponds; names
-            what is different. Or a folder is that of a fork.
+        InputError: the runs belong to different worlds or systems, so that their steps do not correspond (the
+            message names the difference); or a folder holds the result of a fork.
         FolderError: a folder holds no run.
     """
     first = a if isinstance(a, RunFolder) else RunFolder.open(a)
@@ -122,14 +122,14 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
 
 
 def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bool = True) -> Any:
-    """The simulation or the ball's system of a run folder.
+    """Load the simulation or the ball's system of a run folder.
 
     Args:
-        objects: simulations, one of which ran there; needed where it was made of objects.
-        built: False leaves a system file as it is, so that code that it names is not executed.
+        objects: candidate simulations, one of which produced the run; needed if it was made from objects.
+        built: False to leave a system file unbuilt, so that code named in the file is not executed.
 
     Raises:
-        InputError: none of them did.
+        InputError: none of the objects produced the run.
     """
     if not (folder / SIMULATION_FILE).is_file():
         return opened(load(folder)) if built else load(folder)
@@ -146,9 +146,9 @@ def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bo
 
 
 def twin_of(found: FolderFork, objects: Sequence[Simulation] = ()) -> Twin:
-    """The runs of two folders of molecular dynamics, to be followed again; objects as for `simulation_in`.
+    """Rebuild the programs of two molecular-dynamics folders, to run them again (`objects`: `simulation_in`).
 
-    A replay has the bits of the stored run where versions and processor are the same.
+    A replay agrees bit for bit with the stored run if versions and processor are the same.
     """
     difference = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
     a, b = alike(*(simulation_in(path, objects) for path in (found.a, found.b)))
@@ -192,7 +192,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
-    """Where decisions on the positions of two loops or files diverge."""
+    """Find where the decisions on the positions of two loops or files diverge."""
     summaries, names = (first.summary, second.summary), ("rule", "i", "j", "rank")
     rules, between = ([each[name] for each in summaries] for name in ("rules", "between"))
     names_of = [", ".join(one["rule"] for one in each) for each in rules]
@@ -223,7 +223,9 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """The choices that differing keys amount to: dtypes by role are one, so are a cutoff and its numbers."""
+    """Return the choices that a set of differing keys stands for: all dtypes by role are one choice, and so
+    are a cutoff and its numbers.
+    """
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}
     for key, one, other in programs:
@@ -243,7 +245,7 @@ def _different(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Differe
 def _alone(
     first: RunFolder, second: RunFolder, table: str, labels: tuple[str, ...], steps: int, clock: str = "step"
 ) -> tuple[int | None, list[StoredFlip]]:
-    """The first step at which a flip is in one table alone, and those flips."""
+    """Return the first step at which only one of two tables has a flip, and the flips of that step."""
     known = [folder.table(table, rows=1).column_names for folder in (first, second)]
     names = (clock, *labels, "entered", *["terms"] * all("terms" in one for one in known))
     further = ("distance", "ambiguous") if table == "flips" else ()
@@ -311,10 +313,10 @@ def _ball_dates(first: RunFolder, second: RunFolder) -> dict[str, Any]:
 
 
 def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], where: str) -> list[Difference]:
-    """What differs about the atoms at step 0.
+    """List how the atoms of two runs differ at step 0.
 
     Raises:
-        InputError: the atoms or the box are those of different systems.
+        InputError: the atoms or the boxes belong to different systems.
     """
     from ase import Atoms
     from ase.io import read
@@ -356,7 +358,9 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
 
 
 def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
-    """Whether something is the same, and what to say where it is not."""
+    """Compare two sets of atoms property by property; yield whether a property agrees, and the message if
+    not.
+    """
     yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
     symbols = [each.get_chemical_symbols() for each in (one, other)]
     yield symbols[0] == symbols[1], "species differ or their order"

@@ -1,15 +1,15 @@
-"""The linearized run: how a small perturbation of the start grows along a run, and which decisions it flips.
+"""The linearized run: how a small perturbation of the start grows, and which decisions it flips.
 
-The tangent is carried along the states that the run itself recorded, so the run that is linearized is the
-run that was made, bit for bit, list after list. Its growth is the largest Lyapunov exponent: it is rescaled
-again and again (Benettin, Galgani, Giorgilli and Strelcyn 1980), so it never saturates, as the separation of
-two runs does.
+The tangent is propagated along the states that the run recorded, so the linearized run is the recorded run,
+bit for bit, list after list. The growth rate of the tangent is the largest Lyapunov exponent. The tangent is
+rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn 1980), so it does not saturate; the separation
+of two runs does.
 
-Along the run each decision has a margin m and a tangent dm/da, a being the amplitude of the perturbation:
-to first order it flips at a = -m / (dm/da). The least of these at each step answers for all amplitudes at
-once, as long as the perturbed run stays close to the run and makes the same decisions. Where the force jumps
-at the cutoff, the first flip kicks the two atoms, and what was linearized is another run from there on: the
-forecast ends with it. Where the force is continuous there, a flip changes nothing to first order.
+Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation: to first
+order the decision flips at a = -m / (dm/da). The smallest of these amplitudes at each step covers all
+perturbations, as long as the perturbed run remains close to the run and makes the same decisions. If the
+force jumps at the cutoff, the first flip kicks the two atoms, and from then on the linearization describes
+another run: the forecast ends there. If the force is continuous, a flip changes nothing to first order.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _ULPS = 8.0
 
 @dataclass(frozen=True)
 class StepTangents:
-    """The tangent along some steps of one list."""
+    """The tangent of a run during the steps of one neighbor list."""
 
     segment: Segment  # the steps
     # log of the length of the tangent (positions, and velocities times 30 time steps) at each step, relative
@@ -77,15 +77,15 @@ def tangents(
     dv: Float[np.ndarray, "atoms 3"],
     reach: bool = True,
 ) -> Iterator[StepTangents]:
-    """Carry a perturbation of the start along a run.
+    """Propagate an infinitesimal perturbation of the start along a run.
 
     Args:
-        simulation: with a pair potential.
-        dx: perturbation of the positions per amplitude, length. dv: of the velocities.
-        reach: whether to ask for the amplitudes at which decisions flip.
+        simulation: a simulation with a pair potential.
+        dx: perturbation of the positions per amplitude, length. dv: perturbation of the velocities.
+        reach: whether to compute the amplitudes at which decisions flip.
 
     Raises:
-        InputError: a many-body potential, or an integrator that is no linear `KickDrift`.
+        InputError: the potential is a many-body potential, or the integrator is not a linear `KickDrift`.
     """
     force = simulation.smooth.force
     check_kick(simulation.integrator)
@@ -141,7 +141,7 @@ def _length(tangent, clock: float) -> float:
 
 
 def _labels(segment: Segment, slot: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-    """The pairs of flat slots, -1 where there is none."""
+    """Return the atom pairs in the given flat slots, or -1 for an empty slot."""
     order = segment.table.order
     row, column = np.divmod(slot, len(order))
     ends = np.stack([order[column], np.append(order, -1)[segment.table.index[row, column]]], axis=-1)
@@ -206,7 +206,7 @@ def _carry(
 
 @dataclass(frozen=True)
 class Lyapunov:
-    """Growth of a tangent along a run."""
+    """Growth of the tangent along a run: the largest Lyapunov exponent."""
 
     # steps, timestep: of the run; the time step in the units of the system's file
     steps: int
@@ -225,30 +225,30 @@ class Lyapunov:
 
     @property
     def rate_time(self) -> float:
-        """The exponent per unit of time of the system's file."""
+        """Lyapunov exponent per unit of time of the system's file."""
         return self.rate / self.timestep
 
     @property
     def error_time(self) -> float:
-        """Its standard error."""
+        """Standard error of the exponent per unit of time."""
         return self.error / self.timestep
 
     def ratio(self, seen: Growth) -> float:
-        """Growth rate of two runs over the exponent; NaN where they were not seen to grow.
+        """Return the growth rate of two runs divided by the exponent; NaN if no growth was found.
 
-        Near 1 the runs diverged as the motion makes them. Well above it, their flips did it.
+        A ratio near 1 means that the dynamics separated the runs; with a ratio well above 1 their flips did.
         """
         return seen.rate / self.rate if self.chaotic else float("nan")
 
     def steps_to(self, start: float, end: float) -> float | None:
-        """The step at which a displacement of the start has grown from one size to another.
+        """Return the step at which a displacement of the start has grown from one size to another.
 
-        From the run itself as far as it goes, beyond it at the rate. None where it does not get there: where
-        the run is not chaotic.
+        Growth is taken from the run, and extrapolated at the exponential rate beyond its end. The result is
+        None if the run is not chaotic and the displacement does not reach the final size.
 
         Args:
             start: largest displacement of an atom at the start, length; an ulp, for example.
-            end: largest displacement asked for, length.
+            end: final size of the largest displacement, length.
         """
         wanted = float(np.log(end / start))
         beyond = self.furthest >= wanted
@@ -260,17 +260,17 @@ class Lyapunov:
 
 
 def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0) -> Lyapunov:
-    """The largest Lyapunov exponent along a run.
+    """Compute the largest Lyapunov exponent along a run.
 
     Args:
-        simulation: with a pair potential.
-        seed: of the perturbation that is followed: random displacements.
+        simulation: a simulation with a pair potential.
+        seed: random seed of the initial perturbation, which consists of random displacements.
 
     Raises:
-        InputError: a many-body potential, or too few steps for an error.
+        InputError: the potential is a many-body potential, or the run is too short for an error estimate.
 
-    Error: statistical, see Lyapunov.error; and flips of a hard cutoff do not act on a tangent, so growth that
-        is made by flips alone is not in it.
+    Error: statistical, see Lyapunov.error. Flips at a hard cutoff do not act on a tangent, so growth caused
+        by flips alone is not included.
     """
     last = simulation.steps if steps is None else steps
     if last < 10 * BLOCKS:
@@ -293,7 +293,7 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
 
 @dataclass(frozen=True)
 class PredictedFlip:
-    """A decision that a perturbation is expected to flip."""
+    """A decision that a perturbation is predicted to flip."""
 
     # step, i, j: of the decision, i < j
     step: int
@@ -306,7 +306,7 @@ class PredictedFlip:
 
 
 class ForecastRange(NamedTuple):
-    """How far a forecast is good for one amplitude."""
+    """The last step at which a forecast for one amplitude is valid, and the reason why it ends there."""
 
     step: int  # the last one; -1 for none
     # why there: "end" of the run; "flip", the first one kicks its atoms; "close", whether a decision of the
@@ -317,10 +317,10 @@ class ForecastRange(NamedTuple):
 
 @result
 class Forecast:
-    """What perturbations of the start along one direction will flip, to first order.
+    """First-order prediction of the decisions that perturbations of the start along one direction will flip.
 
-    Error: second order in the displacement, and some ulps; a decision that may flip or not within it is not
-        predicted. `good_until` says how far a forecast goes.
+    Error: second order in the displacement, plus a few ulps; a decision whose flip is uncertain within this
+        error is not predicted. `good_until` returns the last step of a valid forecast.
     """
 
     # simulation, steps: the run
@@ -346,11 +346,11 @@ class Forecast:
 
     @property
     def kicks(self) -> bool:
-        """Whether a flip changes the force by a jump, and with it all that follows."""
+        """True if the force jumps at a flip, so that the flip changes all later motion."""
         return self.simulation.cutoff.smoothness < 1
 
     def good_until(self, amplitude: float) -> ForecastRange:
-        """Up to which step what is predicted of a perturbation holds, and why not beyond."""
+        """Return the last step at which the forecast for an amplitude is valid, and what ends it."""
         listed = self._until(2 * abs(amplitude) * self.furthest > self.room)
         ends = ((self.steps, "end"), (self.linear_until(amplitude), "size"), (listed, "list"))
         last = min((ForecastRange(*end) for end in ends), key=lambda one: one.step)
@@ -365,13 +365,13 @@ class Forecast:
         return last
 
     def first(self, amplitude: float, count: int = 3) -> tuple[PredictedFlip, ...]:
-        """The decisions that a perturbation flips first, by step, each pair once; no further than it is good.
+        """Predict the decisions that a perturbation flips first, by step, as far as the forecast is valid.
 
-        At most `KEPT` of a step; where there are as many, there may be more.
+        At most `KEPT` flips of a step are listed; a step with `KEPT` flips may have more.
 
         Args:
-            amplitude: of the perturbation; its sign matters.
-            count: how many at most.
+            amplitude: amplitude of the perturbation; its sign matters.
+            count: largest number of flips to return.
         """
         sign = 0 if amplitude >= 0 else 1
         sure = self.reach[sign] <= abs(amplitude) * (1 - self._error(amplitude))[:, None]
@@ -382,10 +382,10 @@ class Forecast:
         return _each_pair_once(flips, count)
 
     def nearest(self, count: int = 10) -> tuple[PredictedFlip, ...]:
-        """The decisions that the smallest amplitudes of either sign flip, each pair once.
+        """Return the decisions that are flipped at the smallest amplitudes of either sign, each pair once.
 
-        Each at an amplitude at which its forecast is good until then: where flips kick, one that comes after
-        another one is predicted for no amplitude.
+        A flip is included only if its forecast is valid up to its step: where flips kick the atoms, a flip
+        that follows another one cannot be predicted at any amplitude.
         """
         # where flips kick, only what flips sooner or at less than all before it can be the first
         least = np.minimum.accumulate(self.reach.min(axis=2), axis=1)
@@ -399,14 +399,14 @@ class Forecast:
         return _each_pair_once(good, count)
 
     def linear_until(self, amplitude: float) -> int:
-        """The last step at which a perturbation is expected to be small enough for a forecast."""
+        """Return the last step at which a perturbation is expected to be small enough for a forecast."""
         return self._until(abs(amplitude) * self.furthest > LINEAR * self.simulation.r_cut)
 
     def _until(self, beyond: Bool[np.ndarray, "rows"]) -> int:
         return int(beyond.argmax()) - 1 if beyond.any() else self.steps
 
     def _error(self, amplitude: float) -> Float[np.ndarray, "rows"]:
-        """How far off the amplitude of a flip may be, as a share of this one."""
+        """Estimate the relative error of the predicted amplitude of a flip at each step."""
         size = abs(amplitude)
         with np.errstate(divide="ignore", over="ignore"):
             return _SECOND_ORDER * size * self.furthest / self.simulation.r_cut + _ULPS * self.ulp / size
@@ -420,7 +420,7 @@ class Forecast:
 
 
 def _each_pair_once(flips: Iterable[PredictedFlip], count: int) -> tuple[PredictedFlip, ...]:
-    """The first flips, at most so many, without another one of a pair."""
+    """Return the first `count` flips of different pairs."""
     found: dict[tuple[int, int], PredictedFlip] = {}
     for flip in flips:
         found.setdefault((flip.i, flip.j), flip)
@@ -437,16 +437,16 @@ def forecast(
     *,
     seed: int = 0,
 ) -> Forecast:
-    """Foretell flips along a direction in the start.
+    """Predict flips caused by perturbing the start along a direction.
 
     Args:
-        simulation: with a pair potential.
-        dx, dv: the direction; default random displacements, the furthest by 1, so that an amplitude is the
+        simulation: a simulation with a pair potential.
+        dx, dv: the direction; default random displacements whose maximum is 1, so that an amplitude is the
             largest displacement.
-        seed: of a random direction.
+        seed: random seed of a random direction.
 
     Raises:
-        InputError: a many-body potential, a direction that is zero or of the wrong shape.
+        InputError: the potential is a many-body potential, or the direction is zero or has the wrong shape.
     """
     last = simulation.steps if steps is None else steps
     expect_at_least(1, steps=last)
@@ -470,6 +470,6 @@ def forecast(
 
 
 def direction(simulation: Simulation, seed: int) -> Float[np.ndarray, "atoms 3"]:
-    """Random displacements, the furthest atom by 1."""
+    """Return random displacements of all atoms, scaled so that the largest one is 1."""
     noise = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
     return noise / np.sqrt((noise**2).sum(axis=1)).max()

@@ -1,12 +1,12 @@
-"""What processes of their own compute for forks: histories again, and one system by several programs.
+"""Computations in separate processes: histories computed again, and one system run by several programs.
 
-Compiled or not, in a batch, inside a gradient, for other processors: programs of one system compute the same
-formulas, and the compiler is free to round them otherwise. XLA's flags belong to a process, so each variant
-runs in one of its own. Variants whose positions have the same hashes at every step are one program as far as
-numbers go; where they are not, the pattern of who agrees with whom tells the cause.
+Programs of one system (compiled or not, batched, inside a gradient, for other processors) compute the same
+formulas, but the compiler is free to round them differently. XLA's flags apply to a whole process, so each
+variant runs in its own process. Variants whose positions have equal hashes at every step are numerically one
+program; if the hashes differ, the pattern of agreement reveals the cause.
 
-`python -m mdnum.forks.processes FILE` answers the question in a JSON file: digests, a line each, on standard
-output for `digests_elsewhere`; an array of positions for `variants`.
+`python -m mdnum.forks.processes FILE` answers the question in a JSON file. For `digests_elsewhere` the answer
+is one digest per line on standard output; for `variants`, a file with an array of positions.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _NO_FMA = ("--xla_cpu_max_isa=AVX",)
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to run the same steps."""
+    """One of several ways to run the same steps."""
 
     name: str  # what to call it
     # "scan" (one compiled loop), "rollout" (mdnum's own), "vmap" (the first of a batch of equal copies),
@@ -98,18 +98,18 @@ class Ran:
 
     @property
     def separation(self) -> float:
-        """From the reference's atoms at the last common step; NaN where it failed."""
+        """Largest separation from the reference at the last common step; NaN if the variant failed."""
         return float(self.separations[-1]) if len(self.separations) else float("nan")
 
     def agrees(self, other: Ran) -> bool:
-        """Whether both have the same positions, as far as both ran."""
+        """Return True if both variants have the same positions at all common steps."""
         common = min(len(self.hashes), len(other.hashes))
         return common > 0 and self.hashes[:common] == other.hashes[:common]
 
 
 @result
 class Variants:
-    """Variants of one system, by what they compute."""
+    """Variants of one system, grouped by their results."""
 
     rows: tuple[Ran, ...]  # one a variant, in the order asked for
     reference: str  # name of the one that the others are compared with: the first that ran
@@ -119,7 +119,7 @@ class Variants:
 
     @property
     def clusters(self) -> list[list[str]]:
-        """Names of the variants that agree with each other to the last bit, the reference's first."""
+        """Names of the variants that agree bit for bit, by cluster, that of the reference first."""
         count = max(row.cluster for row in self.rows) + 1
         return [[row.variant.name for row in self.rows if row.cluster == k] for k in range(count)]
 
@@ -130,21 +130,21 @@ def variants(
     which: Sequence[Variant] = VARIANTS,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Variants:
-    """Run a system in several programs, two processes at a time, and tell which agree.
+    """Run a system in several programs, two processes at a time, and find which results agree.
 
-    All use one list, as wide as twice the skin where the box has room, and stop before it is used up. On
-    another machine the clusters may be others: a processor without fused multiply-add has nothing to fuse.
+    All programs use a single neighbor list, with twice the skin if the box has room, and stop before that
+    skin is used up. Another machine may give other clusters: some processors have no fused multiply-add.
 
     Args:
-        system: one that came from a file; pair potentials only.
-        steps: of each program; the eager one takes a dozen.
-        which: the first one that runs is what the others are compared with; one that fails or takes too long
-            says so in its row.
-        progress: called with how many have ended, how many there are, and the name of the last.
+        system: a system that was loaded from a file and has a pair potential.
+        steps: steps of each program; the eager program runs only twelve.
+        which: variants; the first one that succeeds is the reference for the others. The row of a variant
+            that fails or takes too long contains the reason.
+        progress: called with the number of finished variants, their total, and the name of the last one.
 
     Raises:
-        InputError: a many-body potential, no steps, or no variant.
-        MdnumError: none of them ran.
+        InputError: the potential is a many-body potential, or there are no steps or no variants.
+        MdnumError: all variants failed.
     """
     from mdnum.md.cell import Cell, displacement
     from mdnum.md.integrators import check_one_box
@@ -212,7 +212,7 @@ def _ran(variant: Variant, question: Mapping[str, Any], file: Path) -> tuple[Ran
 
 
 def clustered(rows: Sequence[Ran]) -> list[Ran]:
-    """The rows with the numbers of their clusters; that of the first one that ran, the reference, is 0."""
+    """Add cluster numbers to the rows; the cluster of the reference, the first variant that ran, is 0."""
     reference = next((row for row in rows if not row.failed), None)
     # the longest of each cluster stands for it, so that a short run joins whom it agrees with
     heads: list[Ran] = []
@@ -226,11 +226,11 @@ def clustered(rows: Sequence[Ran]) -> list[Ran]:
 
 
 def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
-    """What the pattern of agreement says, by code; nothing is said of variants that were not run.
+    """Derive causes from the pattern of agreement, by code; variants that were not run give no cause.
 
-    "fused", "others" and "not_fused" of programs that cannot fuse or do not; "eager_..." of the one without a
-    compiler; "same", "fuses", "orders" and "leaves" of the others, whose name is in "program"; "reversed".
-    Where one leaves the reference, "step" says when.
+    Codes: "fused", "others" and "not_fused" for programs without fused operations; "eager_..." for the
+    program without a compiler; "same", "fuses", "orders" and "leaves" for other programs, named in "program";
+    "reversed". If a program departs from the reference, "step" is the first differing step.
     """
     by_name = {row.variant.name: row for row in rows if not row.failed}
     reference = next(iter(by_name.values()))
@@ -271,9 +271,10 @@ def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
 def positions_of(
     simulation: Simulation, steps: int, program: ProgramName
 ) -> Float[np.ndarray, "steps 3 atoms"]:
-    """Wrapped positions at steps 1, 2, ... in the user's order, as one program computes them in this process.
+    """Compute wrapped positions at steps 1, 2, ... with one program in this process, in the user's atom
+    order.
 
-    Ends before an atom has moved by half the skin of the one list.
+    The result ends before an atom has moved by half the skin of the only list.
     """
     from mdnum.md.cell import displacement
     from mdnum.rollout.engine import Engine, first_state
@@ -350,7 +351,7 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
 
 
 def digests(system: Simulation | BallSystem, key: str, steps: int, values: Sequence[float]) -> list[str]:
-    """Digests of the histories at some values of a number, one after the other."""
+    """Compute the digests of the histories for some values of a number, one after another."""
     number = program_of(system, steps).number(key)
     return [number.at(value).history(steps).digest for value in values]
 
@@ -362,16 +363,16 @@ def digests_elsewhere(
     values: Sequence[float],
     progress: Callable[[int], None] | None = None,
 ) -> list[str]:
-    """The same from a fresh process: what a boundary must survive before it is believed.
+    """Compute the digests of histories in a fresh process, to confirm boundaries independently.
 
-    The system is written to a folder and read again there, bit for bit, and its program is compiled again,
+    The system is written to a folder and read there again, bit for bit, and its program is compiled again
     under the same environment.
 
     Args:
-        progress: called with how many are known, at the start and after each.
+        progress: called with the number of known digests, at the start and after each one.
 
     Raises:
-        MdnumError: a process failed.
+        MdnumError: the process failed.
     """
     found: list[str] = []
 
@@ -395,10 +396,10 @@ def digests_elsewhere(
 
 
 def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
-    """What another process can read and make again, bit for bit.
+    """Return the system in a form that another process can read and recreate, bit for bit.
 
     Raises:
-        InputError: it was made of objects, which are in this process only.
+        InputError: the system was made from objects, which exist only in this process.
     """
     own = system if isinstance(system, BallSystem) else system.file
     if own is None:
@@ -414,7 +415,7 @@ def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
 
 
 def _question(system: Simulation | BallSystem, steps: int, folder: Path) -> dict[str, Any]:
-    """What every process is asked: the system, which is written into a folder, and the last step."""
+    """Assemble the question to a process: the system, written into a folder, and the last step."""
     path = in_a_file(system).write(folder / "system")
     return {"path": str(path), "steps": steps, "code": is_allowed()}
 
@@ -426,13 +427,13 @@ def _ask(
     timeout: float | None = None,
     settings: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Have a process answer a question; why it failed, "" where it did not.
+    """Run a process that answers a question; return the reason if it fails, or "".
 
     Args:
-        file: the question is written to it.
-        heard: called with each line that it prints.
-        timeout: s.
-        settings: variables of its environment.
+        file: file to which the question is written.
+        heard: called with each line that the process prints.
+        timeout: time limit in seconds.
+        settings: environment variables of the process.
     """
     file.write_text(json.dumps(question))
     command, late = python("-m", "mdnum.forks.processes", str(file)), []
@@ -468,7 +469,7 @@ def _ask(
 
 
 def main() -> None:
-    """Answer the question in the file that the last argument names."""
+    """Answer the question in the file named by the last command-line argument."""
     question: dict[str, Any] = json.loads(Path(sys.argv[-1]).read_text())
     with allow_code(question["code"]):
         system = opened(question["path"])

@@ -1,15 +1,16 @@
-"""Simulations whose lists hold the same pairs in another order: of jax-md's formats, or shuffled.
+"""Simulations whose neighbor lists hold the same pairs in another order: that of a jax-md format, or
+shuffled.
 
-A pair's force on one end is exactly minus that on the other, so a format changes nothing but an order. Dense
-and sparse lists hold a pair from both ends and add half its force for each. A sparse list adds the halves of
-an atom's own row in one sum, those of the rows that name it in another, and the two together; where rows are
-sorted that is one loop by label. A dense list scatters the second half onto the sum of the first. An
-ordered-sparse list holds each pair once: an atom's terms with later atoms are one sum, those with earlier
-atoms another.
+The forces of a pair on its two atoms are exactly opposite, so a format changes only the order of sums. Dense
+and sparse lists hold each pair twice, and half its force is added each time. A sparse list adds the halves
+from an atom's own row in one sum, the halves from rows that contain the atom in another sum, and then both
+sums; with sorted rows this is one loop by label. A dense list scatters the second half onto the sum of the
+first. An ordered-sparse list holds each pair once: an atom's terms with later atoms form one sum, those with
+earlier atoms another.
 
 Source: jax_md.smap.pair_neighbor_list and the transpose of its gathers, whose forces have these orders bit
-for bit (tests/forks/test_choices.py, jax-md 0.2.29). One thing more belongs to XLA: it adds an own row of
-more than 32 slots in windows of 32, which is left out here.
+for bit (tests/forks/test_choices.py, jax-md 0.2.29). One detail of XLA is not reproduced: a row with more
+than 32 slots is added in windows of 32.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ class ReorderedSimulation(Simulation):
 
     @classmethod
     def of(cls, simulation: Simulation, order: str | int) -> ReorderedSimulation:
-        """A simulation with such lists, and the sums that go with a format unless they have no order."""
+        """Create a simulation with reordered lists; sums follow the list format unless they do not depend on
+        order.
+        """
         same = _fields(Simulation, simulation)
         if isinstance(order, str) and simulation.reduction == Sequential():
             same["reduction"] = _SUMS[order]
@@ -44,11 +47,11 @@ class ReorderedSimulation(Simulation):
 
     @property
     def lists(self):
-        """Lists of another order are other lists."""
+        """Properties that identify the lists; a different order makes different lists."""
         return (*super().lists, self.order)
 
     def verlet_list(self, skin: float | None = None) -> VerletList:
-        """As the simulation's own, in the other order."""
+        """Create the simulation's own Verlet list with the pairs in the other order."""
         made = super().verlet_list(skin)
         if isinstance(self.order, str):
             return FormattedList(**_fields(VerletList, made), format=self.order)
@@ -62,7 +65,7 @@ def _fields(kind: type, value: object) -> dict:
 
 @dataclass
 class FormattedList(VerletList):
-    """A list whose slots are in the order in which a format adds."""
+    """A neighbor list whose slots are in the order in which a jax-md format adds the pair terms."""
 
     # "dense" or "sparse" (by label), or "ordered-sparse" (later atoms in the first half of the slots, earlier
     # ones in the second, both by label)
@@ -70,7 +73,7 @@ class FormattedList(VerletList):
     half: int = 0  # slots of one half; grows with what it must hold
 
     def build(self, positions, cell) -> PairTable:
-        """As the search found them, in another order."""
+        """Build the pair table of the search, with the pairs in the order of the format."""
         table = super().build(positions, cell)
         atoms = len(table.order)
         labels = np.append(table.order, atoms)[table.index]
@@ -92,7 +95,7 @@ def _first(
     chosen: Bool[np.ndarray, "slots atoms"],
     slots: int,
 ) -> Int[np.ndarray, "kept atoms"]:
-    """The chosen neighbors of each atom by label, then padding."""
+    """Return the chosen neighbors of each atom, sorted by label and followed by padding."""
     atoms = index.shape[1]
     keys = np.where(chosen, labels, atoms)
     order = np.argsort(keys, axis=0, kind="stable")[:slots]
@@ -105,18 +108,18 @@ def _first(
 
 @dataclass(frozen=True)
 class ShuffledBuilder:
-    """A neighbor search whose rows are shuffled, each atom's in its own way."""
+    """A neighbor search that shuffles the neighbors of each atom independently."""
 
     inner: ListBuilder  # who searches
     seed: int  # of the shuffle; every list of a run is shuffled with it again
 
     @property
     def name(self) -> str:
-        """The inner search's word."""
+        """Name of the inner search."""
         return self.inner.name
 
     def build(self, positions, cell, r_list, slots):
-        """The inner search's table with the neighbors of each atom in another order, padding at the end."""
+        """Build the inner search's table with each atom's neighbors shuffled and the padding at the end."""
         table, order, most = self.inner.build(positions, cell, r_list, slots)
         table, atoms = np.asarray(table), table.shape[1]
         keys = np.random.default_rng(self.seed).random(table.shape)

@@ -1,7 +1,9 @@
-"""Runs of molecular dynamics made once more around a fork: its atoms, overridden decisions, minimal causes.
+"""Molecular-dynamics runs repeated around a fork: the atoms near it, overridden decisions, and minimal
+causes.
 
-A decision is overridden by imposing A's on B, while B decides everything else. The fewest pairs that keep B
-with A are found by bisection and delta debugging, as Verrou finds the instructions of a program.
+A decision is overridden by imposing A's decision on B; B makes all other decisions itself. The smallest set
+of pairs that keeps B with A is found by bisection and delta debugging, as Verrou finds the instructions of a
+program.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ _SAMPLES = 400
 
 @dataclass(frozen=True)
 class Neighborhood:
-    """Atoms around the deciding pair, at the fork."""
+    """The atoms around the deciding pair at the fork."""
 
     # labels of A; the pair first, the others by their distance from its middle, shape (near,)
     atoms: Int[np.ndarray, "near"]
@@ -48,7 +50,7 @@ class Neighborhood:
 
 
 def neighborhood(fork: Fork) -> Neighborhood | None:
-    """The atoms around the pair at the fork, from both runs followed up to there; None without one."""
+    """Collect the atoms around the pair at the fork, repeating both runs up to there; None without a pair."""
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
@@ -88,7 +90,7 @@ def neighborhood(fork: Fork) -> Neighborhood | None:
 
 @dataclass(frozen=True)
 class Pinned:
-    """B with some decisions overridden by A's."""
+    """Result of a run of B in which some decisions were overridden by A's."""
 
     pairs: tuple[tuple[int, int], ...]  # whose decisions were
     # first, last: steps of the window in which they were
@@ -107,17 +109,18 @@ def pinned(
     last: int | None = None,
     steps: int | None = None,
 ) -> Pinned:
-    """Run B again, with A's decisions about some pairs imposed, and see how it leaves A.
+    """Run B again with A's decisions about some pairs imposed, and compute B's separation from A.
 
     Args:
-        fork: a pair of runs of one labeling.
-        pairs: (i, j); default the pair at the fork, for as long as the two runs first disagreed about it.
-        first, last: the steps of the window; default the whole run where pairs are named.
-        steps: last step; default as far as the runs were followed.
+        fork: a pair of runs with the same atom labels.
+        pairs: pairs (i, j); default the pair at the fork, during the first interval in which the runs
+            disagree about it.
+        first, last: first and last step of the window; default the whole run if pairs are given.
+        steps: last step; default the last step of the fork's runs.
 
     Raises:
-        InputError: no fork and no pairs, pairs that there are not, many-body potentials, or runs seen in
-            other labels or axes.
+        InputError: neither a fork nor pairs are given, a pair does not exist, a potential is many-body, or
+            the runs have different atom labels or axes.
     """
     check_pins(fork)
     a, b = fork.twin.a, fork.twin.b
@@ -150,10 +153,10 @@ def _check_pair(pair: tuple[int, int], atoms: int) -> None:
 
 
 def parse_pin(text: str, atoms: int) -> dict[str, Any]:
-    """What `pinned` is to pin, from words: "fork", "3-75", "3-75:600..700".
+    """Parse the text of a pin, "fork", "3-75" or "3-75:600..700", into arguments of `pinned`.
 
     Raises:
-        InputError: none of these, or a pair that there is not.
+        InputError: the text has none of these forms, or the pair does not exist.
     """
     if text.strip() == "fork":
         return {}
@@ -175,10 +178,10 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
 
 
 def check_pins(fork: Fork) -> None:
-    """Refuse a pair of runs whose single decisions cannot be imposed.
+    """Raise an error if single decisions cannot be imposed in a pair of runs.
 
     Raises:
-        InputError: many-body potentials, or runs seen in other labels or axes.
+        InputError: a potential is many-body, or the runs have different atom labels or axes.
     """
     a, b = fork.twin.a, fork.twin.b
     if a.imposable or b.imposable:
@@ -194,9 +197,10 @@ def check_pins(fork: Fork) -> None:
 
 
 def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
-    """The steps from which on a pair was decided differently, and at which no longer; None where it stayed.
+    """Return the intervals in which two runs decide a pair differently: first step, and end step (None if
+    open).
 
-    Of the cross-run flips that were kept.
+    Only the cross-run flips that were kept are used.
     """
     spells: list[tuple[int, int | None]] = []
     for flip in fork.flips:
@@ -228,22 +232,22 @@ class Minimal:
 
     @property
     def proven(self) -> bool:
-        """Whether none of the pairs can be left out."""
+        """True if each of the pairs was shown to be necessary."""
         return self.code in ("alone", "proven")
 
 
 def minimal_cause(
     fork: Fork, *, tests: int = 80, progress: Callable[[int, int], None] | None = None
 ) -> Minimal:
-    """A 1-minimal set of pairs whose pinning removes a split.
+    """Find a 1-minimal set of pairs whose pinning to A's decisions removes a split.
 
     Args:
-        fork: a pair of runs that has forked and split, of one labeling.
-        tests: runs of B at most.
-        progress: called with the tests made and allowed.
+        fork: a pair of runs with the same atom labels that has forked and split.
+        tests: largest number of runs of B.
+        progress: called with the number of tests done and the number allowed.
 
     Raises:
-        InputError: the runs did not split, are seen in other labels or axes, or have many-body potentials.
+        InputError: the runs did not split, have different atom labels or axes, or a many-body potential.
 
     Error: 1-minimal only: no single pair can be left out, but another, smaller set may exist.
     """
@@ -269,7 +273,7 @@ def minimal_cause(
 
 
 class _Search:
-    """Runs of B with some pairs pinned to what A decided, and their answers."""
+    """Runs of B with some pairs pinned to A's decisions, and whether B remained with A."""
 
     def __init__(
         self,
@@ -287,18 +291,18 @@ class _Search:
         self._tape = taped(fork.twin.a, horizon, self._keep)
 
     def spent(self) -> bool:
-        """Whether no more runs are allowed."""
+        """Return True if no more runs are allowed."""
         return self.made >= self.allowed
 
     def _keep(self, segment: Segment) -> None:
-        """A's positions now and then."""
+        """Store A's positions at regular intervals."""
         for row in range(segment.rows):
             if (segment.first + row) % self._every == 0:
                 x = segment.unsorted("x", row).astype(np.float64)
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Whether B stays with A when these pairs are pinned; False once no more runs are allowed."""
+        """Test whether B remains with A if some pairs are pinned; return False after the last allowed run."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():
@@ -327,10 +331,10 @@ class _Search:
 
 
 def _required(keys: list[int], search: _Search, until: int) -> list[int]:
-    """A set that should be enough, by bisection for one required pair after the other (QuickXplain).
+    """Find a sufficient set of pairs by bisecting for one required pair after another (QuickXplain).
 
-    About log2(n) runs for each pair, where delta debugging needs their square; but it assumes that more pins
-    never do harm. It gives up at `until` runs.
+    Each pair takes about log2(n) runs, whereas delta debugging takes the square of the number of pairs. The
+    method assumes that additional pins never do harm, and stops after `until` runs.
 
     Source: Junker, QuickXplain, AAAI 2004.
     """

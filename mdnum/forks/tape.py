@@ -1,4 +1,4 @@
-"""Every pair decision of a run, to be compared with another's or imposed on it."""
+"""All pair decisions of a run, stored so that they can be compared with or imposed on another run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mdnum.rollout.program import MdProgram
 
 @dataclass(frozen=True)
 class DecisionTape:
-    """Every pair decision of a run from step 0 on: the pairs inside at the start, and what changed later."""
+    """All pair decisions of a run from step 0: the pairs inside at the start, and all later changes."""
 
     atoms: int  # number of atoms
     steps: int  # the last step that was decided
@@ -30,19 +30,19 @@ class DecisionTape:
 
     @property
     def flips(self) -> int:
-        """Number of flips."""
+        """Number of flips on the tape."""
         return len(self.step)
 
     @cached_property
     def changes(self) -> dict[int, tuple[int, ...]]:
-        """Steps at which pairs that ever do flip, by key, ascending."""
+        """Steps at which each pair flips, ascending, by the key of the pair."""
         order = np.argsort(self.key, kind="stable")
         keys, begins = np.unique(self.key[order], return_index=True)
         steps = np.split(self.step[order], begins[1:])
         return {key: tuple(own.tolist()) for key, own in zip(keys.tolist(), steps, strict=True)}
 
     def pins(self, keys: Iterable[int], first: int, last: int) -> Pins:
-        """These pairs' decisions, to be imposed over a window of steps."""
+        """Return the decisions about some pairs as pins that impose them over a window of steps."""
         begins = set(self.first.tolist())
         return Pins(
             [
@@ -52,23 +52,23 @@ class DecisionTape:
         )
 
     def inside(self, step: int) -> Int[np.ndarray, "pairs"]:
-        """Keys of the pairs inside at a step, sorted."""
+        """Return the sorted keys of the pairs that are inside at a step."""
         members = set(self.first.tolist())
         for _, key, entered in self.rows(step):
             (members.add if entered else members.discard)(key)
         return np.array(sorted(members), np.int64)
 
     def rows(self, last: int) -> list[tuple[int, int, bool]]:
-        """Step, key and direction of the flips up to a step."""
+        """Return step, key and direction of all flips up to a step."""
         columns = (column[self.step <= last].tolist() for column in (self.step, self.key, self.entered))
         return list(zip(*columns, strict=True))
 
 
 def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
-    """The first step at which any pair is decided differently; None where there is none in both tapes.
+    """Find the first step at which two tapes decide a pair differently; None if no common step differs.
 
     Raises:
-        ValueError: tapes of different numbers of atoms.
+        ValueError: the tapes have different numbers of atoms.
     """
     if a.atoms != b.atoms:
         raise ValueError(f"the tapes have {a.atoms} and {b.atoms} atoms; expected the same number")
@@ -89,7 +89,7 @@ def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
 
 
 def taped(program: MdProgram, last: int, watch: Callable[[Segment], None]) -> DecisionTape:
-    """Every decision of a run to a last step; `watch` is called with each of its segments."""
+    """Record every decision of a run up to a last step; `watch` is called with each segment of the run."""
     simulation = program.simulation
     recorder, first, ledgers, end = PairRecorder(simulation), np.empty(0, np.int64), [], 0
     for segment in Engine(simulation, last, start=program.begin).segments():

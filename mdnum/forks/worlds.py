@@ -1,7 +1,7 @@
-"""What forks do with a system file of either world: its program, its numbers, its variations.
+"""The program, the numbers and the variations of a system of either world.
 
-The world's own modules are imported by the functions: those of molecular dynamics bring jax_md, which a ball
-does not need.
+The functions import the modules of molecular dynamics themselves, because those modules import jax_md, which
+a ball does not need.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _BALL_ELSEWHERE = ("loss", "gradient", "variants", "precision", "fork")
 
 
 def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Program:
-    """The program of a simulation, or of a ball's system.
+    """Return the program of a simulation or of a ball's system.
 
     Args:
-        steps: of a ball, instead of the file's.
+        steps: number of steps of a ball's run; default the number in its file.
     """
     if isinstance(system, BallSystem):
         from mdnum.ball.program import BallProgram
@@ -45,15 +45,15 @@ def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Pro
 
 
 def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> Any:
-    """The simulation with other values of some keys, checked as those of a system file are.
+    """Return the system with other values of some keys, validated like those of a system file.
 
     Args:
         system: a simulation, or the system of a ball.
-        values: dotted key to value. A key of the structure makes the atoms of a file again.
-        name: of the choice, for messages about a ball.
+        values: dotted key to value. A new value of a structure key creates the atoms of a file again.
+        name: name of the choice, for error messages about a ball.
 
     Raises:
-        InputError: a value that it could not have.
+        InputError: a value is not allowed for its key.
     """
     if isinstance(system, BallSystem):
         from mdnum.systems.load import vary
@@ -67,14 +67,16 @@ def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> A
 
 
 def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> Twin:
-    """The system, and with other values of some keys of its file."""
+    """Pair the program of a system with its program for other values of some keys."""
     other = varied(system, values, name)
     a, b = map(program_of, alike(system, other))
     return Twin(a, b, difference, changes(system, other))
 
 
 def alike(a: Any, b: Any) -> tuple[Any, Any]:
-    """Two systems whose pairs have the same decisions: one for each term where only one shares them."""
+    """Return two systems whose pairs have the same decisions: one decision for each term if only one system
+    shares decisions between terms.
+    """
     if isinstance(a, BallSystem) or not (a.pairwise and b.pairwise):
         return a, b
     groups = [[[row[0] for row in part.rows] for part in one.model.parts] for one in (a, b)]
@@ -84,7 +86,7 @@ def alike(a: Any, b: Any) -> tuple[Any, Any]:
 
 
 def changes(a: Any, b: Any) -> dict[str, list[Any]]:
-    """Keys whose values differ, with both values."""
+    """Return the keys whose values differ between two systems, with both values."""
     if isinstance(a, BallSystem):
         tables = tuple(one.spec.model_dump(mode="json", exclude={"variants"}) for one in (a, b))
     else:
@@ -100,7 +102,7 @@ def changes(a: Any, b: Any) -> dict[str, list[Any]]:
 
 
 def floats(system: Any) -> dict[str, float]:
-    """The numbers that are floats and enter a step, by their dotted keys."""
+    """Return the floating-point numbers of a system that enter a step, by dotted key."""
     if isinstance(system, BallSystem):
         data = system.spec.model_dump(mode="python", exclude_none=True, exclude=set(_BALL_ELSEWHERE))
         return {key: value for key, value in flat(data).items() if isinstance(value, float)}
@@ -110,7 +112,7 @@ def floats(system: Any) -> dict[str, float]:
 
 
 def as_used(system: Any, key: str) -> tuple[float, Any]:
-    """A number of the file as the program holds it, and the dtype that it is used in."""
+    """Return a number of the file as the program stores it, and the dtype in which the number is used."""
     value = floats(system)[key]
     if not isinstance(system, BallSystem):
         return value, "float64"

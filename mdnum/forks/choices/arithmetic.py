@@ -1,8 +1,8 @@
-"""Choices of arithmetic: which float plays which role, and the order of sums.
+"""Choices of arithmetic: the float format of each role, and the order of sums.
 
-An order is chosen as a reduction, or by what lists hold first: how and when they are built. None of these
-changes which pairs interact, as long as a list is rebuilt before its skin is used up. With sums that have no
-order they must change nothing.
+The order of a sum is set by a reduction, or by the order of pairs in lists, which depends on how and when
+lists are built. These choices do not change which pairs interact if every list is rebuilt before its skin is
+used up. They must have no effect on sums that do not depend on order.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ FORMATS = ("dense", "sparse", "ordered-sparse")
 class PrecisionChoice(Choice):
     """Another float in one role, or in several.
 
-    Sixteen bits are for pair forces alone in molecular dynamics: in any other role they make another model
-    rather than another rounding (`mdnum.numerics.roles.check_role` says why).
+    In molecular dynamics, 16-bit floats are allowed only for pair forces: in any other role they change the
+    model and not only the rounding (`mdnum.numerics.roles.check_role` gives the reason).
     """
 
     screened: ClassVar = {
@@ -75,7 +75,7 @@ class PrecisionChoice(Choice):
 
     @property
     def name(self) -> str:
-        """Such as "precision" or "precision.force=float64"."""
+        """Text of the choice, such as "precision" or "precision.force=float64"."""
         base = self.family if self.role is None else f"{self.family}.{self.role}"
         return base if self.dtype == "float32" else f"{base}={self.dtype}"
 
@@ -114,7 +114,7 @@ class PrecisionChoice(Choice):
 
 @choice("reduction")
 class Summation(Choice):
-    """Another order of a sum: of the forces on an atom, of the residuals that stop a solver."""
+    """Another order of a sum: of the forces on an atom, or of the residuals that stop a solver."""
 
     screened = " ".join(f"reduction={word}" for word in reductions.BY_NAME)
     shown = True
@@ -142,7 +142,7 @@ class Summation(Choice):
 
 
 def sums_residuals(system: Any) -> None:
-    """Refuse a ball's system whose steps sum nothing over several balls, with an `InputError`."""
+    """Raise an `InputError` if a ball's system does not sum residuals over several balls."""
     stop = system.spec.stop
     applies(stop is not None, "its steps solve nothing, so there is no residual to sum")
     reason = f"its solver is stopped by the rule {stop.rule}, which sums nothing"
@@ -156,7 +156,7 @@ def sums_residuals(system: Any) -> None:
 class Order(Summed):
     """The neighbors of each atom, or the balls of the batch, in another order.
 
-    Of balls, `both` is "exact" sums of residuals, or "alone": each ball stopped by itself.
+    For balls, `both` is "exact" (exact sums of residuals) or "alone" (each ball stopped separately).
     """
 
     worlds = ("md", "ball")
@@ -173,7 +173,7 @@ class Order(Summed):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """Sums without an order, and balls that are stopped by themselves, do not depend on it."""
+        """True if sums do not depend on order, or if each ball is stopped separately."""
         return self.both in (*ORDERLESS, "alone")
 
     def describe(self, world: str = "md") -> str:
@@ -236,7 +236,7 @@ class Order(Summed):
 
 @choice("format")
 class FormatChoice(Summed):
-    """The neighbors of each atom in the order in which another format of the list adds them."""
+    """The neighbors of each atom in the order in which another list format adds them."""
 
     screened = "format=dense format=sparse format=ordered-sparse format=ordered-sparse@exact"
     shown = True
@@ -263,7 +263,7 @@ class FormatChoice(Summed):
 
 @choice("builder")
 class Builder(Summed):
-    """Lists by another search for neighbors."""
+    """Lists built by another neighbor search."""
 
     screened = "builder builder@exact"
     word: str | None = None  # "host" or "jax-md"; None for the one that the system does not use
@@ -287,7 +287,7 @@ class Builder(Summed):
 
 @choice("skin")
 class Skin(Summed):
-    """Another skin: more or fewer pairs that do not interact, found at other times."""
+    """Another skin: the lists hold more or fewer noninteracting pairs, and are rebuilt at other steps."""
 
     screened = "skin skin@exact"
     # of the skin; None for half as much again, or three quarters where the box has no room
@@ -327,7 +327,9 @@ class RebuildChoice(Summed):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """A list that is always fresh, or rebuilt in time, holds the pairs; a blind one may lose some."""
+        """True if sums do not depend on order and every list is rebuilt in time; blind rebuilding may lose
+        pairs.
+        """
         return super().must_hold and self.every in (1, None)
 
     @classmethod

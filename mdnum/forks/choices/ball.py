@@ -1,4 +1,4 @@
-"""Choices of a ball alone: what stops its solver, and one decision taken otherwise."""
+"""Choices that exist only for a ball: the stopping rule of its solver, and single inverted decisions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RULES = {
 
 @choice("stop")
 class Stopping(Choice):
-    """Another rule that stops the solver, with the same tolerance."""
+    """Another stopping rule of the solver, with the same tolerance."""
 
     worlds = ("ball",)
     screened = " ".join(f"stop={rule}" for rule in RULES)
@@ -51,7 +51,7 @@ class Stopping(Choice):
 
 @choice("max_iter")
 class Cap(Choice):
-    """More iterations before the solver gives up, or of a fixed number of them."""
+    """More iterations before the solver gives up, or more of a fixed number of iterations."""
 
     worlds = ("ball",)
     shown = True
@@ -87,7 +87,7 @@ def _check_place(system: BallSystem, step: int | None, ball: int | None) -> None
 
 @choice("contact")
 class ContactStep(Choice):
-    """One contact decision of one ball taken otherwise; everything else is decided as ever."""
+    """One contact decision of one ball inverted; all other decisions are made as usual."""
 
     worlds = ("ball",)
     screened = "contact=earlier contact=later"
@@ -136,7 +136,7 @@ class ContactStep(Choice):
 
 @choice("iterations")
 class Iterations(Choice):
-    """One solve goes on for more iterations, or for fewer, than its rule says."""
+    """One solve makes more iterations, or fewer, than its stopping rule requires."""
 
     worlds = ("ball",)
     shown = True

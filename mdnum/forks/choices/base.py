@@ -1,4 +1,5 @@
-"""What a choice is, for systems of both worlds, and how the two programs of one are made."""
+"""The base class of numerical choices, for systems of both worlds, and how a choice makes its two programs.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +30,13 @@ _SIGNED = ("ulps", "more")
 
 
 class Choice:
-    """One numerical choice that can be made otherwise: its arguments, as a frozen dataclass.
+    """One numerical choice that can be made differently; its arguments are the fields of a frozen dataclass.
 
-    To add one, write a subclass and decorate it with `choice("family")`, the word before "=". A package
-    outside gives its own a `family`, decorates it with `choice(None)` and names it by an entry point of the
-    group "mdnum.choices". Its fields but `both` are what is written after "=", with ":" between them, and
-    `both`, where there is one, is what is written after "@". The first line of its docstring describes it.
+    To add a choice, write a subclass and decorate it with `choice("family")`, where the family is the word
+    before "=". A choice of another package sets its own `family`, is decorated with `choice(None)` and is
+    registered as an entry point of the group "mdnum.choices". Its fields except `both` are written after "=",
+    separated by ":"; `both`, if it exists, is written after "@". The first line of the docstring describes
+    the choice.
     """
 
     family: ClassVar[str] = ""  # the word before "="
@@ -52,7 +54,7 @@ class Choice:
 
     @property
     def argument(self) -> str:
-        """What is written after "="."""
+        """Text of the argument that is written after "="."""
         values = {one.name: getattr(self, one.name) for one in self._fields()}
         if not self.shown and all(values[one.name] == one.default for one in self._fields()):
             return ""
@@ -60,21 +62,21 @@ class Choice:
 
     @property
     def name(self) -> str:
-        """The word that `parse` makes it from."""
+        """Text from which `parse` recreates the choice."""
         both = getattr(self, "both", None)
         return self.family + (f"={self.argument}" if self.argument else "") + (f"@{both}" if both else "")
 
     def describe(self, world: str = "md") -> str:
-        """One line, for a system of a world."""
+        """Describe the choice in one line for a system of the given world."""
         text = (self.__doc__ or self.name).partition("\n")[0].rstrip(".")
         return text[:1].lower() + text[1:] + summing(getattr(self, "both", None))
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "family.role=argument@both"; empty where there is none. It has those that it has fields for.
+        """Create the choice from the parts of "family.role=argument@both"; missing parts are empty.
 
         Raises:
-            InputError: an argument that it cannot have.
+            InputError: the argument is not valid for this choice.
         """
         own = cls._fields()
         if argument and not own:
@@ -86,10 +88,10 @@ class Choice:
         return cls(**values)
 
     def make(self, system: Any) -> Twin:
-        """The two programs, of a `Simulation` of molecular dynamics or of the `BallSystem` of a ball.
+        """Make the two programs for a `Simulation` of molecular dynamics or the `BallSystem` of a ball.
 
         Raises:
-            InputError: it does not apply to the system; the message is the reason.
+            InputError: the choice does not apply to the system; the message gives the reason.
         """
         raise NotImplementedError
 
@@ -103,7 +105,7 @@ CHOICES: Registry[Any] = Registry("choice", "mdnum.choices", Choice)
 
 @dataclass_transform(frozen_default=True)
 def choice(family: str | None):
-    """Make a subclass of `Choice` a frozen dataclass, and register it under its family where it has one."""
+    """Make a subclass of `Choice` a frozen dataclass, and register it if a family is given."""
 
     def add(cls: type[Any]) -> type[Any]:
         made = dataclass(frozen=True)(cls)
@@ -116,7 +118,7 @@ def choice(family: str | None):
 
 
 def shipped(world: str) -> dict[str, Choice]:
-    """The choices of a world that are screened when all are asked for, by name."""
+    """Return the built-in choices of a world that are screened by default, by name."""
 
     def of_family(kind: type[Choice]) -> Iterable[Choice]:
         words = kind.screened if isinstance(kind.screened, str) else kind.screened[world]
@@ -127,13 +129,13 @@ def shipped(world: str) -> dict[str, Choice]:
 
 
 def unavailable(choice: Choice, system: Simulation | System | BallSystem) -> str | None:
-    """Why a choice does not apply to a system; None where it does."""
+    """Return the reason why a choice does not apply to a system, or None if the choice applies."""
     made = twin_or_reason(choice, system)
     return made if isinstance(made, str) else None
 
 
 def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> Twin | str:
-    """The two programs of a choice, or why it does not apply to the system."""
+    """Make the two programs of a choice, or return the reason why it does not apply to the system."""
     if world_of(system) not in choice.worlds:
         return f"it is a choice {_WORLDS[choice.worlds[0]]}"
     try:
@@ -151,10 +153,10 @@ def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> 
 
 
 def twin_of(choice: Choice, system: Simulation | System | BallSystem) -> Twin:
-    """The two programs of a choice.
+    """Make the two programs of a choice for a system.
 
     Raises:
-        InputError: it does not apply to the system.
+        InputError: the choice does not apply to the system.
     """
     made = twin_or_reason(choice, system)
     if isinstance(made, str):
@@ -167,20 +169,20 @@ def twin_of(choice: Choice, system: Simulation | System | BallSystem) -> Twin:
 
 
 def parse(text: str, world: str | None = None) -> Choice:
-    """A choice from a word.
+    """Parse a choice from its text.
 
     Args:
         text: a family, with an argument where it has one: "precision=bfloat16", "precision.force=float32",
-            "reduction=permuted:3", "skin=0.5", "format=sparse", "rebuild=every:10",
-            "ulps=cutoff.radius:+1", "start=17:0:+1" (atom, axis, ulps) and "start=3:velocity:+1" (ball, what,
-            ulps), "order=3", "translate=0.5", "rotate=-x-yz", "noise=7", "stop=maximum", "max_iter=+2",
-            "iterations=+1:57:3" (more, step, ball), "contact=later:2" (of the second contact),
-            "contact=57:0" (inverted at a step, for a ball). A last "@exact" gives both runs that reduction,
-            where an order is what is chosen; "@alone" stops each ball by itself.
-        world: whose choices an error lists, "md" or "ball"; default those of both.
+            "reduction=permuted:3", "skin=0.5", "format=sparse", "rebuild=every:10", "ulps=cutoff.radius:+1",
+            "start=17:0:+1" (atom, axis, ulps) and "start=3:velocity:+1" (ball, what, ulps), "order=3",
+            "translate=0.5", "rotate=-x-yz", "noise=7", "stop=maximum", "max_iter=+2", "iterations=+1:57:3"
+            (more, step, ball), "contact=later:2" (of the second contact), "contact=57:0" (inverted at a step,
+            for a ball). A final "@exact" gives both runs exact sums, for choices of an order; "@alone" stops
+            each ball separately.
+        world: world whose choices an error message lists, "md" or "ball"; default both.
 
     Raises:
-        InputError: no such choice, or an argument that it cannot have.
+        InputError: the choice does not exist, or its argument is not valid.
     """
     text = text.strip()
     word, at, both = text.partition("@")
@@ -209,19 +211,19 @@ def parse(text: str, world: str | None = None) -> Choice:
 
 
 def check(is_good: bool, message: str, where: str, remedy: str | None = None) -> None:
-    """Refuse an argument that is not good, with an `InputError`."""
+    """Raise an `InputError` if an argument is not valid."""
     if not is_good:
         raise InputError(message, where=where, remedy=remedy)
 
 
 def applies(is_so: bool, reason: str) -> None:
-    """Say, with an `InputError`, why a choice does not apply to a system, where it does not."""
+    """Raise an `InputError` with the reason if a choice does not apply to a system."""
     if not is_so:
         raise InputError(reason)
 
 
 def number(text: str, kind: type, where: str) -> Any:
-    """A number from a choice's argument; an `InputError` where it is none."""
+    """Parse a number in a choice's argument; raise an `InputError` if the text is not a number."""
     try:
         return kind(text)
     except ValueError:
@@ -230,24 +232,24 @@ def number(text: str, kind: type, where: str) -> Any:
 
 
 def some(count: int, where: str) -> None:
-    """Refuse 0 ulps or iterations, with an `InputError`."""
+    """Raise an `InputError` if the number of ulps or iterations is 0."""
     check(count != 0, "0 change nothing", where, "Write +1 or -1")
 
 
 def plural(count: int, noun: str) -> str:
-    """The noun, with an s where there are several."""
+    """Return the noun, with a final s if the count is not one."""
     return noun if abs(count) == 1 else f"{noun}s"
 
 
 def summing(both: str | None) -> str:
-    """The end of a sentence that says how both runs sum."""
+    """Return the end of a sentence that describes how both runs compute sums."""
     return "" if both is None else f" (both with {both} sums)"
 
 
 def summed(simulation: Simulation, both: str | None = None) -> Simulation:
-    """A simulation with another order of its force sums, such as "exact" or "permuted:3".
+    """Return a simulation with another order of its force sums, such as "exact" or "permuted:3".
 
-    A many-body potential has none: an `InputError`.
+    A many-body potential has a fixed order of sums, so an `InputError` is raised.
     """
     if both is None:
         return simulation
@@ -259,7 +261,7 @@ def summed(simulation: Simulation, both: str | None = None) -> Simulation:
 
 
 def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
-    """The twin of two simulations of molecular dynamics."""
+    """Make the pair of programs of two molecular-dynamics simulations."""
     from mdnum.rollout.program import MdProgram
 
     one, other = alike(a, b)
@@ -268,7 +270,10 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice of molecular dynamics whose runs may be given a reduction: without an order it must hold."""
+    """A choice of molecular dynamics that can impose a reduction on both runs.
+
+    If sums do not depend on order, the choice must not change any bit.
+    """
 
     worlds = ("md",)
     both: str | None = None  # reduction of both runs; None for the system's own
@@ -279,9 +284,9 @@ class Summed(Choice):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """Sums without an order do not depend on what is chosen."""
+        """True if both runs use sums that do not depend on order, so that the choice cannot matter."""
         return self.both in ORDERLESS
 
     def twin(self, a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
-        """The twin of two simulations with the reduction of both."""
+        """Make the pair of programs of two simulations, with the chosen reduction named in the difference."""
         return simulations(a, b, difference + summing(self.both), frame)

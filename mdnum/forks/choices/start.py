@@ -1,6 +1,7 @@
-"""Choices of what a run begins with: numbers of its file, coordinates, noise, and what physics cannot tell.
+"""Choices about the start of a run: numbers of its file, coordinates, noise, and physically equivalent
+starts.
 
-Other labels, another origin, other axes and other images of the atoms are the same system.
+Other atom labels, another origin, other axes and other periodic images describe the same physical system.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def _frame(simulation: Any, **parts: Any) -> Any:
 
 @choice("relabel")
 class Relabel(Summed):
-    """The atoms in another order of the file."""
+    """The atoms in another order."""
 
     screened = "relabel relabel@exact"
     seed: int = 1  # of the permutation
@@ -91,10 +92,10 @@ class Relabel(Summed):
 
 @choice("rotate")
 class Rotate(Summed):
-    """The axes of the box exchanged or turned around.
+    """The axes of the box exchanged or reversed.
 
-    An exchange is exact, but squares of components are added in another order. Where a sign changes, the
-    start is rounded once as it is wrapped.
+    An exchange of axes is exact, but squares of components are added in another order. If a sign changes,
+    wrapping the start into the box rounds the start once.
     """
 
     screened = "rotate rotate@exact"
@@ -126,7 +127,7 @@ class Rotate(Summed):
 
 
 def _is_symmetry(word: str, atoms: Any) -> bool:
-    """Whether the box is itself with its axes exchanged; a lattice vector is as good as its negative."""
+    """Return True if the box is unchanged when its axes are exchanged, up to signs of lattice vectors."""
     axes, signs = _read(word)
     rows = {tuple(row) for row in np.asarray(atoms.cell)[np.asarray(atoms.pbc)].tolist()}
     turned = {tuple(sign * row[k] for k, sign in zip(axes, signs, strict=True)) for row in rows}
@@ -134,14 +135,14 @@ def _is_symmetry(word: str, atoms: Any) -> bool:
 
 
 def _read(word: str) -> tuple[list[int], list[float]]:
-    """Which axis stands in each place, and with which sign."""
+    """Parse a symmetry such as "-x-yz" into the axis in each place and its sign."""
     parts = re.findall("-?[xyz]", word)
     return ["xyz".index(part[-1]) for part in parts], [-1.0 if part[0] == "-" else 1.0 for part in parts]
 
 
 @choice("translate")
 class Translate(Summed):
-    """Everything moved by a share of the lattice vectors: larger coordinates are rounded otherwise."""
+    """All atoms moved by a fraction of the lattice vectors: rounding differs for larger coordinates."""
 
     screened = "translate=0.25 translate=lattice"
     must_hold = False  # type: ignore[assignment]
@@ -172,11 +173,11 @@ class Translate(Summed):
 
 @choice("unwrapped")
 class Images(Choice):
-    """Atoms started in other images of the box.
+    """Atoms started in other periodic images.
 
-    Positions are wrapped before the first step, so this cannot change a bit, as long as the images can be
-    written down: the sum of a position and a lattice vector is rounded. Both runs start where that sum is
-    exact, within an ulp of a lattice vector from the file's positions.
+    Positions are wrapped before the first step, so this choice cannot change a bit if the images can be
+    represented exactly: the sum of a position and a lattice vector is rounded. Both runs start at positions
+    for which this sum is exact, within an ulp of a lattice vector from the file's positions.
     """
 
     worlds = ("md",)
@@ -188,7 +189,7 @@ class Images(Choice):
 
     @property
     def name(self) -> str:
-        """ "translate=lattice", "unwrapped" or "unwrapped=3"."""
+        """Text of the choice: "translate=lattice", "unwrapped" or "unwrapped=3"."""
         if self.seed is None:
             return "translate=lattice"
         return self.family if self.seed == 1 else f"{self.family}={self.seed}"
@@ -216,11 +217,12 @@ class Images(Choice):
 def exact_images(
     cell: Any, positions: Float[np.ndarray, "atoms 3"], images: Int[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"], int]:
-    """Wrapped positions near given ones, the same in other images, and how many atoms have none.
+    """Return wrapped positions near given ones, their equivalents in other images, and the number without
+    any.
 
-    Wrapping the second gives the first, bit for bit. In a box along the axes a position whose image was
-    rounded has an exact one (Sterbenz's lemma: the lattice vector is taken off again without rounding); a
-    second turn is needed only where the first crosses a face.
+    Wrapping the second array gives the first, bit for bit. In a box along the axes, a position whose image
+    was rounded has an exact image (Sterbenz's lemma: the lattice vector is subtracted again without
+    rounding); a second iteration is needed only if the first crosses a face of the box.
     """
     from mdnum.md.cell import wrap_positions
 
@@ -239,9 +241,10 @@ def exact_images(
 
 @choice("ulps")
 class Ulps(Choice):
-    """A number of the system file, moved to a float near it in the format that it is used in.
+    """A number of the system file, changed to a nearby float of the format in which the number is used.
 
-    The temperature of a run at constant energy is that of its drawn velocities: both runs draw theirs.
+    For a run at constant energy, the temperature is that of its drawn velocities, and both runs draw
+    velocities.
     """
 
     screened: ClassVar = {world: " ".join(f"ulps={key}" for key in keys) for world, keys in OFTEN.items()}
@@ -276,7 +279,7 @@ class Ulps(Choice):
 
 @choice("start")
 class StartUlp(Choice):
-    """One coordinate of the start, moved to a float near it."""
+    """One coordinate of the start, changed to a nearby float."""
 
     screened: ClassVar = {"md": "start", "ball": "start start=velocity:+1"}
     # the atom or the ball; None for that of the largest value. An ulp of a small coordinate would be lost in
@@ -355,7 +358,7 @@ class StartUlp(Choice):
 
 @choice("noise")
 class NoiseChoice(Choice):
-    """Another key of the thermostat's noise."""
+    """Another random key of the thermostat's noise."""
 
     worlds = ("md",)
     seed: int | None = None  # of the key; None for the next after the system's own
@@ -379,9 +382,9 @@ class NoiseChoice(Choice):
 
 @choice("energy-shift")
 class EnergyShift(Choice):
-    """Pair energies shifted to zero at the cutoff, or not.
+    """Pair energies shifted to zero at the cutoff, or not shifted.
 
-    The two differ in the energy they conserve, and in nothing that moves: a constant has no derivative.
+    The conserved energies of the two programs differ, but their motions do not: a constant has no derivative.
     """
 
     worlds = ("md",)
