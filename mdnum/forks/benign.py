@@ -79,9 +79,7 @@ class Space:
 
     @classmethod
     def of(cls, features: Float[np.ndarray, "runs features"]) -> Space:
-        """Compute the components that explain an ensemble's variance: two to ten, at most a third of its
-        runs.
-        """
+        """Compute two to ten components that explain the variance, but at most a third of the runs."""
         mean, spread = features.mean(axis=0), features.std(axis=0, ddof=1)
         # nothing can be said of a feature that is constant, such as a distance that no pair has
         spread = np.where(spread > _ROUNDING * np.abs(mean), spread, np.inf)
@@ -160,8 +158,7 @@ class Planted:
 
     @property
     def ok(self) -> bool:
-        """True if a change that must fail failed every time, or another one no more often than chance allows.
-        """
+        """True if all tries failed (for a change that must fail), or no more than chance allows."""
         if self.must_fail:
             return self.failures == self.tries
         return bounds(self.failures, self.tries)[0] <= ACCEPTED

@@ -1,4 +1,4 @@
-"""A pair of runs of either world, followed until they split: dates, the decision at the fork, the verdict."""
+"""A pair of runs of either world, followed until they split: dates, decision at the fork, and verdict."""
 
 from __future__ import annotations
 
@@ -54,26 +54,27 @@ class Fork:
     """Result of following a pair of runs.
 
     Attributes:
-        twin: the pair.
-        steps, asked: that were followed, and that were asked for.
-        tolerance: of the split, length.
-        dates: first differing bit, fork and split. decision: at the fork; None without one.
-        series: columns of `PairRows` by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ...
-            (repeats, those at the other displacement last; NaN once all have split), from B "A|B" and
-            "B|A from B"; "cross"; "overridden" and "furthest" of B|A; "energy A", ...; of molecular dynamics
-            "nearest A", "bound A", "ambiguous A" and the same of B; where boxes can differ, the strain
-            between A's and B's, "strain", and that of "strain B|A".
-        flips, flips_total: cross-run flips, the first `FLIPS_KEPT`, and how many there are of all.
+        twin: the pair of programs.
+        steps, asked: number of steps that were run, and number that was requested.
+        tolerance: separation that counts as a split, length.
+        dates: first differing bit, fork and split. decision: the decision at the fork; None without a fork.
+        series: columns of `PairRows` by step: "step"; separations from A: "B", "B|A", "A|B from A", "B 1",
+            ... (repeats; those at the other displacement last; NaN once all have split); separations from B:
+            "A|B" and "B|A from B"; "cross"; "overridden" and "furthest" of B|A; "energy A", ...; for
+            molecular dynamics "nearest A", "bound A", "ambiguous A" and the same for B; if boxes can differ,
+            the strain between the boxes of A and B, "strain", and of A and B|A, "strain B|A".
+        flips, flips_total: the first `FLIPS_KEPT` cross-run flips, and the number of all cross-run flips.
         doubts: ambiguous decisions of A and of B, the first `FLIPS_KEPT` of each.
-        growth: of the separations "B" and "B|A".
-        splits: first step beyond the tolerance by separation; None where there is none.
-        table: splits of either arithmetic under either decisions.
-        shares: what the decisions and what the arithmetic contributed to the split.
-        verdict: on the flips. repeats: when each repeat splits, free and under A's decisions, at the first
-            displacement and at the other one. displacements: of the starts of those that were run, length.
-        failed: runs that ended in "blow-up" or "runaway". Where a free run does, the comparison ends with it;
-            where only one of them does, that is the fork at the latest.
-        runs: A, B and the counterfactuals by name, of a world that keeps them whole.
+        growth: growth of the separations "B" and "B|A".
+        splits: first step beyond the tolerance for each separation; None if there is no split.
+        table: split for each combination of one program's arithmetic with one program's decisions.
+        shares: contributions of the decisions and of the arithmetic to the split.
+        verdict: verdict on the flips. repeats: splits of each repeat, free and under A's decisions, at the
+            first displacement and at the other one. displacements: of the starts of the repeats that were
+            run, length.
+        failed: runs that ended in "blow-up" or "runaway". If a free run fails, the comparison ends there; if
+            only one of them fails, the fork is at this step at the latest.
+        runs: A, B and the counterfactual runs by name, if the world keeps whole runs.
     """
 
     twin: Twin
@@ -107,22 +108,23 @@ def fork(
     repeats: int | None = None,
     progress: Progress | None = None,
 ) -> Fork:
-    """Follow two runs until they have split, and judge what the flips had to do with it.
+    """Follow two runs until they have split, and judge how much the flips contributed to the split.
 
     Args:
-        twin: the pair.
-        steps: last step; default the system's own. Molecular dynamics is followed to twice the split at most;
-            a fifth further where the split comes too late to tell a cause from a delay.
+        twin: the pair of programs.
+        steps: last step; default the system's own. Molecular dynamics is followed to twice the split at most,
+            but a fifth beyond the last step if the split comes too late to distinguish a cause from a delay.
         split: separation that counts as split, length; default 0.01 of the longest cutoff or start height.
-        counterfactual: whether to run B under A's decisions; many-body potentials cannot.
-        back: whether to run A under B's decisions too; default where B is run under A's.
-        repeats: runs of B at most whose start is displaced at random by as much as the choice separates the
-            runs at first (an ulp at least), each free and under A's decisions; default 15. They are run where
-            the runs split either way, until the verdict is clear, and then at a hundredth of it.
+        counterfactual: whether to run B under A's decisions, which is impossible for many-body potentials.
+        back: whether to run A under B's decisions too; default: the value of `counterfactual`.
+        repeats: largest number of repeats of B, each free and under A's decisions; default 15. Their starts
+            are displaced at random by the initial separation of the runs (an ulp at least). If the runs split
+            either way, they are run until the verdict is clear, and then at a hundredth of the displacement.
         progress: called with the step reached, the last step, and figures.
 
     Raises:
-        InputError: steps below 1, programs that cannot be compared, or counterfactuals that are not run.
+        InputError: steps is below 1, the programs cannot be compared, or requested counterfactual runs are
+            not possible.
     """
     a, b = twin.a, twin.b
     counterfactual, back, most = counterfactuals(twin, counterfactual, back, repeats)
@@ -166,10 +168,11 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Whether to run B under A's decisions, A under B's, and how many repeats at most.
+    """Return whether to run B under A's decisions, whether to run A under B's, and the largest number of
+    repeats.
 
     Raises:
-        InputError: one was asked for that would not be run.
+        InputError: a requested counterfactual run or repeat is not possible.
     """
     reason = twin.a.imposable or twin.b.imposable
     runs = counterfactual and reason is None
@@ -184,10 +187,10 @@ def counterfactuals(
 
 
 def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "those are left out") -> int:
-    """Repeats at most: those asked for, or the default where there are runs under imposed decisions.
+    """Return the largest number of repeats: the requested number, or the default if decisions can be imposed.
 
     Raises:
-        InputError: below 0, too few to tell anything, or asked for where they would not be run.
+        InputError: the number is negative or too small for a significant result, or no repeats can be run.
     """
     if repeats is None:
         return REPEATS if counterfactual else 0
@@ -205,15 +208,17 @@ def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "those a
 
 
 def _beyond(step: int) -> int:
-    """The step up to which a split must be followed to mean something."""
+    """Return the step up to which a run must be followed for a split to be significant."""
     return int(np.ceil(PATIENCE * step)) + 1
 
 
 def displacements(fork: Fork) -> tuple[float, float]:
-    """Displacements of the starts of repeats, length: as the choice separates the runs at first, and less.
+    """Return two displacements (lengths) of the starts of repeats: the initial separation of the runs, and
+    less.
 
-    At a hundredth a repeat begins to have the pair's rounding errors; at much less it is the pair itself and
-    proves nothing. Where a hundredth is less than an ulp, the other one may be larger instead.
+    At a hundredth of the first displacement a repeat begins to have the pair's rounding errors; at much less
+    it equals the pair itself and proves nothing. If a hundredth is less than an ulp, the second displacement
+    may be larger than the first.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]
@@ -224,7 +229,7 @@ def displacements(fork: Fork) -> tuple[float, float]:
 
 
 def _repeated(found: Fork, most: int, progress: Progress | None) -> Fork:
-    """The same with as many repeats as its verdict wants."""
+    """Return the comparison with as many repeats as its verdict requires."""
     a, b, series, tolerance = found.twin.a, found.twin.b, dict(found.series), found.tolerance
     while wanted := found.verdict.wanted:
         place, sizes = int(found.verdict.other is not None), displacements(found)
@@ -334,7 +339,7 @@ class Screened:
 
     @property
     def held(self) -> bool | None:
-        """Whether no bit differed within the horizon; None where it was not run."""
+        """True if no bit differed within the horizon; None if the choice was not run."""
         return None if self.reason_unavailable is not None else self.first_bit is None
 
 
@@ -344,16 +349,17 @@ def screen(
     choices: Sequence[Choice] | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[Screened]:
-    """Every choice against a system, without counterfactuals: the earliest fork first.
+    """Compare runs of a system under every choice, without counterfactual runs; the earliest fork comes
+    first.
 
     Args:
-        system: as loaded.
-        steps: horizon; default the system's own.
-        choices: default all that ship for its world.
-        progress: called with how many are done, how many there are, and the name of the next.
+        system: a loaded system.
+        steps: last step of each run; default the system's own.
+        choices: choices to test; default all built-in choices of the system's world.
+        progress: called with the number of choices done, their total, and the name of the next one.
 
     Raises:
-        InputError: no choice, or steps below 1.
+        InputError: no choice is given, or steps is below 1.
     """
     choices = list(shipped(world_of(system)).values()) if choices is None else choices
     if not choices:

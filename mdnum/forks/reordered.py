@@ -37,9 +37,7 @@ class ReorderedSimulation(Simulation):
 
     @classmethod
     def of(cls, simulation: Simulation, order: str | int) -> ReorderedSimulation:
-        """Create a simulation with reordered lists; sums follow the list format unless they do not depend on
-        order.
-        """
+        """Create a simulation with reordered lists and, for sums that depend on order, a format's sums."""
         same = _fields(Simulation, simulation)
         if isinstance(order, str) and simulation.reduction == Sequential():
             same["reduction"] = _SUMS[order]

@@ -327,9 +327,7 @@ class RebuildChoice(Summed):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """True if sums do not depend on order and every list is rebuilt in time; blind rebuilding may lose
-        pairs.
-        """
+        """True if sums do not depend on order and lists are rebuilt in time; else pairs may be lost."""
         return super().must_hold and self.every in (1, None)
 
     @classmethod

@@ -1,5 +1,4 @@
-"""The base class of numerical choices, for systems of both worlds, and how a choice makes its two programs.
-"""
+"""The base class of numerical choices, for systems of both worlds, and the two programs of a choice."""
 
 from __future__ import annotations
 
@@ -270,10 +269,7 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice of molecular dynamics that can impose a reduction on both runs.
-
-    If sums do not depend on order, the choice must not change any bit.
-    """
+    """A choice that can impose a reduction on both runs; sums without an order must then agree."""
 
     worlds = ("md",)
     both: str | None = None  # reduction of both runs; None for the system's own

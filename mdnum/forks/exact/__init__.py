@@ -1,1 +1,2 @@
-"""Certified decisions: a run against the same map in exact real arithmetic."""
+"""Exact real arithmetic of a run's discrete map, which certifies the decisions of runs in finite precision.
+"""

@@ -1,4 +1,5 @@
-"""When runs leave the exact history, and which precision keeps them on it longest; of both worlds."""
+"""The step at which runs of either world leave the exact history, and the precision that delays it longest.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +48,7 @@ _EXPONENTIAL = 0.95
 
 @dataclass(frozen=True)
 class PolicyHorizon:
-    """How long a run in one precision keeps to the exact history."""
+    """How long a run in one precision follows the exact history."""
 
     # name, roles: of the precision, and its dtype by role
     name: str
@@ -69,22 +70,23 @@ class PolicyHorizon:
 
     @property
     def horizon(self) -> int | None:
-        """First step with a decision other than the exact one; None where there is none."""
+        """First step with a decision that differs from the exact one; None if all decisions agree."""
         return None if self.decision is None else self.decision.step
 
     @property
     def margin(self) -> float:
-        """Of the decision at fault in the exact run; NaN without one."""
+        """Margin of the first wrong decision in the exact run; NaN if no decision is wrong."""
         return float("nan") if self.decision is None else self.decision.margins["A"]
 
     def is_all(self, dtype: str) -> bool:
-        """Whether every role has this dtype."""
+        """Return True if every role has this dtype."""
         return set(self.roles.values()) == {dtype}
 
 
 @result
 class Certificate:
-    """The exact history of a system, and the horizons of real runs against it."""
+    """The exact history of a system, and the steps up to which runs in finite precision follow that history.
+    """
 
     steps: int  # last step
     timestep: float  # in the user's units of time
@@ -101,21 +103,22 @@ def certify(
     policies: Mapping[str, Roles] | None = None,
     progress: Progress | None = None,
 ) -> Certificate:
-    """The exact history of a system, and the step at which a run in each precision leaves it.
+    """Compute the exact history of a system, and the step at which a run in each precision leaves that
+    history.
 
-    The numbers of the file are those that float64 has; a narrower run rounds them too, which is part of what
-    it does differently.
+    The numbers of the file are rounded to float64. A run in lower precision rounds them further, and this
+    rounding is part of its deviation.
 
     Args:
-        system: Lennard-Jones, NVE, at most 108 atoms; or a ball whose steps are sums and products. Its own
-            precision is not used.
+        system: a Lennard-Jones system of at most 108 atoms at constant energy (NVE), or a ball whose steps
+            consist of sums and products. The system's own precision is ignored.
         steps: last step; default the system's own.
-        policies: dtype by role, by the name of the precision; default `MD_POLICIES` or `BALL_POLICIES`. Roles
-            that it does not name are float64.
-        progress: called with what is done, of how much, and a dictionary of figures.
+        policies: for each named precision, the dtype of each role; default `MD_POLICIES` or `BALL_POLICIES`.
+            Roles that are not named are float64.
+        progress: called with the number of items done, their total, and a dictionary of figures.
 
     Raises:
-        InputError: the system cannot be certified, or steps below 1.
+        InputError: the system cannot be certified, or steps is below 1.
     """
     system = opened(system)
     is_ball = isinstance(system, BallSystem)
@@ -162,7 +165,9 @@ def _certify_md(system: Simulation, last: int, policies: Mapping[str, Roles], no
     matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
 
     def reduced(x: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Positions within a box of the origin: a displacement takes off one lattice vector at most."""
+        """Move positions into a box at the origin, so that a displacement is off by one lattice vector at
+        most.
+        """
         return x - np.floor(x @ np.asarray(simulation.cell.inverse)) @ matrix
 
     rows = []
@@ -226,7 +231,7 @@ def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], 
 
 
 def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
-    """ln 2 over the growth rate of the run whose growth could be followed longest."""
+    """Return ln 2 divided by the growth rate of the run whose growth could be followed longest."""
     # separations that grow by a power of time, as those of a lone pair, are no exponentials
     fits = [row.growth for row in rows if row.growth is not None]
     fits = [fit for fit in fits if fit.rate > 0 and fit.r_squared > _EXPONENTIAL]
@@ -236,7 +241,8 @@ def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
 
 
 def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
-    """What each policy gains over single precision throughout, where that leaves the exact history."""
+    """Add the gain of each policy over pure single precision, if single precision leaves the exact history.
+    """
     low = next((row for row in rows if row.is_all("float32")), None)
     high = next((row for row in rows if row.is_all("float64")), None)
     if low is None or low.horizon is None:
@@ -253,10 +259,11 @@ def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
 
 
 def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
-    """By how many bits a run is closer to the exact positions, while both decide as the exact program does.
+    """Return how many bits closer to the exact positions one run is than another, while all decisions are
+    exact.
 
-    The median over the second half of the steps before the first decision at fault: unlike the horizon, it
-    does not hang on which pair happens to come close to its cutoff.
+    The value is the median over the second half of the steps before the first wrong decision. Unlike the
+    horizon, this median does not depend on which pair happens to come close to its cutoff.
     """
     if base.separation is None or row.separation is None:
         return float("nan")

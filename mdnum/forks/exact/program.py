@@ -1,9 +1,9 @@
-"""The discrete map of a rollout in exact real arithmetic, enclosed by balls (Arb) that prove every decision.
+"""The discrete map of a rollout in exact real arithmetic: ball arithmetic (Arb) that proves every decision.
 
-The start and all constants are the doubles that the program holds, taken as the dyadic rationals that they
-are. Positions and velocities are balls of many bits; a decision counts when its ball lies on one side of the
-threshold, and where it does not, the run is repeated with more bits. What results is the history that the
-program would have without any rounding.
+The start and all constants are the doubles that the program holds, taken as exact dyadic rationals. Positions
+and velocities are balls (intervals) of many bits. A decision is proven if its ball lies on one side of the
+threshold; otherwise the run is repeated with more bits. The result is the history that the program would have
+without any rounding.
 
 Source: Johansson, Arb, IEEE Transactions on Computers 66 (2017) 1281.
 """
@@ -48,13 +48,13 @@ _U = 2.0**-53
 def pull_of(
     potential: PairPotential, constants: Mapping[str, float], cutoff: str, r_cut: float, r_onset: float
 ) -> Callable[[Any], Any]:
-    """2 du/d(r²) of a pair inside its cutoff, as a function of the ball r².
+    """Return the function that computes 2 du/d(r²) of a pair inside its cutoff from the ball r².
 
-    The factor of the displacement x_j - x_i in the force on i. Constants are the given doubles, exactly;
-    what follows from them is enclosed at the precision in force when this is called.
+    This derivative is the factor of the displacement x_j - x_i in the force on i. Constants are exactly the
+    given doubles; derived values are enclosed at the precision that is set at the time of the call.
 
     Raises:
-        TypeError: the potential has an operation that ball arithmetic has not.
+        TypeError: the potential uses an operation that ball arithmetic does not support.
     """
     from flint import arb
 
@@ -66,7 +66,7 @@ def pull_of(
 
 
 def _lennard_jones(sigma: Any, epsilon: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """2 du/d(r²) and u, in few operations."""
+    """Return functions for 2 du/d(r²) and u of the Lennard-Jones potential that need few operations."""
     s2 = sigma * sigma
     s6 = s2 * s2 * s2
     # u = (4 epsilon s6) r⁻⁶ (s6 r⁻⁶ - 1), 2 du/d(r²) = (attract - repel r⁻⁶) r⁻⁸
@@ -89,7 +89,7 @@ def _lennard_jones(sigma: Any, epsilon: Any) -> tuple[Callable[[Any], Any], Call
 def _enclosed(
     potential: PairPotential, **constants: Any
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """2 du/d(r²) and u of any potential, operation by operation."""
+    """Return functions for 2 du/d(r²) and u of any potential, evaluated operation by operation."""
 
     def evaluate(r2, *values):
         leaves = {name: value[None] for name, value in zip(constants, values, strict=True)}
@@ -101,7 +101,7 @@ def _enclosed(
 
 @dataclass(frozen=True)
 class ExactHistory:
-    """The certified history."""
+    """The certified history of a run, with every decision proven."""
 
     tape: DecisionTape  # every decision, proven
     # smallest |threshold - r²| of any pair at each step, length², shape (steps + 1,); good to about ten
@@ -119,7 +119,7 @@ class ExactHistory:
 
     @property
     def bits_per_step(self) -> float:
-        """Bits by which the largest ball grows in a step, over the second half; NaN for a short run."""
+        """Bits by which the largest ball grows per step, in the second half; NaN for a short run."""
         rows = np.flatnonzero(np.isfinite(self.radius))
         if len(rows) < 4:
             return float("nan")
@@ -128,14 +128,14 @@ class ExactHistory:
 
 
 def installed() -> bool:
-    """Whether the ball arithmetic (python-flint) is there."""
+    """Return True if the ball arithmetic (python-flint) is installed."""
     from importlib.util import find_spec
 
     return find_spec("flint") is not None
 
 
 def unsupported(simulation: Simulation) -> InputError | None:
-    """What keeps a system from being certified, with a remedy; None where nothing does."""
+    """Return an error, with a remedy, if the system cannot be certified; else None."""
     half, atoms = float(np.min(simulation.cell.widths)) / 2, simulation.atoms
     alone = simulation.pairwise and not isinstance(simulation.potential, SumPotential)
     reasons = (
@@ -184,7 +184,9 @@ def unsupported(simulation: Simulation) -> InputError | None:
 
 
 def _without_balls(simulation: Simulation) -> InputError | None:
-    """An operation of the potential or its cutoff that ball arithmetic has not."""
+    """Return an error if the potential or its cutoff needs an operation that ball arithmetic does not
+    support.
+    """
     from flint import arb
 
     try:
@@ -200,7 +202,7 @@ def _without_balls(simulation: Simulation) -> InputError | None:
 
 
 def _pulls(simulation: Simulation) -> list[Callable[[Any], Any]]:
-    """`pull_of` each pair type."""
+    """Return the function made by `pull_of` for each pair type."""
     model, bare = simulation.model, simulation.model.potential
     radii = zip(np.asarray(model.r_cut), np.asarray(model.r_onset), strict=True)
     return [
@@ -210,10 +212,10 @@ def _pulls(simulation: Simulation) -> list[Callable[[Any], Any]]:
 
 
 class ExactProgram:
-    """A simulation's map in ball arithmetic, from its start in double precision.
+    """The discrete map of a simulation in ball arithmetic, applied to its start in double precision.
 
     Args:
-        simulation: its constants are taken as doubles, whatever the precision policy.
+        simulation: the simulation; its constants are doubles, regardless of the precision policy.
 
     Raises:
         InputError: the system cannot be certified.
@@ -248,15 +250,16 @@ class ExactProgram:
         bits: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> ExactHistory:
-        """Every decision up to a step, proven; with more bits where the first ones did not do.
+        """Prove every decision up to a step, using more bits where the first attempt did not suffice.
 
         Args:
             steps: last step.
-            bits: precision to begin with; default 0.35 a step and 60.
-            progress: called with the step reached and the last one.
+            bits: initial precision; default 0.35 bits per step plus 60.
+            progress: called with the step reached and the last step.
 
         Raises:
-            InputError: a pair sits on its threshold to all bits that were tried.
+            InputError: a pair is too close to its threshold to be decided with any number of bits that was
+                tried.
         """
         expect_at_least(0, steps=steps)
         bits = math.ceil(_BITS_PER_STEP * steps) + _BITS_LEFT if bits is None else bits
@@ -276,7 +279,7 @@ class ExactProgram:
 
 
 class _Run:
-    """One attempt with a fixed number of bits at the start."""
+    """One attempt to prove all decisions with a fixed number of initial bits."""
 
     def __init__(self, program: ExactProgram, steps: int, bits: int):
         self.program, self.steps, self.bits, self.step = program, steps, bits, 0
@@ -287,7 +290,7 @@ class _Run:
         self._close = 0
 
     def bits_needed(self) -> int:
-        """Bits that the growth of the balls so far asks for."""
+        """Estimate the required bits from the growth of the balls so far."""
         grown = self._radius[: self.step + 1]
         known = np.flatnonzero(np.isfinite(grown))
         if len(known) < 50:
@@ -296,7 +299,7 @@ class _Run:
         return math.ceil(1.1 * rate * self.steps) + 2 * _BITS_LEFT
 
     def all(self, progress, restarts: int) -> ExactHistory:
-        """The whole run."""
+        """Run all steps and return the certified history."""
         from flint import ctx
 
         begin, before = time.perf_counter(), ctx.prec
@@ -386,7 +389,7 @@ class _Run:
         return first
 
     def _shift(self, n: list[int]) -> tuple[Any, Any, Any]:
-        """n lattice vectors, exact products of small integers and doubles."""
+        """Return the sum of n lattice vectors, an exact product of small integers and doubles."""
         key = (n[0], n[1], n[2])
         if key not in self._shifts:
             rows = self._lattice
@@ -397,10 +400,11 @@ class _Run:
     def _decide(
         self, x, centers: Float[np.ndarray, "atoms 3"], radius: float, thresholds: list
     ) -> tuple[Bool[np.ndarray, "all_pairs"], Int[np.ndarray, "all_pairs 3"], Float[np.ndarray, "all_pairs"]]:
-        """All decisions of a step: by a bound in double precision, or by the balls where that is too coarse.
+        """Make all decisions of a step, with a bound in double precision, or with the balls if that is too
+        coarse.
 
-        The image that is nearest in double precision is the exact one, or the pair is further away than
-        r_cut in either image, because r_cut is below half the box by more than rounding.
+        The nearest image in double precision is the exact nearest image, or the pair is further apart than
+        r_cut in both images, because r_cut is smaller than half the box by more than rounding.
         """
         program = self.program
         i, j, matrix = program._i, program._j, program._matrix
@@ -433,7 +437,9 @@ class _Run:
 
 
 def _log2_radius(ball) -> float:
-    """An upper bound on the binary logarithm of a ball's radius, which a double may not hold."""
+    """Return an upper bound on the binary logarithm of a ball's radius, which may be out of range for a
+    double.
+    """
     if ball.is_exact():
         return -math.inf
     mantissa, exponent = ball.rad().man_exp()
