@@ -1,7 +1,7 @@
-"""The bouncing ball: events, stopping rules and precision in a world small enough to know exactly.
+"""The bouncing ball: events, stopping rules and precision in a system whose exact solution is known.
 
-The names below are imported on first use, because most of them import jax and system files are checked
-without it.
+The names below are imported on first use, because most of their modules import jax, and validating a system
+file does not need it.
 """
 
 # ruff: noqa: F401

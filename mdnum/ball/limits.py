@@ -1,4 +1,4 @@
-"""Largest numbers of the ball's formats and smallest tolerance that its solver can meet; without jax."""
+"""Largest numbers of the ball's formats, and the smallest tolerance that its solver can meet; without jax."""
 
 from __future__ import annotations
 
@@ -19,34 +19,36 @@ _ROLES = {
 
 
 def largest(name: str) -> float:
-    """The largest finite number of a format."""
+    """Return the largest finite number of a format."""
     return float(ml_dtypes.finfo(DTYPES[name]).max)
 
 
 def spacing(value: float, name: str) -> float:
-    """Distance from the number to the next one of a format."""
+    """Return the distance from a number to the next number of a format."""
     limits = ml_dtypes.finfo(DTYPES[name])
     exponent = int(np.floor(np.log2(max(abs(value), float(limits.smallest_normal)))))
     return float(limits.eps) * 2.0**exponent
 
 
 def rounded(value: float, name: str) -> float:
-    """The number of a format nearest to value."""
+    """Return the number of a format that is nearest to a value."""
     with np.errstate(over="ignore"):
         return float(np.asarray(value, DTYPES[name]))
 
 
 def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") -> dict[str, float]:
-    """The smallest tolerance that a solver can meet, m, for each role whose format limits the tolerance.
+    """Return the smallest tolerance (m) that a solver can meet, for each role whose format limits the
+    tolerance.
 
-    A penetration so small that its share `gain` rounds to nothing no longer shrinks, and a tolerance that is
-    no number of a format is another tolerance. The largest of the values is the smallest usable tolerance.
+    A penetration stops shrinking once its fraction `gain` rounds to zero, and a tolerance that a format
+    cannot represent changes when rounded. The largest of the values is the smallest usable tolerance.
 
     Args:
         precision: names of formats by role, as attributes.
-        gain: share of a penetration that an iteration takes (alpha k of a projection; 1 for Newton's method).
-        kind: what is compared with the tolerance: "sum" of the residuals, "relative" to the first one, or
-            "term" (one of them, or the largest).
+        gain: fraction of a penetration removed by an iteration (alpha k of a projection; 1 for Newton's
+            method).
+        kind: the quantity compared with the tolerance: "sum" of the residuals, "relative" to the first sum,
+            or "term" (a single residual, or the largest).
 
     Error: exact up to the rounding of alpha k; tested against every small penetration.
     """
@@ -56,7 +58,7 @@ def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") ->
 
 
 def _stuck(name: str, gain: float) -> float:
-    """The smallest number above every penetration that an iteration may leave unchanged by rounding."""
+    """Return the smallest number above every penetration that rounding may keep unchanged in an iteration."""
     if name == "float16":
         # of n grains the iteration takes gain * n, which rounds to none up to one half
         return (math.floor(0.5 / gain) + 1) * smallest(name)

@@ -1,4 +1,4 @@
-"""A rollout with a loss: a function of named parameters, and what is differentiated."""
+"""A rollout with a loss, as a differentiable function of named parameters."""
 
 from __future__ import annotations
 
@@ -21,28 +21,30 @@ START = ("y0", "v0")  # parameters of the start rather than of the world; a valu
 
 
 class BallLoss(Protocol):
-    """A loss: a sum over steps and a final term, both of shape () and in the dtype of their input."""
+    """Protocol of a loss: a sum over steps and a final term, both of shape () and in the dtype of their
+    input.
+    """
 
     def step(self, state: BallState, record: BallRecord, dtype: Any) -> Float[Array, ""]:
-        """Contribution of the step that made this state."""
+        """Return the contribution of the step that made this state."""
         ...
 
     def end(self, state: BallState, steps: int, total: Float[Array, ""]) -> Float[Array, ""]:
-        """The loss, from the sum over steps and the last state."""
+        """Compute the loss from the sum over steps and the last state."""
         ...
 
 
 class FinalHeight(eqx.Module):
-    """Loss: mean final height, m; with a target, the mean squared distance to the target, m²."""
+    """Mean final height, m, as a loss; with a target, the mean squared distance from the target, m²."""
 
     target: float | None = eqx.field(static=True, default=None)
 
     def step(self, state, record, dtype):
-        """Contribution of a step: none."""
+        """Return zero, because only the final state contributes."""
         return jnp.zeros((), dtype)
 
     def end(self, state, steps, total):
-        """The mean over the batch."""
+        """Return the mean over the batch."""
         y = state.y.astype(total.dtype)
         if self.target is None:
             return jnp.mean(y, dtype=total.dtype)
@@ -50,35 +52,35 @@ class FinalHeight(eqx.Module):
 
 
 class MeanHeight(eqx.Module):
-    """Loss: height averaged over balls and steps, m."""
+    """Height averaged over balls and steps, m, as a loss."""
 
     def step(self, state, record, dtype):
-        """The mean over the batch."""
+        """Return the mean height over the batch."""
         return jnp.mean(state.y.astype(dtype), dtype=dtype)
 
     def end(self, state, steps, total):
-        """The sum over steps, divided by the number of steps."""
+        """Return the sum over steps divided by the number of steps."""
         return total / max(steps, 1)
 
 
 class ResidualPenetration(eqx.Module):
-    """Loss: penetration that the contact model leaves, summed over steps and averaged over balls."""
+    """Penetration left by the contact model, summed over steps and averaged over balls, as a loss."""
 
     power: int = eqx.field(static=True, default=2)  # 2 for squares, m²; 1 for the penetration itself, m
 
     def step(self, state, record, dtype):
-        """The mean of |p|^power over the batch."""
+        """Return the mean of |p|^power over the batch."""
         left = record.left.astype(dtype)
         return jnp.mean(left if self.power == 1 else left**self.power, dtype=dtype)
 
     def end(self, state, steps, total):
-        """The sum over steps."""
+        """Return the sum over steps."""
         return total
 
 
 @dataclass(frozen=True)
 class BallProblem:
-    """A world, a start, a number of steps and a loss."""
+    """A differentiable simulation problem: a world, a start, a number of steps and a loss."""
 
     world: World  # the program
     y0: Any  # heights at the start, m, a number or shape (balls,)
@@ -87,16 +89,16 @@ class BallProblem:
     loss: BallLoss = field(default_factory=FinalHeight)  # of the rollout
 
     def with_values(self, values: Mapping[str, Any]) -> BallProblem:
-        """The same problem with other values of named parameters, start values included."""
+        """Return the problem with other values of named parameters, including start values."""
         start = {name: values[name] for name in START if name in values}
         rest = {name: value for name, value in values.items() if name not in START}
         return replace(self, world=self.world.with_values(rest), **start)
 
     def values(self, names: Sequence[str]) -> dict[str, Any]:
-        """Current values of named parameters.
+        """Return the current values of named parameters.
 
         Raises:
-            InputError: there is none of a name.
+            InputError: a parameter does not exist.
         """
         return {
             name: jnp.asarray(getattr(self, name)) if name in START else jnp.asarray(self.world.value(name))
@@ -106,19 +108,20 @@ class BallProblem:
     def value(
         self, overrides: Mapping[str, Any] | None = None, imposed: BallDecisions | None = None
     ) -> float:
-        """The loss, also with other values of named parameters: one compiled program for all of them.
+        """Compute the loss, optionally with other parameter values; one compiled program serves all values.
 
         Args:
-            imposed: decisions of every step to act on instead of its own, leading axis steps.
+            imposed: decisions of every step that replace the world's own, leading axis steps.
         """
         problem = self.with_values(overrides or {})
         return float(_loss(problem.bare, problem.world, *problem.start_arrays, imposed))
 
     def origin(self, names: Sequence[str]) -> dict[str, Array]:
-        """Point at which `loss_at` differentiates: values of the parameters, and displacement 0 of the start.
+        """Return the point at which `loss_at` is differentiated: parameter values, and zero displacement of
+        the start.
 
         Raises:
-            InputError: there is no parameter of a name.
+            InputError: a parameter does not exist.
         """
         return {
             name: jnp.zeros((), jnp.float64) if name in START else jnp.asarray(self.world.value(name))
@@ -128,12 +131,13 @@ class BallProblem:
     def value_and_grad(
         self, names: Sequence[str], imposed: BallDecisions | None = None, scale: float = 1.0
     ) -> tuple[float, dict[str, float]]:
-        """Loss and derivative along each named parameter, through the iterations that ran.
+        """Compute the loss and its derivative with respect to each named parameter, through the actual
+        iterations.
 
         Args:
-            names: a batch moves as a whole along y0 and v0.
-            imposed: decisions of every step to act on instead of its own, leading axis steps.
-            scale: of the loss in the reverse pass (`mdnum.numerics.formats`), a power of two.
+            names: names of parameters; y0 and v0 displace the whole batch.
+            imposed: decisions of every step that replace the world's own, leading axis steps.
+            scale: factor of the loss in the reverse pass (`mdnum.numerics.formats`), a power of two.
 
         Error: rounding of the reverse pass in the dtypes of the policy.
         """
@@ -144,7 +148,7 @@ class BallProblem:
         return float(made.value), {name: float(made.gradient[name]) for name in names}
 
     def run(self, **options: Any) -> BallRun:
-        """Simulate the problem; see `simulate`."""
+        """Simulate the problem; for options see `simulate`."""
         return simulate(self.world, self.world.start(self.y0, self.v0), self.steps, **options)
 
     @property
@@ -168,10 +172,10 @@ def loss_of(
     loss: BallLoss,
     imposed: BallDecisions | None = None,
 ) -> Float[Array, ""]:
-    """The loss of a rollout, traceable; every argument but steps and loss may be differentiated.
+    """Compute the loss of a rollout; traceable and differentiable in every argument except steps and loss.
 
     Args:
-        imposed: decisions of every step, leading axis steps; its own when None.
+        imposed: decisions of every step, leading axis steps; None for the world's own decisions.
 
     Returns:
         the loss in the dtype of its role.
@@ -189,11 +193,11 @@ def loss_of(
 
 
 def loss_at(bare, world, y0, v0, values, imposed):
-    """`loss_of` with parameters set, everything an argument, so that no fence is folded.
+    """Evaluate `loss_of` for given parameter values; all inputs are arguments, so that no fence is folded.
 
     Args:
         bare: number of steps, and loss.
-        values: by name; those of the start are how far it is moved (`BallProblem.origin`).
+        values: parameter values by name; for a start parameter, its displacement (`BallProblem.origin`).
     """
     world = world.with_values({name: value for name, value in values.items() if name not in START})
     y0, v0 = (
@@ -214,7 +218,8 @@ def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
-    """Heights after a number of steps, and their derivative with respect to one parameter, by forward mode.
+    """Compute heights after a number of steps, and their derivative with respect to one parameter (forward
+    mode).
 
     One compilation serves all step sizes and numbers of steps.
     """

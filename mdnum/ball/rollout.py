@@ -1,4 +1,4 @@
-"""Running balls: a compiled loop in chunks, the record on the host, and two of them side by side."""
+"""Rollouts of balls: a compiled loop in chunks, its record on the host, and comparison of two rollouts."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """A finished rollout; in arrays with a row for each step, row s is the step that made state s + 1.
+    """A finished rollout. In arrays with one row per step, row s is the step that made state s + 1.
 
     Attributes:
-        world: the program.
-        steps, balls: of the rollout.
-        y, v: heights (m) and velocities (m/s), shape (steps + 1, balls), in the dtype of the state; only
-            the first and the last row where states were not kept.
-        height: what each contact decision compared with zero, shape (steps, balls), or empty.
-        contact: the decisions, shape (steps, balls).
-        iterations, reason, residual, margin, before: of the step's solver (see `state.Solve`), shape
-            (steps,) where one rule stops all balls, else (steps, balls).
+        world: the world that was simulated.
+        steps, balls: number of steps and of balls.
+        y, v: heights (m) and velocities (m/s), shape (steps + 1, balls), in the dtype of the state; only the
+            first and the last state if states were not kept.
+        height: height that each contact decision compared with zero, shape (steps, balls), or empty.
+        contact: the contact decisions, shape (steps, balls).
+        iterations, reason, residual, margin, before: results of the step's solver (see `stopping.Solve`),
+            shape (steps,) if one rule stops all balls, else (steps, balls).
         history: residual at every stop decision, shape (steps, max_iter + 1), or None.
-        contacts: every contact flip; the subject is the ball, the margin minus the height. Its jump is the
-            change of mechanical energy per mass over the step in which an impact or a projection resets the
-            velocity, and 0 for a penalty, whose energy is continuous.
+        contacts: ledger of all contact flips: the subject is the ball, the margin is minus the height. The
+            jump is the change of mechanical energy per mass in the step in which an impact or a projection
+            resets the velocity; it is 0 for a penalty, whose energy is continuous.
     """
 
     world: World
@@ -62,7 +62,7 @@ class BallRun:
 
     @property
     def kept(self) -> bool:
-        """Whether every state was kept."""
+        """True if every state was kept."""
         return len(self.y) == self.steps + 1
 
     @property
@@ -77,34 +77,34 @@ class BallRun:
 
     @cached_property
     def first_contact(self) -> Int[np.ndarray, "balls"]:
-        """The step (from 1) of each ball's first contact decision that was yes; -1 where there was none."""
+        """Step (from 1) at which each ball first touches the floor; -1 if it never does."""
         touched = self.contact.any(axis=0)
         return np.where(touched, self.contact.argmax(axis=0) + 1, -1)
 
     @property
     def final(self) -> tuple[np.ndarray, np.ndarray]:
-        """Height and velocity at the end."""
+        """Heights and velocities at the end of the rollout."""
         return self.y[-1], self.v[-1]
 
     @cached_property
     def energy(self) -> Float[np.ndarray, "rows balls"]:
-        """Mechanical energy per mass, (m/s)², of each state that was kept."""
+        """Mechanical energy per mass, (m/s)², of each kept state."""
         return energy(self.world, self.y, self.v)
 
     def ended(self) -> dict[str, int]:
-        """Number of solves that ended for each reason."""
+        """Count the solves that ended for each reason."""
         codes, counts = np.unique(self.reason, return_counts=True)
         return {Reason(code).word: int(n) for code, n in zip(codes, counts, strict=True)}
 
     def decisions(self) -> BallDecisions:
-        """The decisions of all steps, to be imposed on another rollout."""
+        """Return the decisions of all steps, to be imposed on another rollout."""
         return BallDecisions(self.contact, self.iterations)  # type: ignore[arg-type]
 
 
 def energy(world: World, y: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "..."]:
-    """Mechanical energy per mass, (m/s)²: kinetic, gravity, and the spring of a penalty contact.
+    """Compute the mechanical energy per mass, (m/s)²: kinetic, gravitational, and that of a penalty spring.
 
-    Error: evaluated in float64; a softplus contact is counted as the spring it approximates.
+    Error: evaluated in float64; a softplus contact is treated as the spring that it approximates.
     """
     y, v = np.asarray(y, np.float64), np.asarray(v, np.float64)
     total = float(world.gravity) * y + 0.5 * v * v
@@ -126,17 +126,17 @@ def simulate(
     """Advance a batch of balls and record every decision.
 
     Args:
-        start: from `world.start`.
-        history: keep the residual of every stop decision too.
-        keep: keep every state; otherwise the first and the last, and the flips.
-        imposed: decisions of every step to act on instead of the world's own, leading axis steps.
-        progress: called with the steps made and asked for.
+        start: start state, made by `world.start`.
+        history: whether to keep the residual of every stop decision too.
+        keep: whether to keep every state; otherwise only the first and last states and the flips are kept.
+        imposed: decisions of every step that replace the world's own, leading axis steps.
+        progress: called with the numbers of steps made and requested.
 
     Returns:
         the record, on the host.
 
     Raises:
-        InputError: steps below 1.
+        InputError: steps is below 1.
     """
     check_not_forked()
     if steps < 1:
@@ -178,7 +178,7 @@ _COUNTS: dict[tuple[Any, int], tuple[int, ...]] = {}
 
 
 def undecided(world: World, start: BallState, steps: int) -> BallDecisions:
-    """Imposed decisions that impose nothing: -1 throughout, leading axis steps."""
+    """Return decisions that impose nothing: all values are -1, leading axis steps."""
     kind = jax.tree.structure(world), len(start.y)
     if kind not in _COUNTS:
         solve = eqx.filter_eval_shape(lambda world, start: world.advance(start)[1].solve, world, start)
@@ -201,7 +201,7 @@ def _chunk(world: World, state: BallState, imposed: Any, length: int, history: b
 
 
 def _flips(world: World, made: int, before, y, v, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The rows of the ledger of a chunk, from the steps, contacts and state before it and from its record."""
+    """Compute the ledger rows of a chunk from its record and from the state and contacts before it."""
     contact = rows["contact"]
 
     def packed(bits: np.ndarray) -> np.ndarray:
@@ -233,12 +233,13 @@ def _flips(world: World, made: int, before, y, v, rows: dict[str, np.ndarray]) -
 def height_bound(
     world: World, y: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."]
 ) -> Float[np.ndarray, "..."]:
-    """Bound on |computed - exact| of the height that a contact decision compares, m.
+    """Bound the rounding error |computed - exact| of the height in a contact decision, m.
 
-    Four roundings on the way from the state before, none of which cancels more than the sum of its parts.
+    The height results from four roundings after the previous state; none of them can exceed the roundoff of
+    the sum of the absolute terms.
 
     Args:
-        y, v: height (m) and velocity (m/s) of the state before.
+        y, v: height (m) and velocity (m/s) of the previous state.
     """
     y, v = np.asarray(y, np.float64), np.asarray(v, np.float64)
     h, free = float(world.integrator.h), abs(float(world.gravity))
@@ -246,13 +247,13 @@ def height_bound(
 
 
 def residual_bound(world: World, residual: Any, terms: int) -> Any:
-    """Bound on |computed - exact| of a residual, in its own unit.
+    """Bound the rounding error |computed - exact| of a residual, in the unit of the residual.
 
     All terms of a residual have one sign, so the error of their sum is at most gamma times the sum.
 
     Args:
-        residual: what a stop decision compares.
-        terms: balls that it is a residual of; 1 where each has its own.
+        residual: residual that a stop decision compares with its threshold.
+        terms: number of balls in the residual; 1 if each ball has its own residual.
     """
     return gamma(max(terms - 1, 1), world.policy.dtype("accumulate")) * residual
 
@@ -261,7 +262,7 @@ def residual_bound(world: World, residual: Any, terms: int) -> Any:
 
 
 class CrossDecision(NamedTuple):
-    """A decision on which two runs differ."""
+    """A decision that differs between two runs."""
 
     step: int  # from 1
     channel: str  # "contact" or "stop"
@@ -279,13 +280,13 @@ class CrossDecision(NamedTuple):
 
     @property
     def run(self) -> str:
-        """The run that decided yes: the one in which the ball touches, or whose solver stops first."""
+        """Run that decided yes: the run in which the ball touches, or whose solver stops first."""
         return "A" if (self.a > self.b) == (self.channel == "contact") else "B"
 
 
 @dataclass(frozen=True)
 class BallDifference:
-    """Where two rollouts of the same length diverge."""
+    """The first differences between two rollouts of the same length."""
 
     seed: int | None  # first step whose state bits differ (0: the start itself); None where none do
     fork: int | None  # first step whose decisions differ; None where none do
@@ -302,10 +303,10 @@ class BallDifference:
 
 
 def first_difference(a: BallRun, b: BallRun) -> BallDifference:
-    """Where two rollouts diverge.
+    """Find the first differences between two rollouts.
 
     Raises:
-        InputError: of other lengths or batch sizes.
+        InputError: the rollouts differ in length or batch size.
     """
     if (a.steps, a.balls) != (b.steps, b.balls):
         raise InputError(
@@ -330,10 +331,10 @@ def first_difference(a: BallRun, b: BallRun) -> BallDifference:
 
 
 def cross_decisions(a: BallRun, b: BallRun, last: int | None = None) -> list[CrossDecision]:
-    """Every decision that two runs of equal size make differently, contacts of a step before its stops.
+    """List all decisions that differ between two runs of equal size; contacts of a step precede its stops.
 
     Args:
-        a, b: margins and bounds of contacts are NaN where states were not kept.
+        a, b: the two runs; margins and bounds of contacts are NaN if their states were not kept.
         last: the last step to compare; default all.
     """
     rows = a.steps if last is None else last
@@ -352,7 +353,7 @@ def cross_decisions(a: BallRun, b: BallRun, last: int | None = None) -> list[Cro
 
 
 def _stops(a: BallRun, b: BallRun, rows: int) -> list[CrossDecision]:
-    """Solves whose iterations differ."""
+    """List the solves whose numbers of iterations differ."""
     row, ball = np.nonzero(_unequal_counts(a, b, rows))
     if a.iterations.ndim == b.iterations.ndim == 1:
         ball = np.full(len(row), -1)
@@ -375,7 +376,7 @@ def _stops(a: BallRun, b: BallRun, rows: int) -> list[CrossDecision]:
 
 
 def _solving(run: BallRun, rows: int) -> np.ndarray:
-    """Whether iterations move each ball: where a shared rule goes on, balls that do not touch stay put."""
+    """Return which balls the iterations can move: under a shared rule, balls without contact do not move."""
     if isinstance(run.world.contact, Projection):
         return run.contact[:rows]
     return np.ones((rows, run.balls), bool)
@@ -388,14 +389,14 @@ def _at(values: np.ndarray, row: np.ndarray, ball: np.ndarray) -> np.ndarray:
 def overridden(
     run: BallRun, last: int | None = None
 ) -> tuple[Int[np.ndarray, "times"], Float[np.ndarray, "times"]]:
-    """Number of imposed decisions that differ from the run's own, and their distance to the threshold.
+    """Count imposed decisions that differ from the run's own, and return their distance to the threshold.
 
     Args:
-        run: under imposed decisions.
+        run: a run under imposed decisions.
         last: the last step to compare; default all.
 
     Returns:
-        the number at each step 0..last, and the largest |height - threshold| of its contacts, m, 0 for none.
+        the number at each step 0..last, and the largest |height - threshold| (m) of these contacts, or 0.
     """
     rows = run.steps if last is None else last
     # as it is compared: in the dtype of decisions
@@ -421,7 +422,7 @@ def overridden(
 
 
 def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
-    """Solves whose iterations differ, shape (rows, 1) where one rule stops all balls, else by ball."""
+    """Return which iteration counts differ, shape (rows, 1) if one rule stops all balls, else per ball."""
     counts = [run.iterations.reshape(run.steps, -1)[:rows] for run in (a, b)]
     differ = counts[0] != counts[1]
     if _counted(a) != _counted(b):
@@ -433,7 +434,7 @@ def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
 
 
 def _counted(run: BallRun) -> str:
-    """What the iteration counts of a run count."""
+    """Return the name of the quantity in the iteration counts of a run."""
     contact, scheme = run.world.contact, run.world.integrator
     if isinstance(scheme, EventLocated):
         return "impacts"

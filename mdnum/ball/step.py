@@ -1,7 +1,8 @@
-"""One step of a ball: schemes of flight, and contact models: a force, an iterated constraint, an instant.
+"""One step of a ball: integration schemes, and contact models: a force, an iterated constraint, or an impact.
 
-Every scheme says at which height the contact decision is made; the record holds that height. All products
-are rounded before they are added (no fused multiply-add), so numpy in the same dtype has the same bits.
+Every scheme defines the height at which the contact decision is made; the record contains this height. All
+products are rounded before they are added (no fused multiply-add), so numpy in the same dtype gives the same
+bits.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class BallState(NamedTuple):
 
 
 class BallDecisions(NamedTuple):
-    """All decisions of a step; also used to impose some or all decisions on a step."""
+    """All decisions of a step; also used to impose all or some decisions on a step."""
 
     # whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1, and a negative
     # number where the step is to decide by itself
@@ -48,7 +49,7 @@ class BallDecisions(NamedTuple):
 
 
 class BallRecord(NamedTuple):
-    """Record of a step."""
+    """Record of one step: height, contact decision, remaining penetration and solve."""
 
     height: Float[Array, "balls"]  # what the contact decision compared with zero, m, shape (balls,)
     contact: Bool[Array, "balls"]  # the decision, shape (balls,)
@@ -58,17 +59,18 @@ class BallRecord(NamedTuple):
 
     @property
     def decisions(self) -> BallDecisions:
-        """What the step decided, to be imposed on another."""
+        """Decisions of the step, in the form in which they can be imposed on another step."""
         return BallDecisions(self.contact, self.solve.iterations)
 
 
 class Rounding(eqx.Module):
-    """Rounds a product (or anything) before it is used: the fence, with the zero it needs."""
+    """Fence that rounds a value, such as a product, before its use; it contains the zero that this requires.
+    """
 
     zero: Int[Array, ""]  # an integer zero that the compiler must not know (see mdnum.numerics.exact)
 
     def __call__(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """x, rounded here."""
+        """Return x, rounded to its dtype at this point."""
         return fence(x, self.zero)
 
 
@@ -93,7 +95,7 @@ class Motion(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """The next height, velocity and carried acceleration, and the record of how they came about."""
+    """Result of a step: height, velocity, the acceleration carried to the next step, and the record."""
 
     y: Balls
     v: Balls
@@ -114,11 +116,11 @@ class Scheme(Protocol):
     h: Any  # time step, s
 
     def fly(self, y: Balls, v: Balls, a: Balls, r: Rounding) -> tuple[Balls, Balls]:
-        """One step under a constant acceleration."""
+        """Make one step under a constant acceleration."""
         ...
 
     def push(self, pull: Pull, motion: Motion) -> Moved:
-        """One step under a contact force; what it leaves of the penetration is not on the record yet."""
+        """Make one step under a contact force; the record does not yet contain the remaining penetration."""
         ...
 
 
@@ -131,7 +133,7 @@ class _Euler(eqx.Module):
     h: Any
 
     def push(self, pull, motion):
-        """The decision is made at the old height."""
+        """Make one step under a contact force, with the contact decision made at the old height."""
         y, v = motion.y, motion.v
         contact = motion.judge(y)
         a = pull(y, v, contact)
@@ -139,7 +141,8 @@ class _Euler(eqx.Module):
 
 
 class ExplicitEuler(_Euler):
-    """y += h v; v += h a(y), both from the old state. Order 1; a stiff contact gains energy at any step."""
+    """y += h v; v += h a(y), both from the old state. Order 1; a stiff contact gains energy at any time step.
+    """
 
     def fly(self, y, v, a, r):
         return r(y + r(self.h * v)), r(v + r(self.h * a))
@@ -168,7 +171,7 @@ class BallVerlet(eqx.Module):
         return y, r(v + r(half * a))
 
     def push(self, pull, motion):
-        """The decision is made at the new height; a damping force sees the velocity of the half step."""
+        """Make one step, deciding contact at the new height; damping uses the half-step velocity."""
         r = motion.rounding
         y, v, half = self._drift(motion.y, motion.v, motion.carried, r)
         contact = motion.judge(y)
@@ -177,9 +180,10 @@ class BallVerlet(eqx.Module):
 
 
 class ImplicitMidpoint(eqx.Module):
-    """The acceleration of the middle of the step, found by Newton's method. Order 2, stable at any step.
+    """Implicit midpoint scheme, solved by Newton's method. Order 2, stable for any time step.
 
-    The derivative is the implicit one: of the equation that the solve ends at, not of its iterations.
+    The acceleration is that of the middle of the step. Derivatives are implicit: those of the solved
+    equation, not of the iterations.
     """
 
     h: Any  # time step, s
@@ -192,7 +196,7 @@ class ImplicitMidpoint(eqx.Module):
         return r(y + r(self.h * middle)), r(v + r(self.h * a))
 
     def push(self, pull, motion):
-        """The decision is made at the height of the middle of the step."""
+        """Make one step, with the contact decision made at the height in the middle of the step."""
         y, v, r, judge = motion.y, motion.v, motion.rounding, motion.judge
         half = r(0.5 * self.h)
         quarter = r(half * half)
@@ -241,7 +245,7 @@ class ImplicitMidpoint(eqx.Module):
 
 
 class EventLocated(eqx.Module):
-    """Flight along the exact parabola, with every impact located inside the step. For impacts only."""
+    """Flight along the exact parabola, with every impact located inside the step. For `Impact` only."""
 
     h: Any  # time step, s; the trajectory does not depend on it, only where it is looked at
     max_impacts: int = eqx.field(static=True, default=200)  # the cap on impacts inside one step
@@ -261,27 +265,27 @@ class Contact(Protocol):
     """Base class of the contact models."""
 
     def move(self, motion: Motion) -> Moved:
-        """One step."""
+        """Make one step."""
         ...
 
     def acceleration(self, y: Balls, v: Balls, free: Balls, contact: Touching, r: Rounding) -> Balls:
-        """Acceleration of a state, for schemes that carry it."""
+        """Return the acceleration of a state, for schemes that carry it to the next step."""
         ...
 
 
 class _Forceless(eqx.Module):
-    """A contact that resets the state."""
+    """A contact model that resets the state instead of exerting a force."""
 
     def acceleration(self, y, v, free, contact, r):
-        """There is no contact force."""
+        """Return the acceleration without contact, because there is no contact force."""
         return free
 
 
 class Penalty(eqx.Module):
-    """Force k p - damping v on a ball in contact, with p = -y; k p with a softplus p when smooth.
+    """Force k p - damping v on a ball in contact, with p = -y; a smooth contact has a softplus p.
 
-    A step on which a contact is imposed pushes with -k y whatever the sign of y: the branch continues
-    smoothly beyond its threshold, as a pair force beyond its cutoff does when it is imposed.
+    If a contact is imposed on a step, the force is -k y for either sign of y: the branch continues smoothly
+    beyond its threshold, like an imposed pair force beyond its cutoff.
 
     Source: the soft contact of the discrete element method (Cundall and Strack 1979).
     """
@@ -294,18 +298,18 @@ class Penalty(eqx.Module):
     smooth: bool = eqx.field(static=True, default=False)
 
     def depth(self, y, contact):
-        """Penetration p, m."""
+        """Return the penetration p, m."""
         if self.smooth:
             return self.eps * jax.nn.softplus(-y / self.eps)
         return jnp.where(contact, -y, jnp.zeros_like(y))
 
     def acceleration(self, y, v, free, contact, r):
-        """Control, gravity, spring and damper."""
+        """Return the sum of control, gravity, spring and damper."""
         drag = jnp.where(contact, r(self.damping * v), jnp.zeros_like(v))
         return r(free + r(r(self.k * self.depth(y, contact)) - drag))
 
     def move(self, motion: Motion) -> Moved:
-        """One step of the scheme under this force."""
+        """Make one step of the scheme under this force."""
         r = motion.rounding
 
         def pull(y, v, contact):
@@ -316,11 +320,12 @@ class Penalty(eqx.Module):
 
 
 class Projection(_Forceless):
-    """y ← y + alpha k p with p = max(0, -y) until the rule stops it; then the clamp, and restitution.
+    """y ← y + alpha k p with p = max(0, -y) until the rule stops the iteration; then clamping and
+    restitution.
 
-    Each iteration leaves 1 - alpha k of the penetration, so tol is reached after
-    ceil(log(tol / p0) / log(1 - alpha k)) iterations; alpha k in (1, 2) overshoots, at 2 it never ends.
-    The floor is at 0 whatever k is: where the iterations end depends on k only through what they leave.
+    Each iteration leaves 1 - alpha k of the penetration, so tol is reached after ceil(log(tol / p0) / log(1 -
+    alpha k)) iterations; with alpha k in (1, 2) they overshoot, and at 2 they never end. The floor is at 0
+    for any k: k affects the final height only through the remaining penetration.
     """
 
     k: Any  # gain, dimensionless; what is learned in place of a stiffness
@@ -332,7 +337,7 @@ class Projection(_Forceless):
     derivative: Any = None
 
     def move(self, motion: Motion) -> Moved:
-        """Flight, and the projection back where it ends below the floor."""
+        """Make one step: flight, and a projection back to the floor if the flight ends below it."""
         r, policy = motion.rounding, motion.policy
         height, v = motion.integrator.fly(motion.y, motion.v, motion.free, r)
         contact = motion.judge(height)
@@ -370,9 +375,9 @@ class Projection(_Forceless):
 class Impact(_Forceless):
     """v ← -restitution v at the floor.
 
-    With an event-located step the impact happens at its exact time, and the rest of the step flies on from
-    there; with any other scheme the ball is put on the floor and reset at the end of the step in which it
-    passed the floor, an error of order h in its state and of order 1 in its derivative.
+    With an event-located step the impact happens at its exact time, and the flight continues for the rest of
+    the step. With any other scheme, a ball that passed the floor is put on the floor, and its velocity is
+    reset, at the end of the step: an error of order h in the state and of order 1 in the derivative.
     """
 
     restitution: Any = 0.8  # speed after over speed before
@@ -381,7 +386,7 @@ class Impact(_Forceless):
     rest_speed: Any = 1e-6
 
     def move(self, motion: Motion) -> Moved:
-        """Flight with the impacts of this step."""
+        """Make one step: flight with the impacts of this step."""
         if isinstance(motion.integrator, EventLocated):
             return self._located(motion, motion.integrator)
         r = motion.rounding
@@ -453,7 +458,7 @@ class Impact(_Forceless):
 
 
 def lowest(y, v, a, time, r):
-    """The lowest height of the parabola over the given time: at its end, or at its vertex."""
+    """Return the lowest height of the parabola over the given time: at its end, or at its vertex."""
     end = r(y + r(time * r(v + r(r(0.5 * time) * a))))
     up = (a > 0) & (v < 0) & (r(-v) < r(a * time))
     safe = jnp.where(up, a, jnp.ones_like(a))
@@ -461,9 +466,9 @@ def lowest(y, v, a, time, r):
 
 
 def time_of_impact(y, v, a, r):
-    """The first time at which the parabola meets the floor, s; infinite where it never does.
+    """Return the first time (s) at which the parabola meets the floor; infinite if there is no such time.
 
-    Error: a few units roundoff relative; of the two forms of the root the one without cancellation is used.
+    Error: a relative error of a few units roundoff; the form of the root without cancellation is used.
     """
     inside = r(r(v * v) - r(r(2.0 * a) * y))
     # the argument is masked as well, so that no derivative is taken where there is no root

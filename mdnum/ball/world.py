@@ -1,4 +1,4 @@
-"""The bouncing ball as a program: the decisions are made in one place and acted on in another."""
+"""The bouncing ball as a program that separates making decisions from acting on them."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ _MOST_ITERATIONS = 2**31 - 1  # iterations are counted in 32 bits
 
 
 class World(eqx.Module):
-    """Balls over a floor at height 0: everything that a step depends on, apart from the state.
+    """Balls above a floor at height 0: everything that a step depends on, except the state.
 
-    Made by `World.create`, which checks ranges and casts every number to its role's dtype. To be passed
-    into jit as an argument and not closed over: what a compiler knows to be zero it may fold away.
+    `World.create` makes a world, checks ranges and casts every number to its role's dtype. Pass a world to
+    jitted code as an argument, not by closure: a compiler may remove operations with a known zero.
 
     Attributes:
-        contact: what happens at the floor.
-        integrator: how a step is made.
+        contact: contact model of the floor.
+        integrator: integration scheme.
         gravity: m/s², downward positive.
-        control: acceleration added in each step, m/s², shape (steps,) or (steps, balls); None for none.
-        lift: height, m, at which a contact ends that began below 0; None for no hysteresis.
-        rounding: the fence.
+        control: additional acceleration in each step, m/s², shape (steps,) or (steps, balls); or None.
+        lift: height, m, at which a contact that began below 0 ends; None for no hysteresis.
+        rounding: fence that forces intermediate rounding.
         policy: dtype by role.
     """
 
@@ -72,17 +72,17 @@ class World(eqx.Module):
         policy: RolePrecision | None = None,
         hysteresis: float | None = None,
     ) -> World:
-        """A world with its numbers checked and cast.
+        """Create a world, check its numbers and cast them to their dtypes.
 
         Args:
-            contact, integrator: with plain numbers.
-            gravity: m/s².
-            control: shape (steps,) or (steps, balls), m/s².
-            policy: dtype by role; float64 throughout when None.
+            contact, integrator: contact model and integration scheme with plain numbers as parameters.
+            gravity: gravitational acceleration, m/s².
+            control: additional acceleration, m/s², shape (steps,) or (steps, balls).
+            policy: dtype by role; None for float64 in all roles.
             hysteresis: height, m, at which a contact ends; None for 0.
 
         Raises:
-            InputError: a number out of range, or parts that do not go together.
+            InputError: a number is out of range, or the components are incompatible.
         """
         policy = RolePrecision() if policy is None else policy
         fence = Rounding(zero_bits(np.float64))
@@ -105,12 +105,12 @@ class World(eqx.Module):
         return None
 
     def has(self, name: str) -> bool:
-        """Whether this world has a parameter of this name."""
+        """Return True if this world has a parameter of this name."""
         return self._place(name) is not None
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that this world has."""
+        """Names of the parameters of this world."""
         return tuple(name for name in PARAMETERS if self.has(name))
 
     def _known(self, name: str) -> str:
@@ -122,18 +122,18 @@ class World(eqx.Module):
         return path
 
     def value(self, name: str) -> Any:
-        """A parameter's value.
+        """Return the value of a parameter.
 
         Raises:
-            InputError: there is none of that name here.
+            InputError: this world has no such parameter.
         """
         return attrgetter(self._known(name))(self)
 
     def with_values(self, values: Mapping[str, Any]) -> World:
-        """The same world with other values; nothing is checked, so values may be traced.
+        """Return the world with other parameter values; they are not checked, so they may be traced.
 
         Raises:
-            InputError: there is no parameter of that name here.
+            InputError: this world has no such parameter.
         """
         world = self
         for name, value in values.items():
@@ -146,7 +146,7 @@ class World(eqx.Module):
     # -- decide ----------------------------------------------------------------------------------------
 
     def touches(self, height: Balls, before: Bool[Array, "balls"]) -> Bool[Array, "balls"]:
-        """The contact decision: height < 0, or with hysteresis until height > lift."""
+        """Decide contact: height < 0; with hysteresis, a contact continues until height > lift."""
         height = height.astype(self.policy.dtype("decision"))
         enter = Threshold(jnp.zeros((), height.dtype), "<", "height")
         if self.lift is None:
@@ -157,7 +157,7 @@ class World(eqx.Module):
     # -- act -------------------------------------------------------------------------------------------
 
     def start(self, y: Any, v: Any = 0.0) -> BallState:
-        """The state at step 0.
+        """Create the state at step 0.
 
         Args:
             y: heights, m, a number or shape (balls,).
@@ -168,11 +168,11 @@ class World(eqx.Module):
     def advance(
         self, state: BallState, *, imposed: BallDecisions | None = None, history: bool = False
     ) -> tuple[BallState, BallRecord]:
-        """Decide and act.
+        """Make one step: decide which balls touch, and act on these decisions.
 
         Args:
-            imposed: decisions to act on instead of its own, or instead of some of them (see `BallDecisions`).
-            history: whether a solver keeps the residual of every decision.
+            imposed: decisions that replace all or some of the world's own (see `BallDecisions`).
+            history: whether a solver records the residual of every decision.
 
         Returns:
             the next state, and the record of the step.
@@ -209,7 +209,7 @@ class World(eqx.Module):
         return lambda height: jnp.where(contact < 0, self.touches(height, state.touching), contact > 0)
 
     def free(self, step: Int[Array, ""], shape: tuple[int, ...]) -> Balls:
-        """Acceleration without contact, control minus gravity, m/s², of so many balls in a step."""
+        """Return the acceleration without contact (control minus gravity, m/s²) of each ball in a step."""
         free = -self.gravity
         if self.control is not None:
             # a control that ends before the run does stays at its last value
@@ -238,7 +238,7 @@ def _start(world: World, y: Array, v: Array) -> BallState:
 
 
 def _check(world: World) -> None:
-    """Refuse numbers out of range and parts that do not go together, before anything runs."""
+    """Raise an error if a number is out of range or the components are incompatible."""
     contact: Any = world.contact
     integrator: Any = world.integrator
     for name in world.parameters:
@@ -267,7 +267,7 @@ def _check(world: World) -> None:
 
 
 def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
-    """Refuse a stopping rule out of range, or with a tolerance that the dtypes can never meet."""
+    """Raise an error if a stopping rule is out of range or its tolerance cannot be met in these dtypes."""
     _count("max_iter", rule.max_iter)
     if isinstance(rule, stopping.FixedCount):
         return

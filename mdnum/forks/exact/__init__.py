@@ -1,2 +1,1 @@
-"""Exact real arithmetic of a run's discrete map, which certifies the decisions of runs in finite precision.
-"""
+"""Exact real arithmetic of a run's discrete map, to certify the decisions of finite-precision runs."""

@@ -1,5 +1,4 @@
-"""The step at which runs of either world leave the exact history, and the precision that delays it longest.
-"""
+"""The step at which runs of either world leave the exact history, for each precision."""
 
 from __future__ import annotations
 
@@ -85,8 +84,7 @@ class PolicyHorizon:
 
 @result
 class Certificate:
-    """The exact history of a system, and the steps up to which runs in finite precision follow that history.
-    """
+    """The exact history of a system, and how long runs in finite precision follow that history."""
 
     steps: int  # last step
     timestep: float  # in the user's units of time
@@ -165,9 +163,7 @@ def _certify_md(system: Simulation, last: int, policies: Mapping[str, Roles], no
     matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
 
     def reduced(x: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Move positions into a box at the origin, so that a displacement is off by one lattice vector at
-        most.
-        """
+        """Move positions into a box at the origin, so that one lattice vector corrects a displacement."""
         return x - np.floor(x @ np.asarray(simulation.cell.inverse)) @ matrix
 
     rows = []
@@ -241,8 +237,7 @@ def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
 
 
 def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
-    """Add the gain of each policy over pure single precision, if single precision leaves the exact history.
-    """
+    """Add the gain of each policy over pure single precision, if that leaves the exact history."""
     low = next((row for row in rows if row.is_all("float32")), None)
     high = next((row for row in rows if row.is_all("float64")), None)
     if low is None or low.horizon is None:

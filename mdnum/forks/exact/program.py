@@ -184,9 +184,7 @@ def unsupported(simulation: Simulation) -> InputError | None:
 
 
 def _without_balls(simulation: Simulation) -> InputError | None:
-    """Return an error if the potential or its cutoff needs an operation that ball arithmetic does not
-    support.
-    """
+    """Return an error if the potential or cutoff needs an operation that balls do not support."""
     from flint import arb
 
     try:
@@ -437,9 +435,7 @@ class _Run:
 
 
 def _log2_radius(ball) -> float:
-    """Return an upper bound on the binary logarithm of a ball's radius, which may be out of range for a
-    double.
-    """
+    """Return an upper bound on log2 of a ball's radius, for radii beyond the range of a double too."""
     if ball.is_exact():
         return -math.inf
     mantissa, exponent = ball.rad().man_exp()
