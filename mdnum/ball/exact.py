@@ -1,17 +1,17 @@
 """The bouncing ball in closed form: its motion, and its derivative with respect to every parameter.
 
-A ball above a floor at height 0, with gravity g, starts at (y0, v0). It reaches the floor with speed
-s = sqrt(v0² + 2 g y0) at t_1 = (v0 + s) / g. With restitution e, impact n has speed e^(n-1) s, and the time
-between impacts n and n + 1 is 2 e^n s / g. So
+A ball above a floor at height 0, with gravity g, starts at (y0, v0). It reaches the floor with speed s =
+sqrt(v0² + 2 g y0) at t_1 = (v0 + s) / g. With restitution e, impact n has speed e^(n-1) s, and the time
+between impacts n and n + 1 is 2 e^n s / g. Therefore
 
     t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e),
 
-infinitely many impacts in a finite time (Zeno). On a spring y'' = -g - k y - c y' below the floor, and each
-contact is a damped cosine. That is the differential equation that penalty contacts discretize; the ball with
-restitution is not, not even in the limit of stiff springs, unless its restitution is 1.
+so infinitely many impacts take place in a finite time (Zeno). With a spring, y'' = -g - k y - c y' below the
+floor, and each contact is a damped cosine. Penalty contacts discretize this differential equation. A ball
+with restitution follows another motion, even in the limit of stiff springs, unless its restitution is 1.
 
-Everything here is numpy in float64 on the host: it is what the programs of this package are measured against,
-so it shares no code with them.
+All computations use numpy in float64 on the host. They share no code with the programs of this package,
+because they are the reference for these programs.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MOST = 100_000  # contacts after which something is wrong: each damped one take
 
 @dataclass(frozen=True)
 class Known:
-    """A quantity known in closed form, with its derivative with respect to every parameter."""
+    """A quantity with a closed-form value, and its derivative with respect to every parameter."""
 
     value: Float[np.ndarray, "..."]  # shape of what was asked for (times or impact numbers)
     # derivative by name of the parameter, each of that shape
@@ -45,9 +45,9 @@ Parameters = Mapping[str, complex]
 
 
 class _Motion:
-    """Checks of the start, derivatives, height and velocity, shared by both kinds of motion.
+    """Shared base of both motions: checks of the start, derivatives, height and velocity.
 
-    Source: derivatives by the complex step, in which nothing cancels (Squire & Trapp, SIAM Review 40 (1998)
+    Source: complex-step derivatives, which involve no cancellation (Squire & Trapp, SIAM Review 40 (1998)
     110).
     """
 
@@ -64,7 +64,7 @@ class _Motion:
             raise InputError("the ball starts at rest on the floor", remedy="Give it a height or a velocity")
 
     def _known(self, quantities: Callable[[Parameters], tuple[Any, ...]]) -> tuple[Known, ...]:
-        """Functions of complex parameters, with their derivatives."""
+        """Evaluate functions of complex parameters, with their derivatives."""
         at = self._at
         moved = {name: quantities(at | {name: value + 1j * _STEP}) for name, value in at.items()}
         found = []
@@ -78,34 +78,34 @@ class _Motion:
         return {name: complex(getattr(self, name)) for name in self.NAMES}
 
     def first_contact(self) -> Known:
-        """Time at which the ball first reaches the floor, s.
+        """Return the time (s) at which the ball first reaches the floor.
 
         Error: a few ulps, for either sign of v0.
         """
         return self._known(_down)[0]
 
     def state(self, t: Times) -> tuple[Known, Known]:
-        """Height (m) and velocity (m/s) at time t (s)."""
+        """Return height (m) and velocity (m/s) at time t (s)."""
         raise NotImplementedError
 
     def height(self, t: Times) -> Known:
-        """Height at time t (s), m."""
+        """Return the height (m) at time t (s)."""
         return self.state(t)[0]
 
     def velocity(self, t: Times) -> Known:
-        """Velocity at time t (s), m/s; after the impact where t is the time of one."""
+        """Return the velocity (m/s) at time t (s); at the time of an impact, the velocity after it."""
         return self.state(t)[1]
 
 
 def _down(p: Parameters) -> tuple[complex, complex]:
-    """Time and speed at which the ball first reaches height 0: (v0 + s) / g would cancel where it falls."""
+    """Return the time and speed of the first contact; if the ball falls, (v0 + s) / g would cancel."""
     y0, v0, g = p["y0"], p["v0"], p["gravity"]
     speed = np.sqrt(v0 * v0 + 2 * g * y0)
     return (v0 + speed) / g if v0.real >= 0 else 2 * y0 / (speed - v0), speed
 
 
 def _impact(p: Parameters, n: Any) -> tuple[Any, Any]:
-    """Time of impact n, and the speed after it."""
+    """Return the time of impact n and the speed after the impact."""
     first, speed = _down(p)
     e = p["restitution"]
     power, between = _powers(e, np.asarray(n, np.float64) - 1)
@@ -116,14 +116,14 @@ def _impact(p: Parameters, n: Any) -> tuple[Any, Any]:
 class ExactImpact(_Motion):
     """The exact motion of a ball with restitution.
 
-    Impacts are numbered from 1. At the time of an impact the state is the one after it.
+    Impacts are numbered from 1. At the time of an impact, the state is that after the impact.
 
     Raises:
-        InputError: a parameter out of range, or a ball that starts at rest on the floor.
+        InputError: a parameter is out of range, or the ball starts at rest on the floor.
 
-    Error: values and derivatives are those of a program without cancellation: impact speeds and
-    times within some ten ulps plus n ulps for the n-th power of e, whatever e is, also at 1 and next to it;
-    height and velocity within that of the motion at a time some ulps earlier or later.
+    Error: values and derivatives are computed without cancellation. Impact speeds and times have errors of
+    about ten ulps, plus n ulps for the n-th power of e, for any e including values at and near 1. Height and
+    velocity are those at a time that differs by a few ulps, within the same errors.
     """
 
     y0: float  # height at the start, m, at least 0
@@ -138,17 +138,17 @@ class ExactImpact(_Motion):
         _positive("restitution", self.restitution, zero=True, most=1.0)
 
     def impact_speed(self, n: Counts) -> Known:
-        """Speed with which impact n meets the floor, e^(n-1) s, m/s."""
+        """Return the speed e^(n-1) s (m/s) with which impact n meets the floor."""
         power = _numbers(n) - 1
         return self._known(lambda p: (_powers(p["restitution"], power)[0] * _down(p)[1],))[0]
 
     def impact_time(self, n: Counts) -> Known:
-        """Time of impact n, s."""
+        """Return the time of impact n, s."""
         n = _numbers(n)
         return self._known(lambda p: _impact(p, n))[0]
 
     def rest_time(self) -> Known:
-        """Time after which the ball lies still, infinitely many impacts later, s.
+        """Return the time (s) at which the ball comes to rest after infinitely many impacts.
 
         Raises:
             InputError: the restitution is 1.
@@ -167,7 +167,7 @@ class ExactImpact(_Motion):
         return self._known(at_rest)[0]
 
     def bounces(self, t: Times) -> Float[np.ndarray, "*times"]:
-        """Number of impacts up to and including time t (s); infinite once the ball lies still."""
+        """Return the number of impacts up to and including time t (s); infinite once the ball is at rest."""
         t = _later(t)
         at = self._at
         first, speed = (part.real for part in _down(at))
@@ -191,7 +191,7 @@ class ExactImpact(_Motion):
         return np.where(finite & (np.real(_impact(at, now)[0]) > t) & (n > 1), n - 1, n)
 
     def state(self, t: Times) -> tuple[Known, Known]:
-        """Height and velocity at time t (s); zero, with zero derivatives, once the ball lies still."""
+        """Return height and velocity at time t (s); zero with zero derivatives once the ball is at rest."""
         t = _later(t)
         n = self.bounces(t)
         still = np.isinf(n) | ((n > 0) & (self.restitution == 0))
@@ -212,15 +212,15 @@ class ExactImpact(_Motion):
 class ExactPenalty(_Motion):
     """The exact motion of a ball on a penalty contact, with or without damping.
 
-    Below the floor y'' = -g - k y - c y', as long as the ball is below it (so the damper may pull at the
-    end). The end of a contact is closed without damping; with it, it is the root of one equation between the
-    lowest point and the first crest after it. A ball whose crest stays below the floor has come to rest in
-    it, g / k deep.
+    The equation y'' = -g - k y - c y' holds as long as the ball is below the floor, so the damper may pull at
+    the end of a contact. The end time of a contact has a closed form without damping. With damping it is the
+    root of one equation between the lowest point and the next crest. A ball whose crest remains below the
+    floor comes to rest at depth g / k.
 
     Raises:
-        InputError: a parameter out of range, or a ball that starts at rest on the floor.
+        InputError: a parameter is out of range, or the ball starts at rest on the floor.
 
-    Error: some ten ulps per contact, in values and in derivatives.
+    Error: about ten ulps per contact, in values and in derivatives.
     """
 
     y0: float  # height at the start, m, at least 0
@@ -241,14 +241,14 @@ class ExactPenalty(_Motion):
             )
 
     def state(self, t: Times) -> tuple[Known, Known]:
-        """Height and velocity at time t (s); the height is negative in contact."""
+        """Return height and velocity at time t (s); the height is negative during contact."""
         t = _later(t)
         y, v = self._known(lambda p: _bounced(p, t))
         return y, v
 
 
 def _bounced(p: Parameters, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Height and velocity on a penalty contact with complex parameters, at real times."""
+    """Compute height and velocity on a penalty contact, for complex parameters and real times."""
     y, v = np.zeros(t.shape, complex), np.zeros(t.shape, complex)
     g = p["gravity"]
     # where the current flight began, and how
@@ -280,7 +280,7 @@ def _bounced(p: Parameters, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _arc(p: Parameters, s: complex, tau):
-    """Height and velocity a time tau into a contact entered with speed s."""
+    """Return height and velocity at a time tau after entering a contact with speed s."""
     k, half, deep = p["k"], p["damping"] / 2, p["gravity"] / p["k"]
     w = np.sqrt(k - half * half)
     fade, cosine, sine = np.exp(-half * tau), np.cos(w * tau), np.sin(w * tau) / w
@@ -292,7 +292,7 @@ def _arc(p: Parameters, s: complex, tau):
 
 
 def _end(p: Parameters, s: complex) -> complex | None:
-    """Duration of a contact entered with speed s, s; None if the contact never ends."""
+    """Return the duration (s) of a contact entered with speed s, or None if the contact never ends."""
     half = p["damping"].real / 2
     if half * half > p["k"].real:
         return None
@@ -338,9 +338,10 @@ def _later(t: Times) -> Float[np.ndarray, "*times"]:
 
 
 def _powers(e: complex, n: Any) -> tuple[Any, Any]:
-    """e^n, and 1 + e + ... + e^(n-1), for whole numbers: bit by bit, in sums of one sign.
+    """Return e^n and 1 + e + ... + e^(n-1) for integers n, by repeated squaring with sums of one sign.
 
-    (1 - e^n) / (1 - e) loses everything next to e = 1, and its derivative before that.
+    Near e = 1 the formula (1 - e^n) / (1 - e) loses all digits, and the digits of its derivative even
+    earlier.
     """
     n = np.asarray(n, np.float64)
     power, total = np.ones(n.shape, complex), np.zeros(n.shape, complex)

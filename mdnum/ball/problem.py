@@ -21,9 +21,7 @@ START = ("y0", "v0")  # parameters of the start rather than of the world; a valu
 
 
 class BallLoss(Protocol):
-    """Protocol of a loss: a sum over steps and a final term, both of shape () and in the dtype of their
-    input.
-    """
+    """Protocol of a loss: a sum over steps and a final term, of shape () and in the dtype of their input."""
 
     def step(self, state: BallState, record: BallRecord, dtype: Any) -> Float[Array, ""]:
         """Return the contribution of the step that made this state."""

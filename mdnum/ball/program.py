@@ -1,4 +1,4 @@
-"""The ball as a `Program`: its rollouts are short, so they are kept whole and compared at once."""
+"""The ball as a `Program`: its rollouts are short, so whole rollouts are kept and compared at once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
 
 @dataclass(frozen=True)
 class ImposedDecision:
-    """One decision that is imposed on a run, which makes all others by itself."""
+    """One decision that is imposed on a run, while the run makes all other decisions itself."""
 
     channel: Literal["contact", "stop"]
     step: int  # from 1
@@ -34,7 +34,7 @@ class ImposedDecision:
 
 @dataclass(frozen=True)
 class BallProgram:
-    """World, start and steps of a ball, and their comparison with another program's."""
+    """World, start and steps of a ball's run, and methods to compare the run with another program's."""
 
     problem: BallProblem  # the program
     # its balls are those of the other program in this order; None where they are the same
@@ -59,7 +59,7 @@ class BallProgram:
 
     @property
     def scale(self) -> float:
-        """The largest start height; of balls that start on the floor, the largest that they reach."""
+        """Largest start height; for balls that start on the floor, the largest height that they reach."""
         start = self.problem.world.start(self.problem.y0, self.problem.v0)
         height = float(np.abs(np.asarray(start.y, np.float64)).max())
         if height:
@@ -74,19 +74,19 @@ class BallProgram:
 
     @property
     def streams(self) -> bool:
-        """Always False: exactly the requested steps are compared."""
+        """Always False: a rollout is compared at exactly the requested steps."""
         return False
 
     @property
     def imposable(self) -> None:
-        """Any decisions can be imposed."""
+        """Always None: every decision of a ball can be imposed."""
         return None
 
     def check(self, other: BallProgram) -> None:
         """Check that both programs make the same kinds of decisions for the same number of balls.
 
         Raises:
-            InputError: they do not.
+            InputError: the kinds of decisions or the numbers of balls differ.
         """
         kinds = [type(one.problem.world.contact).__name__ for one in (self, other)]
         if kinds[0] != kinds[1] or (self.problem.world.lift is None) != (other.problem.world.lift is None):
@@ -101,10 +101,11 @@ class BallProgram:
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
-        """A rollout, its balls in the order of the other program.
+        """Simulate a rollout, with the balls in the order of the other program.
 
         Args:
-            decisions: imposed on the balls in that order; its own, and its pins, when None.
+            decisions: decisions imposed on the balls in that order; None for the program's own decisions and
+                pins.
         """
         if decisions is None and steps in self._runs:
             return self._runs[steps]
@@ -124,7 +125,7 @@ class BallProgram:
         return run
 
     def _pinned(self, steps: int) -> BallDecisions | None:
-        """The pins, -1 wherever the program decides by itself; None where there are none."""
+        """Return the pins as imposed decisions, -1 for free decisions; None without pins."""
         if not self.pins:
             return None
         world = self.problem.world
@@ -141,7 +142,7 @@ class BallProgram:
     def lockstep(
         self, other: BallProgram, last: int, *, forward: bool, back: bool, guard: float | None
     ) -> Iterator[PairRows]:
-        """All steps at which both runs are finite (see `Program.lockstep`)."""
+        """Compare two runs at all steps at which both are finite (see `Program.lockstep`)."""
         asked = last
         runs = {"A": self.run(asked), "B": other.run(asked)}
         a, b = runs.values()
@@ -178,7 +179,7 @@ class BallProgram:
     def repeats(
         self, others: Sequence[BallProgram], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Separations of perturbed runs (see `Program.repeats`)."""
+        """Compute the separations of perturbed runs (see `Program.repeats`)."""
         # of the number of steps that was run before: another one would be another compiled program
         steps = min((known for known in self._runs if known >= last), default=last)
         a = self.run(steps)
@@ -190,7 +191,7 @@ class BallProgram:
         return found
 
     def nudged(self, size: float, count: int, seed: int) -> list[BallProgram]:
-        """The program with its start heights displaced at random by up to `size`, an ulp at least."""
+        """Return programs whose start heights are displaced at random by up to `size`, at least an ulp."""
         rng = np.random.default_rng(seed)
         y = np.asarray(np.atleast_1d(self.problem.y0), np.float64)
         size = max(size, self.ulp)
@@ -198,7 +199,7 @@ class BallProgram:
         return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
 
     def decision(self, other: BallProgram, flips: Sequence[CrossDecision], separation: float) -> Decision:
-        """The first decision at a fork: a contact before a stop, the first ball."""
+        """Return the first decision at a fork: contacts before stops, lowest ball first."""
         first = flips[0]
         return Decision(
             channel=first.channel,
@@ -215,10 +216,10 @@ class BallProgram:
         )
 
     def number(self, key: str) -> Number:
-        """A parameter by the key of the system file, its last word, or the world's own name.
+        """Find a parameter by its key in the system file, the last word of the key, or the world's own name.
 
         Raises:
-            InputError: there is none of that name.
+            InputError: the parameter does not exist.
         """
         word = key.rpartition(".")[2]
         word = next((name for name, row in PARAMETERS.items() if word in row.get("words", ())), word)
@@ -245,7 +246,7 @@ class BallProgram:
         )
 
     def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
-        """The decisions of a run (see `Program.history`), with the loss of the problem."""
+        """Return the decisions of a run (see `Program.history`), with the loss of the problem."""
         problem = replace(self.problem, steps=steps)
         run = problem.run(keep=False)
         contact, counts = run.contact, run.iterations.reshape(steps, -1)
@@ -260,7 +261,7 @@ class BallProgram:
         return DecisionHistory(every, digest, x, value, float("nan"), "", first=1)
 
     def differing(self, other: BallProgram, steps: int, step: int, key: str) -> Differing:
-        """The first decision that differs at a step, with the gradients of the loss on both sides."""
+        """Return the first decision that differs at a step, with the gradients of the loss on both sides."""
         problems = [replace(one.problem, steps=steps) for one in (self, other)]
         runs = [problem.run(history=True) for problem in problems]
         flips = [flip for flip in cross_decisions(runs[0], runs[1], step) if flip.step == step]
@@ -280,7 +281,7 @@ class BallProgram:
 
 
 def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float:
-    """Threshold minus residual at an iteration of a solve of all balls, from the residuals of every one."""
+    """Return threshold minus residual at one iteration of a joint solve, from the recorded residuals."""
     if run.history is None or not isinstance(run.world.contact, Projection):
         return margin
     rule = run.world.contact.stop
@@ -289,7 +290,7 @@ def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float
 
 
 def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
-    """A run with its balls in the order of the other program."""
+    """Return a run with its balls in the order of the other program."""
     place = np.argsort(order)
     columns = ("y", "v", "height", "contact", "iterations", "reason", "residual", "margin", "before")
     arrays = {name: getattr(run, name) for name in columns}
@@ -310,7 +311,7 @@ def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
 
 
 def _apart(one: BallRun, other: BallRun, last: int) -> Float[np.ndarray, "times"]:
-    """Largest difference of heights at each step, m; infinite where one of them is no number."""
+    """Return the largest difference of heights at each step, m; infinite if a height is not finite."""
     y = [run.y[: last + 1].astype(np.float64) for run in (one, other)]
     with np.errstate(invalid="ignore"):
         off = np.abs(y[0] - y[1])
@@ -318,7 +319,7 @@ def _apart(one: BallRun, other: BallRun, last: int) -> Float[np.ndarray, "times"
 
 
 def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
-    """The last step at which both runs are finite, and which of them is not after it."""
+    """Return the last step at which both runs are finite, and how each run ends."""
     ends = {}
     for name, run in (("A", a), ("B", b)):
         finite = np.isfinite(run.y.astype(np.float64)) & np.isfinite(run.v.astype(np.float64))
@@ -332,7 +333,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
 
 
 def _guarded(separation: np.ndarray, furthest: np.ndarray, guard: float | None) -> np.ndarray:
-    """The same, NaN after the step at which a contact far from the floor is imposed."""
+    """Set separations to NaN after the step at which a contact far from the floor is imposed."""
     beyond = furthest > (np.inf if guard is None else guard)
     if beyond.any():
         separation[int(beyond.argmax()) + 1 :] = np.nan

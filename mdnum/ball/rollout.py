@@ -235,8 +235,8 @@ def height_bound(
 ) -> Float[np.ndarray, "..."]:
     """Bound the rounding error |computed - exact| of the height in a contact decision, m.
 
-    The height results from four roundings after the previous state; none of them can exceed the roundoff of
-    the sum of the absolute terms.
+    Four roundings lead from the previous state to the height; the bound adds the absolute values of all
+    terms.
 
     Args:
         y, v: height (m) and velocity (m/s) of the previous state.

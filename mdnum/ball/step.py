@@ -64,8 +64,7 @@ class BallRecord(NamedTuple):
 
 
 class Rounding(eqx.Module):
-    """Fence that rounds a value, such as a product, before its use; it contains the zero that this requires.
-    """
+    """Fence that rounds a value, such as a product, before its use; it holds the required zero."""
 
     zero: Int[Array, ""]  # an integer zero that the compiler must not know (see mdnum.numerics.exact)
 
@@ -141,8 +140,7 @@ class _Euler(eqx.Module):
 
 
 class ExplicitEuler(_Euler):
-    """y += h v; v += h a(y), both from the old state. Order 1; a stiff contact gains energy at any time step.
-    """
+    """y += h v; v += h a(y), both from the old state. Order 1; a stiff contact always gains energy."""
 
     def fly(self, y, v, a, r):
         return r(y + r(self.h * v)), r(v + r(self.h * a))

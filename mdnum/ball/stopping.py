@@ -1,8 +1,8 @@
 """Iterative solvers: stopping rules, the loop that they stop, and derivatives of the loop.
 
 A rule turns the terms of a residual (one per ball) into the quantity that is compared with a threshold. A sum
-over the batch couples balls that have nothing to do with one another, and its last bits depend on the order
-of summation; a rule per ball does neither.
+over the batch couples independent balls, and its last bits depend on the order of summation; a rule per ball
+has neither disadvantage.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ class Reason(IntEnum):
 
     @property
     def word(self) -> str:
-        """As people read it."""
+        """Name of the reason for display."""
         return self.name.lower().replace("_", " ")
 
 
 class Solve(NamedTuple):
-    """The record of one iterative solve; shape () where one rule stops all balls, else (balls,)."""
+    """Record of one iterative solve; shape () if one rule stops all balls, else (balls,)."""
 
     iterations: Int[Array, "..."]  # how often it went on
     reason: Int[Array, "..."]  # a `Reason`
@@ -66,21 +66,21 @@ class StopRule(Protocol):
     def measure(
         self, terms: Float[Array, "balls"], accumulate: Any, decision: Any, zero: Int[Array, ""]
     ) -> Float[Array, "..."]:
-        """The residual in the dtype of decisions, from terms summed in the dtype of sums."""
+        """Return the residual, in the dtype of decisions, from terms summed in the dtype of sums."""
         ...
 
     def threshold(self, first: Float[Array, "..."], iteration: Int[Array, "..."]) -> Float[Array, "..."]:
-        """What the residual is compared with at an iteration, given the residual of the first decision."""
+        """Return the threshold of the residual at an iteration, given the residual of the first decision."""
         ...
 
 
 def stops(threshold: Float[Array, "..."], residual: Float[Array, "..."]) -> Bool[Array, "..."]:
-    """The stopping decision: yes when residual < threshold."""
+    """Return the stopping decision: True if residual < threshold."""
     return Threshold(threshold, "<", "residual").decide(residual)
 
 
 class _ToleranceRule(eqx.Module):
-    """A rule with one tolerance."""
+    """Base class of the stopping rules with one tolerance."""
 
     tol: Any  # the solver stops when the residual is below; the unit of the residual
     max_iter: int = eqx.field(static=True, default=100)  # the cap
@@ -90,7 +90,7 @@ class _ToleranceRule(eqx.Module):
 
 
 class GlobalSum(_ToleranceRule):
-    """One residual for the batch: the sum of all terms, in the order of a reduction."""
+    """Stopping rule with one residual for the batch: the sum of all terms, in the order of a reduction."""
 
     reduction: Reduction = eqx.field(static=True, default=Pairwise())
 
@@ -99,24 +99,24 @@ class GlobalSum(_ToleranceRule):
 
 
 class PerInstance(_ToleranceRule):
-    """A residual for each ball: a ball stops when its own is low enough, whatever the others do."""
+    """Stopping rule with a residual for each ball: each ball stops independently of the others."""
 
     def measure(self, terms, accumulate, decision, zero):
         return terms.astype(decision)
 
 
 class Maximum(_ToleranceRule):
-    """One residual for the batch: the largest term. No sum, so no order of summation."""
+    """Stopping rule with one residual for the batch: the largest term, independent of summation order."""
 
     def measure(self, terms, accumulate, decision, zero):
         return jnp.max(terms).astype(decision)
 
 
 class Relative(GlobalSum):
-    """Stops when the sum of the residual terms is below the tolerance times the first sum."""
+    """Stopping rule that compares the sum of the residual terms with the tolerance times the first sum."""
 
     def threshold(self, first, iteration):
-        """tol times the first residual; a residual that starts at zero is below any tolerance."""
+        """Return tol times the first residual, or the smallest normal number if that residual is zero."""
         scaled = jnp.asarray(self.tol).astype(first.dtype) * first
         # float32's smallest would be 0 in float16, and no residual is below that
         least = jnp.finfo(first.dtype).tiny
@@ -124,40 +124,41 @@ class Relative(GlobalSum):
 
 
 class HysteresisStop(eqx.Module):
-    """A rule with a gap: the solver starts only above one threshold, and then runs to below another."""
+    """Stopping rule with hysteresis: a solve starts only above one threshold and ends below a lower one."""
 
     rule: _ToleranceRule  # says what the residual is, and where a solver that has started stops
     enter: Any  # a residual below this starts no solve; at least the rule's tolerance
 
     @property
     def max_iter(self) -> int:
-        """The rule's cap."""
+        """Largest number of iterations of the inner rule."""
         return self.rule.max_iter
 
     def measure(self, terms, accumulate, decision, zero):
         return self.rule.measure(terms, accumulate, decision, zero)  # type: ignore[attr-defined]
 
     def threshold(self, first, iteration):
-        """The higher one before the first iteration, the rule's afterwards."""
+        """Return the higher threshold before the first iteration, and the inner rule's threshold afterwards.
+        """
         enter = jnp.asarray(self.enter).astype(first.dtype)
         return jnp.where(iteration == 0, enter, self.rule.threshold(first, iteration))
 
 
 class FixedCount(eqx.Module):
-    """A fixed number of iterations, whatever the residual: no decision, and none that could flip."""
+    """Stopping rule with a fixed number of iterations for any residual, so that no decision can flip."""
 
     count: int = eqx.field(static=True, default=10)  # iterations; also the cap
 
     @property
     def max_iter(self) -> int:
-        """The count."""
+        """Number of iterations, which is also the largest number."""
         return self.count
 
     # for the record only
     measure = Maximum.measure
 
     def threshold(self, first, iteration):
-        """Stops when the count is reached, and not before."""
+        """Return a threshold that stops the solver exactly when the count is reached."""
         reached = jnp.broadcast_to(iteration >= self.count, first.shape)
         return jnp.where(reached, np.inf, -np.inf).astype(first.dtype)
 
@@ -173,20 +174,20 @@ def iterate(
     imposed: Int[Array, "..."] | None = None,
     history: bool = False,
 ) -> tuple[Any, Solve]:
-    """Update until the rule stops the loop, its cap ends the loop, or the imposed iterations have been made.
+    """Iterate until the rule or its cap ends the loop, or the imposed number of iterations is reached.
 
     Args:
-        rule: when to stop.
-        start: a pytree of arrays of shape (balls,).
-        update: one iteration.
-        terms: of the residual, one per ball.
+        rule: stopping rule.
+        start: initial value, a pytree of arrays of shape (balls,).
+        update: function that makes one iteration.
+        terms: function that returns the terms of the residual, one per ball.
         policy: dtypes of sums and decisions.
-        zero: runtime zero for fenced sums.
-        imposed: iterations to make instead of the rule's own; a negative number leaves it to the rule.
+        zero: zero for fenced sums, unknown to the compiler.
+        imposed: number of iterations that replaces the rule's own; if negative, the rule decides.
         history: whether to keep the residual of every decision.
 
     Returns:
-        where it ended, and the record.
+        the final value, and the record of the solve.
     """
     accumulate, decision = policy.dtype("accumulate"), policy.dtype("decision")
 
@@ -240,27 +241,26 @@ def iterate(
 
 
 def no_solve(dtype: Any) -> Solve:
-    """The record of a step without a solver."""
+    """Create the record of a step without a solver."""
     none, nan = jnp.zeros((), jnp.int32), jnp.asarray(jnp.nan, dtype)
     return Solve(none, jnp.asarray(Reason.NONE.value, jnp.int8), nan, nan, nan, jnp.zeros(0, dtype))
 
 
 def elementwise(function: Map) -> Map:
-    """A map with both derivative modes, for a function of each ball alone that contains a while_loop.
+    """Make an elementwise function with a while_loop differentiable in forward and reverse mode.
 
-    A `while_loop` has no reverse mode in JAX, because its tape would have no fixed size. A map that treats
-    each ball by itself has a diagonal Jacobian, though, whatever decides when its loop ends: a few tangents
-    carried along in the same loop give all of it, and nothing is stored per iteration. The derivative is that
-    of the iterations which ran, with every decision held fixed. The record, and whatever is in `rest`,
-    carries none.
+    A `while_loop` has no reverse mode in JAX, because its tape would have no fixed size. But a function that
+    treats each ball separately has a diagonal Jacobian, whatever ends its loop: a few tangents propagated in
+    the same loop give all entries, and nothing is stored per iteration. The derivative is that of the actual
+    iterations, with every decision held fixed. The record and the inputs in `rest` carry no derivative.
 
     Args:
-        function: output b of every output depends on input b of every input only (and on `rest`).
+        function: a function whose outputs for ball b depend only on the inputs for ball b (and on `rest`).
 
     Returns:
         the same function, forward and reverse differentiable.
 
-    Error: tangents are propagated in the dtype of the inputs, a rounding per operation.
+    Error: tangents are propagated in the dtype of the inputs, with one rounding per operation.
     """
 
     @jax.custom_jvp

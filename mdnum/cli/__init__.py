@@ -1,7 +1,8 @@
-"""The command line: parse, call, print. No science here, and no import of jax.
+"""The command line: parse arguments, call a verb, print the result; without science and without importing
+jax.
 
-Every verb is a function that returns its exit code: 0 fine, 1 findings, 2 a mistake in what was asked, 3 time
-was up before a verdict.
+Every verb is a function that returns its exit code: 0 without findings, 1 with findings, 2 for invalid input,
+3 if time ran out before a verdict.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _UsageError: Any = typer.BadParameter.__base__
 
 
 def programs_folder() -> str:
-    """Name of a folder of programs that were compiled for this kind of processor, and are run by no other."""
+    """Return the folder name for compiled programs that only this kind of processor may run."""
     features = platform.machine()
     with contextlib.suppress(OSError), open("/proc/cpuinfo") as file:
         features = next((line for line in file if line.startswith(("flags", "Features"))), features)
@@ -37,9 +38,9 @@ def programs_folder() -> str:
 
 
 def _keep_programs() -> None:
-    """Let jax keep what it compiles for the next command.
+    """Set up jax's compilation cache, so that later commands reuse compiled programs.
 
-    Processors of several kinds share home folders, and possibly the folder that the environment names.
+    Processors of several kinds may share home folders, and also the folder that the environment names.
     """
     if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":  # which jax sets where nobody has
         # XLA takes its own hints (prefer-no-gather) for what the processor lacks and prints pages of it
@@ -63,7 +64,7 @@ def _keep_programs() -> None:
 
 
 def _set_up() -> None:
-    """What a process of the command line, and no other, may change for all of it."""
+    """Change process-wide settings that only the command line may change."""
     # imports and compilers make half a million objects that stay: walking them for garbage takes a sixth of a
     # short command's time, and walking them once more as the process ends half a second
     gc.set_threshold(1_000_000, 20, 20)
@@ -82,7 +83,7 @@ def _set_up() -> None:
 
 
 def _no_device(error: BaseException) -> str | None:
-    """What there is to say of an error of jax's that finds none of the devices it was told to use."""
+    """Return a message if jax failed because a device named in JAX_PLATFORMS is missing, else None."""
     platforms, trace = os.environ.get("JAX_PLATFORMS"), error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
@@ -97,7 +98,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and exit.
 
     Args:
-        arguments: what follows `mdnum`; the process's own when None.
+        arguments: command-line arguments after `mdnum`; None for those of the process.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     as_json = "--json" in arguments
@@ -141,7 +142,7 @@ _EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number"
 
 
 def _said(error: Any) -> str:
-    """What is wrong with the words of a command, with the word itself where it is a number's."""
+    """Return the message of a usage error, including the invalid text where a number was expected."""
     details = getattr(error.__cause__, "errors", None)
     if details is None or details()[0]["type"] not in _EXPECTED:
         return error.format_message()

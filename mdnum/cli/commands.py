@@ -1,6 +1,6 @@
-"""The commands of verbs, made from their text files (`mdnum/verbs/__init__.toml` says what these have).
+"""Commands of the verbs, created from the verbs' text files (their format: `mdnum/verbs/__init__.toml`).
 
-Nothing of a verb is imported before it is called.
+A verb's modules are imported only when its command is called.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = beside(verbs.__file__)["shared"]
 
 
 class _Verbs(TyperGroup):
-    """The command line: verbs, those of other packages included, and the commands that it was made with."""
+    """Command group of all verbs, including those of other packages, and of commands registered directly."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(dict.fromkeys([*(name.split()[0] for name in VERBS), *self.commands]))
@@ -80,7 +80,7 @@ def _top(
 
 
 class _Questions(TyperGroup):
-    """The questions of one verb; a first word that is none of them is what the usual one is asked of."""
+    """Command group of one verb's questions; a first word that names no question goes to the usual one."""
 
     group: Mapping[str, Any]
 
@@ -98,7 +98,7 @@ class _Questions(TyperGroup):
 
 
 def _of_verb(verb: str) -> Any:
-    """The command of a verb, or the group of its commands."""
+    """Create the command of a verb, or the group of its commands."""
     texts = {name: declared(name) for name in verbs.of_command(verb)}
     shared = {**_SHARED, **texts[verb].get("shared", {})}
     if "group" not in texts[verb]:
@@ -116,7 +116,7 @@ def _of_verb(verb: str) -> Any:
 
 
 def _command(entry: str, name: str, said: Mapping[str, Any], shared: Mapping[str, Any]) -> Any:
-    """A command as the parser has it, from what the text file of an entry of `VERBS` says."""
+    """Create a command for the parser, from the text file of an entry of `VERBS`."""
     parts = [shared[one] for one in said.get("shares", ())]
     # a system comes first among arguments, and a command's own options before those of others
     arguments = {key: one for part in (*parts, said) for key, one in part.get("arguments", {}).items()}
@@ -146,7 +146,7 @@ def _made(name: str, help: str, function: Callable[..., Any], **settings: Any) -
 
 
 def _parameter(name: str, said: Mapping[str, Any], make: Callable[..., Any]) -> tuple[Any, Any]:
-    """The type and the default of an argument or option, as typer reads those of a function."""
+    """Return the type and the default of an argument or option in the form that typer reads."""
     types = [_TYPES[word] for word in said.get("type", "text").split()]
     kind: Any = types[0] if len(types) == 1 else tuple[tuple(types)]
     kind = list[kind] if said.get("repeatable") else kind
@@ -170,7 +170,7 @@ def _flags(name: str, said: Mapping[str, Any]) -> list[str]:
 
 
 def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> int:
-    """Calls the function of a command with what was typed, prints its answer and returns the exit code."""
+    """Call the function of a command with the typed values, print its answer, and return the exit code."""
     typed = {**said["arguments"], **said["options"]}
     if given.get("resume") == given.get("out"):
         given.pop("out", None)
@@ -185,7 +185,7 @@ def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> in
     stopped = False
 
     def again() -> str | None:
-        """What can be done about the folder of a command that was stopped and has a --resume."""
+        """Return the remedy for the folder of a stopped command that has a --resume option."""
         folder = given.get("resume") or progress.folder or given.get("out")
         with suppress(MdnumError):
             return _folder(folder).again if "resume" in typed and folder is not None else None
@@ -218,7 +218,7 @@ def _folder(path: Path) -> Any:
 
 
 def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """What was given as a function takes it; whoever names code on the command line allows it."""
+    """Convert typed options to function arguments; naming code on the command line allows its execution."""
     options = {}
     for name in given.keys() & said["options"].keys():
         off = said["options"][name].get("type") == "flag" and name.startswith("no_")
@@ -235,10 +235,10 @@ def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any
 
 
 def _refuse_new(said: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-    """Refuses what a folder that is resumed has already.
+    """Raise an error for values that a resumed folder already contains.
 
     Raises:
-        InputError: something of a new one was given.
+        InputError: an argument or option that is only for a new run was given.
     """
     from mdnum.verbs.frame import refuse
 

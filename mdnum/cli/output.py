@@ -1,4 +1,4 @@
-"""What the verbs print: errors in one line, one JSON document, tables for people, and their progress."""
+"""Output of the verbs: one-line errors, one JSON document, tables for people, and progress."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ JSON_OPTION = typer.Option(False, "--json", help="Print one JSON document instea
 
 
 class Stopped(MdnumError):
-    """Somebody pressed control-C."""
+    """Error raised if the user stops the command with control-C."""
 
     exit_code = EXIT_STOPPED
 
 
 def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
-    """The `--set key=value` words as a mapping.
+    """Parse the `--set key=value` words into a mapping.
 
     Raises:
-        InputError: a word without "=", or a key given twice.
+        InputError: a word has no "=", or a key is given twice.
     """
     overrides: dict[str, str] = {}
     for setting in settings or ():
@@ -64,13 +64,13 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
 
 
 def print_json(document: Mapping[str, Any]) -> int:
-    """The one JSON document of a verb, to stdout; returns the exit code of one that is fine."""
+    """Print the JSON document of a verb to stdout; return the exit code for success."""
     say(printable(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False), json_escape))
     return EXIT_FINE
 
 
 def print_reply(reply: Reply, as_json: bool) -> int:
-    """What is said on the spot, as JSON or for people; returns the exit code."""
+    """Print an immediate reply, as JSON or for people; return the exit code."""
     if as_json:
         print_json(reply.document)
     for one in () if as_json else reply.shown:
@@ -84,13 +84,13 @@ def print_reply(reply: Reply, as_json: bool) -> int:
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """A line for a person, in which nothing that came from a file reaches the terminal raw."""
+    """Print a line for people, with control characters from files escaped."""
     # typer's own echo writes UTF-8 to a stream that is ascii
     print(printable(text), file=sys.stderr if err else sys.stdout, flush=True)
 
 
 def print_error(error: MdnumError, *, as_json: bool) -> None:
-    """An error as one line on stderr, and as the JSON document when one was asked for."""
+    """Print an error as one line on stderr, and as a JSON document if requested."""
     say("mdnum: " + " ".join(str(error).split()), err=True)
     if as_json:
         told = {name: getattr(error, name) for name in ("message", "where", "remedy", "exit_code")}
@@ -98,13 +98,13 @@ def print_error(error: MdnumError, *, as_json: bool) -> None:
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Lines on stderr that say who speaks."""
+    """Print lines on stderr, each with the prefix "mdnum:"."""
     for line in lines:
         say("mdnum: " + " ".join(line.split()), err=True)
 
 
 def console(width: int = _PIPE_WIDTH) -> Console:
-    """rich's console on stdout, made when first needed, as importing rich is slow; prints nothing raw."""
+    """Return rich's console for stdout, with raw characters escaped; rich is imported on first use."""
     from rich.console import Console
     from rich.segment import Segment
 
@@ -119,7 +119,7 @@ def console(width: int = _PIPE_WIDTH) -> Console:
 
 
 def print_prose(text: str, indent: int = 2, style: str = "") -> None:
-    """A paragraph, in lines that can be read; a word that is longer than a line stays whole."""
+    """Print a paragraph wrapped to a readable width; a word longer than a line is not broken."""
     from textwrap import fill
 
     from rich.text import Text
@@ -133,7 +133,7 @@ def print_prose(text: str, indent: int = 2, style: str = "") -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """A table for people; cells that name a severity are colored; no header where no column has a name."""
+    """Print a table for people; severities are colored, and the header is omitted if no column has a name."""
     from rich.table import Table
     from rich.text import Text
 
@@ -150,7 +150,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
 
 
 def print_records(title: str, records: Sequence[Mapping[str, Any]]) -> None:
-    """A table of records; on its side when there are few of them with many parts each."""
+    """Print a table of records, transposed if there are few records with many fields."""
     columns = list(dict.fromkeys(key for record in records for key in record))
     rows = [[record.get(column) for column in columns] for record in records]
     if len(rows) > _FEW or len(columns) <= _MANY:
@@ -161,7 +161,7 @@ def print_records(title: str, records: Sequence[Mapping[str, Any]]) -> None:
 
 
 def show(cell: Any) -> str:
-    """A table cell as text: floats short, None as a dash, yes and no in words."""
+    """Format a table cell: floats in short form, None as a dash, booleans as yes or no."""
     if cell is None:
         return "-"
     if isinstance(cell, bool):
@@ -172,7 +172,7 @@ def show(cell: Any) -> str:
 
 
 def print_findings(findings: Iterable[Finding]) -> None:
-    """Each finding as a title line with its code, what was seen, and what to do."""
+    """Print each finding: a title line with its code, the observation, and the remedy."""
     from rich.text import Text
 
     for finding in findings:
@@ -186,11 +186,11 @@ def print_findings(findings: Iterable[Finding]) -> None:
 
 
 def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
-    """The exit code of a verb: 1 when a finding asks for attention, whatever the status is.
+    """Return the exit code of a verb: 1 if a finding is a warning or an error, for any status.
 
     Args:
-        findings: those that are only information do not count.
-        status: of summary.json; see `frame.UNDECIDED`.
+        findings: findings of the verb; those that are only informative do not count.
+        status: status in summary.json; see `frame.UNDECIDED`.
     """
     if any(finding.severity in ("warning", "error") for finding in findings):
         return EXIT_FINDINGS
@@ -199,7 +199,7 @@ def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
 
 
 def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
-    """What a verb answers, as JSON or for people: its page in brief. Returns the exit code."""
+    """Print the outcome of a verb as JSON, or its page in brief for people; return the exit code."""
     code = exit_code(outcome.verdict.findings, outcome.summary.get("status", "complete"))
     if as_json:
         print_json({**outcome.summary, "folder": outcome.folder})
@@ -244,10 +244,10 @@ def _print_part(table: Table) -> None:
 
 
 class CommandBar(ProgressBar):
-    """The progress of a command; control-C raises from the first report on: there is something to keep."""
+    """Progress bar of a command; after the first report, control-C raises, because results can be kept."""
 
     def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
-        """What a rollout reports."""
+        """Show the progress that a rollout reports."""
         if signal.getsignal(signal.SIGINT) == signal.SIG_DFL and threading.current_thread() is _MAIN:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         super().__call__(step, steps, info)
@@ -255,13 +255,13 @@ class CommandBar(ProgressBar):
 
 @contextmanager
 def watched(remedy: Callable[[], str | None]) -> Iterator[ProgressBar]:
-    """A progress bar around a run; control-C becomes the error that ends the command line.
+    """Show a progress bar during a run, and convert control-C into the error that ends the command line.
 
     Args:
-        remedy: asked then what to do about it.
+        remedy: called after control-C to get the remedy for the error message.
 
     Raises:
-        Stopped: somebody pressed control-C.
+        Stopped: the user pressed control-C.
     """
     try:
         with CommandBar() as progress:
@@ -273,7 +273,7 @@ def watched(remedy: Callable[[], str | None]) -> Iterator[ProgressBar]:
 
 
 def is_interrupt(error: BaseException | None) -> bool:
-    """Whether it began with control-C, which becomes another error inside of an import or compiled code."""
+    """Return True if an error was caused by control-C, also inside an import or compiled code."""
     while error is not None and not isinstance(error, KeyboardInterrupt | MdnumError):
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     return isinstance(error, KeyboardInterrupt)
