@@ -1,8 +1,8 @@
 """The bouncing ball in closed form: its motion, and its derivative with respect to every parameter.
 
-A ball above a floor at height 0, with gravity g, starts at (y0, v0). It reaches the floor with speed s =
-sqrt(v0² + 2 g y0) at t_1 = (v0 + s) / g. With restitution e, impact n has speed e^(n-1) s, and the time
-between impacts n and n + 1 is 2 e^n s / g. Therefore
+A ball above a floor at height 0, with gravity g, starts at (y0, v0). Its speed at the floor is s = sqrt(v0² +
+2 g y0), reached at t_1 = (v0 + s) / g. With restitution e, impact n has speed e^(n-1) s, and the time between
+impacts n and n + 1 is 2 e^n s / g. Therefore
 
     t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e),
 

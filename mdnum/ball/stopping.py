@@ -138,8 +138,7 @@ class HysteresisStop(eqx.Module):
         return self.rule.measure(terms, accumulate, decision, zero)  # type: ignore[attr-defined]
 
     def threshold(self, first, iteration):
-        """Return the higher threshold before the first iteration, and the inner rule's threshold afterwards.
-        """
+        """Return the higher threshold before the first iteration, then the threshold of the inner rule."""
         enter = jnp.asarray(self.enter).astype(first.dtype)
         return jnp.where(iteration == 0, enter, self.rule.threshold(first, iteration))
 

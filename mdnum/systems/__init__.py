@@ -1,6 +1,6 @@
-"""From a system file to something that runs: schema, loading, checks, and the build.
+"""System files and how they become programs: schema, loading, checks, and building.
 
-Importing this package imports neither jax nor jax_md; `build` and `Simulation` are loaded when first used.
+Importing this package imports neither jax nor jax_md; `build` and `Simulation` are imported on first use.
 """
 
 from __future__ import annotations

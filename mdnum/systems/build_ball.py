@@ -1,4 +1,4 @@
-"""From a ball's system file to objects: a world, a start, a loss, and the same for every variant."""
+"""Objects from a ball's system file: a world, a start and a loss, also for every variant."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _RULES: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class BallVariant:
-    """The problem with some keys of its file changed."""
+    """A problem in which some keys of the file were changed."""
 
     name: str  # what the file calls it
     changes: Mapping[str, Any]  # dotted keys to values
@@ -56,12 +56,12 @@ def build_ball(
     overrides: Mapping[str, Any] | None = None,
     steps: int | None = None,
 ) -> BallSimulation:
-    """The objects of a ball's system.
+    """Build the objects of a ball's system.
 
     Args:
         system: a loaded system, or a name or path to load.
-        overrides: as for `load`, where a name or path is given.
-        steps: instead of the file's.
+        overrides: overrides as for `load`, if a name or path is given.
+        steps: number of steps; default the number in the file.
 
     Raises:
         InputError: the file cannot be run.
@@ -77,10 +77,10 @@ def build_ball(
 
 
 def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system") -> BallProblem:
-    """World, start, steps and loss of the tables of a file.
+    """Create world, start, steps and loss from the tables of a file.
 
     Raises:
-        InputError: a number that the world refuses.
+        InputError: the world rejects a number.
     """
     steps = spec.integrator.steps if steps is None else steps
     try:
@@ -101,7 +101,7 @@ def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system"
 
 
 def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.ndarray, "balls"]]:
-    """Heights (m) and velocities (m/s) of the balls at step 0, float64; a world rounds them to its dtype."""
+    """Return heights (m) and velocities (m/s) of the balls at step 0 in float64; the world rounds them."""
     given, count = spec.start, spec.balls
     if given.boundary is not None:
         # one penetration an ulp short of the tolerance, and the ulp in equal parts
@@ -120,7 +120,7 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
 
 
 def _control(table: ball.Control, h: float, steps: int) -> Float[np.ndarray, "steps"] | None:
-    """The acceleration that is added in each step, m/s²; None for none."""
+    """Return the additional acceleration in each step, m/s²; None for none."""
     match table:
         case ball.ConstantControl():
             return np.full(steps, table.value)

@@ -1,4 +1,5 @@
-"""From objects to a simulation: what fits together is put together, what does not is refused."""
+"""Construction of simulations from objects: compatible parts are assembled, incompatible parts are rejected.
+"""
 
 from __future__ import annotations
 
@@ -44,17 +45,18 @@ _INSIDE, _STEEP = 1e-7, 1e4
 
 @dataclass(frozen=True)
 class Cut:
-    """Where a pair potential ends, and how.
+    """The end of a pair potential: the kind of cutoff and its radius.
 
     Example:
         >>> Cut("switched", 8.5, onset=7.0)
         >>> Cut("hard", {"Ni-Ni": 2.5, "Ni-P": 2.0, "P-P": 2.2})
 
     Args:
-        kind: a name of `mdnum.md.cutoffs.CUTOFFS`, such as "hard", "shifted" or "switched".
-        radius: length; one for all pairs, or one for each pair of species.
-        onset: where switching begins, length, given like the radius; default 0.9 of the radius.
-        compare: what inside means, one of "r2 <", "r2 <=", "r <", "r <=".
+        kind: a name from `mdnum.md.cutoffs.CUTOFFS`, such as "hard", "shifted" or "switched".
+        radius: cutoff radius, length; one for all pairs, or one for each pair of species.
+        onset: distance at which switching begins, length, in the form of the radius; default 0.9 of the
+            radius.
+        compare: comparison that defines the inside, one of "r2 <", "r2 <=", "r <", "r <=".
     """
 
     kind: str
@@ -65,17 +67,17 @@ class Cut:
 
 @dataclass(frozen=True)
 class Term:
-    """One of several pair potentials that are added, with its own end.
+    """One of several pair potentials that are added, with its own cutoff.
 
     Example:
         >>> Term(LennardJones(sigma=2.3, epsilon=0.01), Cut("switched", 8.5))
         >>> Term(PairFunction(coulomb), Cut("shifted", 8.5), weight={"Na": 1.0, "Cl": -1.0})
 
     Args:
-        potential: of a pair of weights 1.
-        cutoff: where it ends. Terms with the same radii share the decision of each pair.
-        weight: a number for each species, or an array with one for each atom; the energy of a pair is
-            multiplied by those of both its atoms. Default 1.
+        potential: potential of a pair whose atoms both have weight 1.
+        cutoff: cutoff of the term. Terms with the same radii share the decision of each pair.
+        weight: a number for each species, or an array with one number for each atom; the energy of a pair is
+            multiplied by the weights of both atoms. Default 1.
     """
 
     potential: PairPotential
@@ -108,7 +110,7 @@ def simulation(
     name: str = "simulation",
     about: str = "",
 ) -> Simulation:
-    """A simulation from a structure and a potential.
+    """Create a simulation from a structure and a potential.
 
     Example:
         >>> atoms = ase.build.bulk("Ar", "fcc", a=5.26, cubic=True).repeat(4)
@@ -117,32 +119,32 @@ def simulation(
         >>> mdnum.run(sim, steps=500)
 
     Args:
-        atoms: positions, cell and periodicity; masses default to ASE's, in reduced units to 1.
+        atoms: positions, cell and periodicity; masses default to those of ASE, or to 1 in reduced units.
         potential: a pair potential, whose parameters are numbers or {"Ni-P": number, ...}; a dictionary of
-            `Term`s, which add; or one of `mdnum.md.manybody` or `mdnum.md.tetrahedral`.
-        cutoff: of a pair potential; terms and one of many bodies have their own.
-        timestep: in ps, or in reduced time; not beside an integrator that has one.
+            `Term`s that are added; or a potential from `mdnum.md.manybody` or `mdnum.md.tetrahedral`.
+        cutoff: cutoff of a pair potential; terms and many-body potentials have their own cutoffs.
+        timestep: time step in ps or reduced time; omit it if the integrator has a time step.
         units: "metal" (Å, eV, amu, ps, K) or "lj" (reduced).
-        temperature: of velocities that are drawn, and of a thermostat.
-        friction: of Langevin dynamics, one over time; default constant energy.
-        pressure: of a barostat, GPa or reduced.
-        integrator: another one by its name ("nose-hoover", "csvr", "mtk", "cell-rescaling") or class, or one
-            itself, whose numbers are internal (time is length * sqrt(mass / energy)).
-        dynamics: further numbers and words of it, by the keys and in the units of a system file.
-        seed: of drawn velocities and of a thermostat's noise.
-        remove_drift: whether the velocity of the center of mass is taken out at the start.
-        drawn: whether velocities are drawn; default where the atoms have no momenta.
-        steps, save_every: last step of a run, and steps from frame to frame, 0 for none.
-        skin: of the Verlet list, length; default that of the units.
-        rebuild: every, delay and check of the list's rebuild rule.
-        builder: which search makes lists.
+        temperature: temperature of drawn velocities and of a thermostat.
+        friction: friction coefficient of Langevin dynamics, 1/time; default constant energy.
+        pressure: pressure of a barostat, in GPa or reduced units.
+        integrator: name ("nose-hoover", "csvr", "mtk", "cell-rescaling") or class of another integrator, or
+            an integrator object, whose numbers are in internal units (time is length * sqrt(mass / energy)).
+        dynamics: further options of the integrator, by the keys and in the units of a system file.
+        seed: random seed of drawn velocities and of a thermostat's noise.
+        remove_drift: whether the velocity of the center of mass is removed at the start.
+        drawn: whether velocities are drawn; default: only if the atoms have no momenta.
+        steps, save_every: last step of a run, and number of steps between frames (0 for no frames).
+        skin: skin of the Verlet list, length; default that of the units.
+        rebuild: `every`, `delay` and `check` of the list's rebuild rule.
+        builder: name of the neighbor search.
         precision: dtype by role.
         reduction: order of the force sums.
-        name, about: for people.
+        name, about: name and description for people.
 
     Raises:
-        InputError: a structure that cannot be simulated, parameters that do not fit its species, a box too
-            small for the cutoff and the skin, a cutoff that is missing or has no use.
+        InputError: the structure cannot be simulated, the parameters do not fit its species, the box is too
+            small for cutoff and skin, or the cutoff is missing or not applicable.
     """
     system = unit_systems.get(units)
     atoms = atoms.copy()
@@ -196,7 +198,7 @@ def simulation(
 def _integrator(
     kind: str | type[Integrator], numbers: Mapping[str, Any], units: Units, where: str
 ) -> Integrator:
-    """An integrator by its name or class; one that a system file can have from what one may say of it."""
+    """Create an integrator from its name or class; options of built-in integrators are validated."""
     made = INTEGRATORS[kind] if isinstance(kind, str) else kind
     if made in (INTEGRATORS[one] for one in INTEGRATORS.shipped):
         table = {key: one.item() if hasattr(one, "item") else one for key, one in numbers.items()}
@@ -206,7 +208,7 @@ def _integrator(
 
 
 def of_atoms(atoms: Atoms, model: Any, compare: str = "r <", units: str = "metal") -> Simulation:
-    """A potential for atoms as they lie, with nothing to move them: what a calculator evaluates."""
+    """Create a static simulation of given atoms with a potential, as evaluated by a calculator."""
     return assembled(
         Origin("calculator"), atoms, unit_systems.get(units), model, compare, RebuildRule(0.0), "auto",
         PrecisionPolicy(), REDUCTIONS.parse("sequential"), VelocityVerlet(jax.device_put(np.float64(1.0))),
@@ -224,10 +226,10 @@ def cut(
     *,
     where: str = "",
 ) -> CutPotential:
-    """A potential with its end, everything with one entry per pair type; arguments as those of `Cut`.
+    """Add a cutoff to a potential, with one entry per pair type; for arguments see `Cut`.
 
     Args:
-        weights: of the atoms, if there are any. where: begins the names of parameters in messages.
+        weights: weights of the atoms, if any. where: prefix of parameter names in messages.
     """
 
     def table(value: Any, what: str):
@@ -254,10 +256,11 @@ def cut(
 
 
 def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequence[str]) -> None:
-    """That a person's function can be called, goes on beyond its cutoff, and is the same in both orders.
+    """Check that a user's function can be called, is smooth across its cutoff, and is symmetric in a pair.
 
     Raises:
-        InputError: it is not; with what it raised, or the pair, a distance and both energies.
+        InputError: a check fails; the message has the function's error, or the pair, a distance and both
+            energies.
     """
     here = potential.typed
     is_pair = lambda leaf: isinstance(leaf, tuple)  # noqa: E731
@@ -296,7 +299,7 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
 
 
 def common(terms: Mapping[str, Term]) -> Cut:
-    """A cutoff whose convention is that of all terms.
+    """Return a cutoff with the comparison convention that all terms share.
 
     Raises:
         InputError: there are no terms, or their conventions differ.
@@ -310,10 +313,10 @@ def common(terms: Mapping[str, Term]) -> Cut:
 
 
 def weights(weight: Any, atoms: Atoms, term: str) -> tuple[Any, ...]:
-    """The weight of each atom as `CutPotential` holds it; nothing where there is none.
+    """Return the weights of the atoms in the form for `CutPotential`; empty without weights.
 
     Raises:
-        InputError: a species, or an atom, has none.
+        InputError: a species or an atom has no weight.
     """
     if weight is None:
         return ()
@@ -329,7 +332,7 @@ def weights(weight: Any, atoms: Atoms, term: str) -> tuple[Any, ...]:
 
 
 def closest(model: Any, units: str) -> float:
-    """Atoms closer than this are a mistake in a structure with this potential, length."""
+    """Return the distance (length) below which two atoms of a structure must be a mistake."""
     if not isinstance(model, CutPotential | Channels):
         return smallest_distance(model.name, units)
     each = [term.potential for term in model.terms.values()]
@@ -338,7 +341,7 @@ def closest(model: Any, units: str) -> float:
 
 
 def _is_array(value: Any) -> bool:
-    """Whether a list is one of numbers, or of equally long lists of them, as a file writes an array."""
+    """Return True if a list represents an array in a file: numbers, or equally long lists of numbers."""
     numbers = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(value))
     try:
         return type(value) in (list, tuple) and numbers and np.array(value).dtype.kind in "iuf"
@@ -347,10 +350,10 @@ def _is_array(value: Any) -> bool:
 
 
 def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, "types"]:
-    """One number per pair type, from one for all or one for each pair of species.
+    """Return one number per pair type, given one number for all or one for each pair of species.
 
     Raises:
-        InputError: a pair has none, or it is no finite number.
+        InputError: the number of a pair is missing or not finite.
     """
     names = pair_names(symbols)
     if isinstance(value, Mapping):
@@ -368,10 +371,10 @@ def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, 
 
 
 def by_species(value: Mapping[str, Any], symbols: Sequence[str], what: str) -> Float[np.ndarray, "species"]:
-    """One number per species.
+    """Return one number per species, in the order of the symbols.
 
     Raises:
-        InputError: a species has none, or it is no finite number.
+        InputError: the number of a species is missing or not finite.
     """
     if missing := [symbol for symbol in symbols if symbol not in value]:
         remedy = "Give a number for every species"
@@ -404,15 +407,15 @@ def assembled(
     steps: int,
     save_every: int,
 ) -> Simulation:
-    """A simulation from its parts, arguments as its attributes.
+    """Assemble a simulation from its parts; the arguments are the attributes of `Simulation`.
 
     Args:
-        atoms: with momenta, unless velocities are drawn.
-        compare: what inside means.
-        builder: "auto" for the search that is fastest here.
+        atoms: the structure, with momenta unless velocities are drawn.
+        compare: comparison that defines the inside of a cutoff.
+        builder: name of the neighbor search; "auto" for the fastest one on this device.
 
     Raises:
-        InputError: the cutoff and skin do not fit the box, or the state cannot be a fixed-point one.
+        InputError: the cutoff and skin do not fit the box, or a fixed-point state is not possible.
     """
     check_not_forked()
     cell = Cell.create(np.asarray(atoms.cell), atoms.pbc)
@@ -448,13 +451,13 @@ def assembled(
 
 
 def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
-    """The same potential and settings for other atoms of the same species, or of some of them.
+    """Create a simulation of other atoms of the same species with the same potential and settings.
 
     Args:
-        skin: of the Verlet list, length.
+        skin: skin of the Verlet list, length.
 
     Raises:
-        InputError: a species that the simulation does not have; a box that is too small.
+        InputError: the atoms contain another species, or the box is too small.
     """
     symbols, old = species_of(atoms)[0], simulation.symbols
     if unknown := [one for one in symbols if one not in old]:
@@ -489,7 +492,7 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
 
 
 def in_fixed_point(simulation: Simulation) -> Simulation:
-    """The simulation with a fixed-point state, in a box that fits it."""
+    """Return the simulation with a fixed-point state, in a box adjusted to its units."""
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(

@@ -1,13 +1,13 @@
-"""Parameters of a simulation by path: what they are, their units, and the simulation with others.
+"""Parameters of a simulation by path: their values and units, and the simulation with other values.
 
-A parameter is a number or an array of them, and its name a path: the key of a system file where that has one
-("potential.sigma", "cutoff.radius", "dynamics.timestep"), and on down into what a potential is made of
-("potential.layers.0.weight"). One entry of it is a parameter too: "potential.pairs.Ni-P.sigma" as in files,
-"position.17.x", "velocity.17.x", or the path and the indices, "potential.layers.0.weight.3.2".
+A parameter is a number or an array of numbers. Its name is a path: the key of a system file if one exists
+("potential.sigma", "cutoff.radius", "dynamics.timestep"), extended into the components of a potential
+("potential.layers.0.weight"). A single entry is a parameter too: "potential.pairs.Ni-P.sigma" as in files,
+"position.17.x", "velocity.17.x", or path and indices, "potential.layers.0.weight.3.2".
 
-`dynamics.temperature` is that of velocities that were drawn, which go with its root, and of a thermostat.
-Velocities that were given stay as they are; `velocity.scale` scales any. `cutoff.radius` moves the onset,
-too, where nothing switches. `box.scale` is a common factor of the box and all positions.
+`dynamics.temperature` is the temperature of drawn velocities, which scale with its square root, and of a
+thermostat. Given velocities are not changed by it; `velocity.scale` scales any velocities. `cutoff.radius`
+also moves the onset if the cutoff does not switch. `box.scale` scales the box and all positions.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ _UNITS = {
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of a simulation, or an array of them.
+    """A parameter of a simulation: a number or an array of numbers.
 
     Attributes:
-        value: in `unit`; of shape (), or with an entry for each of `by`, or of the shape of an array that all
-            pairs share.
-        unit: in the units of the simulation; "" for a pure number, and "[alpha]" for an alpha of which it is
-            not known. Of initial velocities that of length per internal time.
-        by: "pair type", "species" or "atom"; "" where it is one for all.
+        value: value in `unit`; of shape (), or with an entry for each of `by`, or of the shape of an array
+            that all pairs share.
+        unit: unit in the unit system of the simulation; "" for a pure number, and for example "[alpha]" for
+            an alpha whose unit is not known. For initial velocities: length per internal time.
+        by: "pair type", "species" or "atom"; "" for a single value or a shared array.
     """
 
     value: Float[np.ndarray, "..."]
@@ -69,7 +69,7 @@ class Parameter:
 
 
 def parameters(simulation: Simulation) -> dict[str, Parameter]:
-    """All parameters of a simulation by path; `changed` gives it other values.
+    """Return all parameters of a simulation by path; use `changed` to change them.
 
     Example:
         >>> mdnum.parameters(sim)["potential.sigma"].value
@@ -82,7 +82,7 @@ def parameters(simulation: Simulation) -> dict[str, Parameter]:
 
 
 def names(simulation: Simulation) -> tuple[str, ...]:
-    """The paths of all parameters, those of single entries aside."""
+    """Return the paths of all parameters, excluding single entries."""
     model, draw = simulation.model, simulation.draw
     if simulation.pairwise:
         found = list(pair_leaves(model))
@@ -94,7 +94,7 @@ def names(simulation: Simulation) -> tuple[str, ...]:
 
 
 def numbers(simulation: Simulation) -> tuple[str, ...]:
-    """The paths of all parameters that are one number, those of single coordinates and weights aside."""
+    """Return the paths of all scalar parameters, excluding single coordinates and weights."""
     file = simulation.origin.system
     # as its file has it the radius would move along with sigma
     ends = [] if file is None else [one.cutoff for one in file.spec.interactions.values()]
@@ -110,17 +110,17 @@ def _is_number(simulation: Simulation, name: str) -> bool:
 
 
 def number(simulation: Simulation, name: str) -> float:
-    """The value of one of `numbers`."""
+    """Return the value of one of `numbers`."""
     return float(value(simulation, name).flat[0])
 
 
 def with_number(simulation: Simulation, name: str, given: float) -> Simulation:
-    """The simulation with another value of one of `numbers`, without compiling anew."""
+    """Return the simulation with another value of one of `numbers`, without recompilation."""
     return with_values(simulation, {name: np.full(value(simulation, name).shape, given)})
 
 
 def is_positive(simulation: Simulation, name: str) -> bool:
-    """Whether only values above 0 make sense of a number: not of coordinates and weights."""
+    """Return True if only positive values of a number are meaningful: not for coordinates and weights."""
     whole = entry(simulation, name).whole
     if "potential." in whole:
         return _is_typed(simulation, whole) and number(simulation, name) > 0
@@ -128,7 +128,8 @@ def is_positive(simulation: Simulation, name: str) -> bool:
 
 
 def by(simulation: Simulation, name: str) -> str:
-    """What a parameter has an entry for: "pair type", "species" or "atom"; "" where it is one for all."""
+    """Return the index of a parameter's entries, "pair type", "species" or "atom", or "" for a single value.
+    """
     if name.startswith("initial.") or is_weight(name):
         return "atom"
     if not _is_typed(simulation, name) or simulation.pair_types == 1:
@@ -137,7 +138,7 @@ def by(simulation: Simulation, name: str) -> str:
 
 
 def is_weight(name: str) -> bool:
-    """Whether a path is that of the weights of a term."""
+    """Return True if a path refers to the weights of a term."""
     return name.startswith("terms.") and name.split(".")[2:] == ["weight"]
 
 
@@ -146,13 +147,13 @@ def _is_typed(simulation: Simulation, name: str) -> bool:
 
 
 def _by_species(simulation: Simulation) -> set[str]:
-    """The paths of parameters with an entry for each species."""
+    """Return the paths of parameters with an entry for each species."""
     every = pair_leaves(simulation.model, shared=False)
     return set(every) - set(pair_leaves(simulation.model, shared=False, species=False))
 
 
 def unit(simulation: Simulation, name: str) -> str:
-    """The unit of a parameter: "" for none, its own name in brackets where none is known."""
+    """Return the unit of a parameter: "" if it has none, its name in brackets if the unit is unknown."""
     table, whole = name.partition(".")[0], entry(simulation, name).whole
     last = whole.rpartition(".")[2]
     field = simulation.integrator.keys().get(last) if table == "dynamics" else None
@@ -163,7 +164,7 @@ def unit(simulation: Simulation, name: str) -> str:
 
 
 def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
-    """The value of a parameter: a scalar where the simulation has one pair type, else one for each."""
+    """Return the value of a parameter: a scalar for one pair type, else one entry per pair type."""
     place = entry(simulation, name)
     if place.index:
         return np.asarray(value(simulation, place.whole)[place.index] * place.factor)
@@ -182,17 +183,18 @@ def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
 
 
 def leaf_of(model: Any, name: str) -> Any:
-    """Where a parameter of a potential, or of its end, is in it."""
+    """Return the array in a potential or its cutoff that holds a parameter."""
     if not isinstance(model, CutPotential | Channels):
         return quantities_of(model)[name.removeprefix("potential.")]
     return pair_leaves(model)[name]
 
 
 def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bool = True) -> dict[str, Any]:
-    """The arrays of pair potentials and their ends by path; those without pair types, and those by species,
-    where wanted.
+    """Return the arrays of pair potentials and their cutoffs by path.
 
-    `cutoff.radius` is that of all terms where they agree. Of some that do each has the one that they share.
+    Arrays without pair types (`shared`) and arrays by species (`species`) are optional. The path
+    `cutoff.radius` is the radius of all terms if they agree; otherwise each term has the path of the radius
+    that it shares.
     """
     found: dict[str, Any] = {}
     for part in model.parts:
@@ -211,7 +213,7 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
 
 
 def shared_radius(model: Any, name: str) -> tuple[str, ...]:
-    """The terms that share their decisions with the one whose radius this is, itself included; else none."""
+    """Return all terms that share decisions with the term of this radius path; empty if there are none."""
     table, term, key = (*name.split(".", 2), "", "")[:3]
     if table != "terms" or key != "cutoff.radius":
         return ()
@@ -221,10 +223,10 @@ def shared_radius(model: Any, name: str) -> tuple[str, ...]:
 
 
 def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
-    """The simulation with other values of some parameters, whatever its file would make of them.
+    """Return the simulation with other values of some parameters, without reapplying its file's rules.
 
     Raises:
-        InputError: a value that is not finite, complex, of another shape, or that it could not have.
+        InputError: a value is not finite, complex, of the wrong shape, or not allowed.
     """
     for name, given in values.items():
         here, new = value(simulation, name), np.asarray(given)
@@ -241,7 +243,7 @@ def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation
 
 
 def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
-    """The simulation with another value, which has the right shape."""
+    """Return the simulation with another value, which has the correct shape."""
     table, _, key = name.partition(".")
     model, integrator = simulation.model, simulation.integrator
     if table == "potential" and not simulation.pairwise:
@@ -282,7 +284,7 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
 
 
 def _heated(simulation: Simulation, new: float) -> Simulation:
-    """Drawn velocities of another temperature: those of a start other than the draw's are scaled."""
+    """Set the temperature of drawn velocities; velocities that differ from the draw are scaled."""
     old = simulation.draw
     heated = replace(simulation, draw=replace(old, temperature=new))
     if not (old.temperature and old.drawn) and "temperature" in simulation.integrator.numbers():
@@ -300,7 +302,7 @@ def _heated(simulation: Simulation, new: float) -> Simulation:
 
 
 class Entry(NamedTuple):
-    """Where a path leads."""
+    """A path resolved into a parameter, an index and a unit factor."""
 
     whole: str  # path of the parameter
     index: tuple[int, ...] = ()  # which of its entries; empty for all of it
@@ -308,7 +310,7 @@ class Entry(NamedTuple):
 
 
 def entry(simulation: Simulation, name: str) -> Entry:
-    """The parameter or the entry of one that a path names; the path itself where there is none such."""
+    """Find the parameter or entry that a path names; an unknown path is returned itself."""
     if (of_pair := _of_pairs(simulation).get(name)) is not None:
         return of_pair
     table, *at = name.split(".")
@@ -330,7 +332,7 @@ def entry(simulation: Simulation, name: str) -> Entry:
 
 
 def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
-    """The paths of single pairs of species, and of single ones, where there are several."""
+    """Return the paths of entries for single pairs of species or single species, if there are several."""
     if not simulation.pairwise or simulation.pair_types == 1:
         return {}
     single = _by_species(simulation)
@@ -346,13 +348,13 @@ def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
 
 
 def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
-    """The path that a word means: of those known, or of a single entry of one.
+    """Find the parameter path for a word: a known path, or a single entry of a known parameter.
 
     Args:
-        word: a path, an alias as "r_cut" or "dt", or the end of one path alone.
+        word: a path, an alias such as "r_cut" or "dt", or an ending that only one path has.
 
     Raises:
-        InputError: no such parameter, or several; the known ones are listed.
+        InputError: no parameter or several parameters match; the message lists the known ones.
     """
     full = _ALIASES.get(word, word)
     for name in (word, full):
@@ -376,20 +378,20 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
 
 
 def changed(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
-    """The simulation with other values of some keys of a system file or parameters, checked.
+    """Return the simulation with other values of some system-file keys or parameters, after validation.
 
-    One of a file is made again from the file with these keys, and stays one of that file; not with parameters
-    that a file has no key for.
+    A simulation from a file is rebuilt from the file with these keys and keeps its file, unless a parameter
+    has no key in the file.
 
     Example:
         >>> mdnum.changed(sim, {"cutoff.radius": 9.0, "precision.force": "float32"})
         >>> mdnum.changed(sim, {"potential.layers.0.weight": weight, "position.17.x": 0.5})
 
     Args:
-        values: path to value. A key of the structure makes the atoms of a file again.
+        values: path to value. A new value of a structure key creates the atoms of a file again.
 
     Raises:
-        InputError: a value that it could not have, or no such key.
+        InputError: a value is not allowed, or a key does not exist.
     """
     keys: dict[str, Any] = {}
     if simulation.file is not None:
@@ -419,7 +421,7 @@ def _of_file(system: System, values: Mapping[str, Any]) -> Simulation:
 
 
 def _changed(simulation: Simulation, key: str, given: Any) -> Simulation:
-    """A simulation of objects with another value of one key."""
+    """Return a simulation of objects with another value of one key."""
     table, _, name = key.partition(".")
     if key == "precision.reduction":
         return replace(simulation, reduction=REDUCTIONS.parse(given))
@@ -454,7 +456,7 @@ def _changed(simulation: Simulation, key: str, given: Any) -> Simulation:
 
 
 def redrawn(simulation: Simulation) -> Simulation:
-    """The simulation with drawn velocities instead of those of its structure."""
+    """Return the simulation with drawn velocities instead of those of its structure."""
     if simulation.file is not None:
         return changed(simulation, {"structure.velocities": "drawn"})
     return _drawn(replace(simulation, draw=replace(simulation.draw, drawn=True)))
@@ -466,7 +468,7 @@ def _drawn(simulation: Simulation) -> Simulation:
 
 
 def floats(simulation: Simulation) -> dict[str, float]:
-    """The numbers that are floats and enter a step, by their dotted keys."""
+    """Return the floating-point numbers that enter a step, by their dotted keys."""
     if simulation.file is not None:
         data = simulation.file.spec.model_dump(mode="python", exclude_none=True, exclude={"fork"})
         return {key: value for key, value in toml.flat(data).items() if isinstance(value, float)}

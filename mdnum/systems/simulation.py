@@ -1,4 +1,4 @@
-"""A simulation as objects: structure, potential, list rule, integrator, precision, start, units."""
+"""A simulation as objects: structure, potential, list rule, integrator, precision, start, and units."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a simulation came from."""
+    """The source of a simulation: its name, description and system file."""
 
     name: str  # what it is called
     about: str = ""  # a sentence for people
@@ -50,36 +50,37 @@ class Origin:
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation as objects: what every verb, reference and calculator works with.
+    """A simulation as objects, used by every verb, reference and calculator.
 
-    `mdnum.simulation` makes one from a structure and a potential, `mdnum.build` from a system file.
+    `mdnum.simulation` creates a simulation from a structure and a potential, `mdnum.build` from a system
+    file.
 
     Example:
         >>> sim = mdnum.build("argon/liquid-864")
         >>> sim.evaluate().energy
 
     Attributes:
-        origin: where it came from.
-        structure: atoms as they were given; positions and velocities of step 0 are those below.
-        units: of everything that a person reads or writes.
+        origin: source of the simulation.
+        structure: atoms as given by the user; step 0 uses the positions and velocities below.
+        units: units of all input and output for people.
         symbols: chemical symbols present, sorted.
-        cell: the box of step 0. The box of a row of a run is its `Segment.cell_of`, the same unless the
-            integrator moves it.
-        positions: shape (atoms, 3), length, as the structure has them (not wrapped).
-        velocities: shape (atoms, 3), length per internal time.
-        masses: shape (atoms,).
-        species: index into symbols, shape (atoms,).
-        model: CutPotential, or a many-body potential.
+        cell: the box of step 0. If the integrator changes the box, `Segment.cell_of` returns the box of a
+            row.
+        positions: positions of the structure (not wrapped), shape (atoms, 3), length.
+        velocities: velocities of step 0, shape (atoms, 3), length per internal time.
+        masses: masses of the atoms, shape (atoms,).
+        species: index of each atom's species in symbols, shape (atoms,).
+        model: a CutPotential, Channels, or a many-body potential.
         decider: the pair decision.
-        rule: when lists are rebuilt.
+        rule: rule that determines when lists are rebuilt.
         builder: name of the list builder.
         policy: dtype by role.
         reduction: order of the force sum.
         integrator: the dynamics.
-        draw: how the velocities of step 0 were made.
-        steps, save_every: last step of a run, and steps from one frame of its trajectory to the next (0:
-            none), unless a run is asked for others.
-        fixed_point: units of a fixed-point state; None where it is one of floats.
+        draw: how the velocities of step 0 were created.
+        steps, save_every: default last step of a run, and default number of steps between trajectory frames
+            (0: no frames).
+        fixed_point: units of a fixed-point state; None for a floating-point state.
     """
 
     origin: Origin
@@ -119,19 +120,21 @@ class Simulation:
 
     @property
     def name(self) -> str:
-        """Such as "argon/liquid-864"."""
+        """Name of the simulation, such as "argon/liquid-864"."""
         return self.origin.name
 
     @property
     def file(self) -> System | None:
-        """The system file that says all of it; None of one made of objects, or changed since it was read."""
+        """System file that fully describes the simulation; None if made from objects or changed since
+        loading.
+        """
         its = self.origin.parts
         same = bool(its) and all(getattr(self, name) is part for name, part in its.items())
         return self.origin.system if same else None
 
     @property
     def timestep(self) -> float:
-        """The time step in the unit of time of `units`."""
+        """Time step in the time unit of `units`."""
         step, factor = float(self.integrator.timestep), self.units.time_factor
         # the shortest number that makes this step, which is what a person wrote
         short = float(f"{step / factor:.15g}")
@@ -144,17 +147,17 @@ class Simulation:
 
     @property
     def pairwise(self) -> bool:
-        """Whether the fast pair path serves it (else the general path does)."""
+        """True if the fast path for pair potentials applies, else the general path is used."""
         return isinstance(self.model, CutPotential | Channels)
 
     @property
     def imposable(self) -> bool:
-        """Whether decisions can be imposed: an energy that decides by itself does not act on them."""
+        """True if decisions can be imposed; an energy function that decides by itself ignores them."""
         return self.pairwise or self.model.trusts_list
 
     @property
     def pbc(self) -> tuple[bool, bool, bool]:
-        """Periodicity per axis."""
+        """Periodicity along each axis."""
         return self.cell.pbc
 
     @property
@@ -164,17 +167,17 @@ class Simulation:
 
     @property
     def cutoff(self) -> Any:
-        """The cutoff of a pair potential; None where the potential carries its own."""
+        """Cutoff of a pair potential; None if the potential contains its own cutoff."""
         return self.model.cutoff if self.pairwise else None
 
     @property
     def r_cut(self) -> float:
-        """The longest interaction radius, length."""
+        """Longest interaction radius, length."""
         return max(self.decider.r_cut)
 
     @cached_property
     def force(self) -> PairForce | ManyBodyForce:
-        """Forces and decisions over a list, for use in jit."""
+        """Function for forces and decisions over a list, for use in jit."""
         # kept for later calls, so it must hold no tracer even where its first use is inside a jit
         with jax.ensure_compile_time_eval():
             parts = (self.model, self.cell, self.decider, self.policy, self.reduction)
@@ -186,10 +189,10 @@ class Simulation:
 
     @cached_property
     def propagator(self) -> Integrator:
-        """The dynamics as the state needs it: the integrator, or its fixed-point twin.
+        """Integrator for the state: the integrator itself, or its fixed-point version.
 
         Raises:
-            InputError: an integrator, or a friction, that no fixed-point step can have.
+            InputError: the integrator or its friction is not possible for a fixed-point state.
         """
         if self.fixed_point is None:
             return self.integrator
@@ -198,25 +201,25 @@ class Simulation:
 
     @property
     def smooth(self) -> Simulation:
-        """The same system in floats: what is linearized, since an integer has no derivative."""
+        """The same system with a floating-point state, for linearization: an integer has no derivative."""
         return self if self.fixed_point is None else replace(self, fixed_point=None)
 
     @property
     def path(self) -> Path | None:
-        """Its file's; None for one made of objects."""
+        """Path of the system file; None for a simulation made from objects."""
         return None if self.file is None else self.file.path
 
     @property
     def program(self) -> dict[str, Any]:
-        """Every number and choice but the structure, plain values: what is hashed."""
+        """All numbers and choices except the structure, as plain values, for hashing."""
         return self.file.program if self.file is not None else describe.program(self)
 
     def write(self, folder: str | Path) -> None:
-        """Write what it is into a folder: its file and structure, or the objects' description."""
+        """Write the simulation into a folder: its file and structure, or a description of its objects."""
         describe.write(self, Path(folder))
 
     def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-        """Positions and velocities of step 0 as the state holds them; not wrapped, not narrowed."""
+        """Return positions and velocities of step 0 as stored in the state, neither wrapped nor narrowed."""
         if self.fixed_point is None:
             return self.positions, self.velocities
         scheme, masses = self.propagator, jnp.asarray(self.masses)
@@ -227,19 +230,19 @@ class Simulation:
 
     @property
     def channels(self) -> int:
-        """How many decisions a pair has: one for all terms that share their radii."""
+        """Number of decisions per pair; terms with the same radii share one decision."""
         return len(self.model.parts) if self.pairwise else 1
 
     @property
     def pair_types(self) -> int:
-        """How many kinds of pairs there are."""
+        """Number of pair types."""
         return len(self.decider.r_cut) // self.channels
 
     def type_of(self, i, j) -> Int[np.ndarray, "..."]:
-        """Kind of the decision of atoms i and j: their pair type, and the types of the channels before.
+        """Return the decision type of atoms i and j: their pair type plus the types of preceding channels.
 
         Args:
-            i: atoms, plus the number of atoms for each channel before that of the decision.
+            i: first atoms, plus the number of atoms for each channel before that of the decision.
         """
         channel, i = np.divmod(i, self.atoms)
         if self.pair_types == 1:
@@ -247,27 +250,29 @@ class Simulation:
         return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
 
     def first_atoms(self, i: Any) -> dict[str, Any]:
-        """Labels of the first atoms of decisions as of `type_of`, and their terms if there are channels."""
+        """Return the labels of decisions' first atoms (i as in `type_of`), and the terms if there are
+        channels.
+        """
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """The terms that kinds of decisions belong to, as a column; none where there are no channels."""
+        """Return the terms of given decision types as a column; empty if there are no channels."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])
         return {"terms": names[kind // self.pair_types]}
 
     def pair_of(self, i: int, j: int) -> dict[str, Any]:
-        """The labels of a decision's pair, i as for `type_of`, and its term if there are channels."""
+        """Return the labels of a decision's pair (i as in `type_of`), and the term if there are channels."""
         return {key: np.asarray(one).item() for key, one in self.first_atoms(i).items()} | {"j": int(j)}
 
     def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
-        """Energy and radial force that a pair brings when it enters, per kind of decision.
+        """Return the changes of energy and radial force when a pair enters, per decision type.
 
-        Where atoms have weights the largest of any pair, without a sign; `jumps_of` has a pair's own.
+        If atoms have weights, the values are the largest absolute ones; for single pairs see `jumps_of`.
         """
         if not self.pairwise:
             smoothness = self.model.smoothness
@@ -280,14 +285,14 @@ class Simulation:
 
     @property
     def _weights(self) -> Float[np.ndarray, "terms atoms"] | None:
-        """Those of all terms; None where none has any."""
+        """Weights of all terms; None if no term has weights."""
         if not self.pairwise or not self.model.weights:
             return None
         each = (term.weights for term in self.model.terms.values())
         return np.stack([np.asarray(own[0]) if own else np.ones(self.atoms) for own in each])
 
     def jumps_of(self, i, j) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """As `jumps`, of given pairs; i as for `type_of`."""
+        """Return the changes of energy and radial force when given pairs enter; for i see `type_of`."""
         kind, weights = self.type_of(i, j), self._weights
         if weights is None:
             energy, force = (jump[kind] for jump in self.jumps())
@@ -299,22 +304,22 @@ class Simulation:
 
     @property
     def lists(self) -> tuple[Any, ...]:
-        """What decides which lists a run has and in which order they are: equal here, equal lists."""
+        """Properties that determine the neighbor lists and their order; equal values give equal lists."""
         return self.rule, self.builder
 
     def verlet_list(self, skin: float | None = None) -> VerletList:
-        """A new Verlet list for this system, with another skin where one is given."""
+        """Create a Verlet list for this system, optionally with another skin."""
         rule = self.rule if skin is None else replace(self.rule, skin=skin)
         return VerletList(BUILDERS.parse(self.builder), rule, self.r_cut, guard=self._guard)
 
     @property
     def _guard(self) -> float:
-        """Room for rounding of the displacements that are compared with the skin, length."""
+        """Margin for rounding of the displacements that are compared with the skin, length."""
         coarsest = max(unit_roundoff(self.policy.dtype(role)) for role in ("state", "decision"))
         return 16 * coarsest * float(np.linalg.norm(self.decider.reach.coordinate))
 
     def tables(self, table: PairTable) -> Tables:
-        """A pair table on the device, with pair types."""
+        """Put a pair table on the device, with pair types."""
         index, order = table.found, table.sorting
         atoms = index.shape[1]
         shape = (-1, SLOTS, atoms)
@@ -332,11 +337,11 @@ class Simulation:
         return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order), edges)
 
     def with_model(self, model: Any) -> Simulation:
-        """The same system with other pair terms or a many-body potential, and decisions at their radii.
+        """Return the system with other pair terms or a many-body potential, and decisions at their radii.
 
         Raises:
-            InputError: the longest radius and the skin do not fit the box, or a many-body potential is in
-                neither float64 nor float32.
+            InputError: the longest radius and the skin do not fit the box, or the precision of a many-body
+                potential is neither float64 nor float32.
         """
         radii = tuple(np.atleast_1d(np.asarray(model.r_cut, np.float64)).tolist())
         check_radius(self.cell, max(radii), self.rule.skin)
@@ -345,19 +350,19 @@ class Simulation:
 
     @property
     def apart(self) -> Simulation:
-        """The same terms with a decision of its own for each, radii that agree included."""
+        """The same system with a separate decision for each term, even if radii agree."""
         return self.with_model(Channels.of_terms(self.model.terms, apart=True))
 
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
-        """The same system with another treatment of its cutoff (its radius and pairs stay the same).
+        """Return the system with another kind of cutoff; radius and pairs remain the same.
 
-        Switching begins where it did, and at 0.9 of the radius where it did not switch before.
+        The onset of switching is kept; if the previous cutoff did not switch, the onset is 0.9 of the radius.
         """
         made = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff
         return self._ended(lambda _: made)
 
     def _ended(self, change: Callable[[Cutoff], Cutoff]) -> Simulation:
-        """The same with other cutoffs, of every term."""
+        """Return the system with a changed cutoff for every term."""
 
         def ended(term: CutPotential) -> CutPotential:
             made, onset = change(term.cutoff), term.r_onset
@@ -369,22 +374,22 @@ class Simulation:
 
     @property
     def continuous(self) -> Simulation:
-        """The same forces from an energy that does not jump at the cutoff."""
+        """The same forces, with an energy that is continuous at the cutoff."""
         if not self.pairwise or self.cutoff.smoothness >= 0:
             return self
         return self._ended(lambda end: end.continuous)
 
     def with_policy(self, policy: PrecisionPolicy = PrecisionPolicy()) -> Simulation:
-        """The same system in floats of these roles, by default float64 throughout."""
+        """Return the system with floating-point roles of a policy, by default float64 throughout."""
         decider = replace(self.decider, dtype=policy.decision, state=policy.state)
         return replace(self, policy=policy, decider=decider, fixed_point=None)
 
     def in_row(self, cell: Cell | None) -> Simulation:
-        """The same system in the box of a row; where the integrator leaves the box as it is, itself."""
+        """Return the system in the box of a row; unchanged if the integrator does not move the box."""
         return self.with_cell(jax.tree.map(np.asarray, cell)) if self.integrator.moves_cell else self
 
     def with_cell(self, cell: Cell) -> Simulation:
-        """The same system in another box."""
+        """Return the system in another box."""
         check_radius(cell, self.r_cut, 0.0)
         if not self.pairwise and getattr(self.model, "fixed_box", False):
             message = f"{self.model.name} keeps the box that it was made with"
@@ -399,14 +404,14 @@ class Simulation:
         cell: Float[np.ndarray, "3 3"] | None = None,
         stress: bool = True,
     ) -> Evaluation:
-        """`Evaluator.__call__` for one configuration, with a list of its own."""
+        """Evaluate one configuration with a temporary list; for arguments see `Evaluator.__call__`."""
         return Evaluator(self, skin=0.0, often=False)(positions, cell, stress)
 
     def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
-        """The potential energy of one configuration alone, with a list of its own, and the numbers behind it.
+        """Compute only the potential energy of one configuration and related numbers, with a temporary list.
 
         Args:
-            positions: shape (atoms, 3), length; default the structure's.
+            positions: shape (atoms, 3), length; default those of the structure.
 
         Returns:
             energy; by name `force` on the atoms, energy/length, `r2`: smallest squared distance of each pair
@@ -415,7 +420,7 @@ class Simulation:
         return Evaluator(self, skin=0.0, often=False).numbers(positions)
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pairs i < j whose decision is yes, sorted, with their distances."""
+        """Return the pairs i < j that are inside the cutoff, sorted, with their distances."""
         i, j = table.decided(bits)
         if self.channels > 1:
             i, j = np.divmod(np.unique(i % self.atoms * self.atoms + j), self.atoms)
@@ -426,7 +431,7 @@ class Simulation:
 
 
 def _edges(index: Int[np.ndarray, "slots atoms"], form: str) -> Int[np.ndarray, "first second"]:
-    """The pairs of a table as `Tables.edges` has them, those of one atom together."""
+    """Return the pairs of a table in the format of `Tables.edges`, grouped by atom."""
     atoms = index.shape[1]
     if form == "dense":
         return np.ascontiguousarray(index.T, np.int32)
