@@ -1,9 +1,8 @@
-"""What an energy function is, and what is wrong with it, found by calling it before it is simulated.
+"""Classification and validation of an energy function, by calling it before it is simulated.
 
-A signature does not say whether positions are fractional, whether lattice vectors are rows or columns, or
-whether the box that is given counts at all. A wrong guess gives energies that look right. So the function is
-called at the first configuration, over lists that are the same in other words and in boxes that are nearly
-the same (`trial`).
+A signature does not reveal whether positions are fractional, whether lattice vectors are rows or columns, or
+whether the given box is used at all, and a wrong guess gives plausible energies. Therefore the function is
+called at the first configuration, with equivalent lists and with slightly different boxes (`trial`).
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ _RESOLVED, _BEFORE = 2e-3, 0.03
 
 
 def admitted(simulation: Simulation) -> Simulation:
-    """The simulation with an energy function that is known: its convention, its smoothness, what was noted.
+    """Return the simulation with a classified energy function: its convention, its smoothness, and notes.
 
     Raises:
-        AdmissionError: what it does cannot be right, in one of the ways of trial.toml.
+        AdmissionError: the function has one of the defects that are listed in trial.toml.
     """
     with jaxmd.standard_promotion():
         trial = _of_a_part(simulation)
@@ -53,7 +52,7 @@ def admitted(simulation: Simulation) -> Simulation:
 
 
 def _of_a_part(simulation: Simulation) -> Trial | None:
-    """A few atoms of a large structure examined, and the numbers of all; None where that is not enough."""
+    """Examine a few atoms of a large structure, then all energies; return None if this is not sufficient."""
     if simulation.atoms <= _ENOUGH or simulation.model.start is not None:
         return None
     try:
@@ -72,12 +71,12 @@ def _of_a_part(simulation: Simulation) -> Trial | None:
 
 
 def _short(values: Mapping[str, Any]) -> dict[str, Any]:
-    """With six digits: another processor computes others."""
+    """Round values to six digits, because other processors compute other last digits."""
     return {key: float(f"{one:.6g}") if isinstance(one, float) else one for key, one in values.items()}
 
 
 def _examine(trial: Trial) -> None:
-    """Find out all of it; raise an AdmissionError where what it does cannot be right."""
+    """Classify the energy function; raise an AdmissionError if its values cannot be correct."""
     _resolve(trial)
     _check(trial)
     _at_the_cutoff(trial)
@@ -87,11 +86,11 @@ def _examine(trial: Trial) -> None:
 
 
 def _resolve(trial: Trial) -> None:
-    """Find which box it follows, and whether its positions are real or fractional.
+    """Find which box the function uses, and whether its positions are real or fractional.
 
     Raises:
-        AdmissionError: numbers that are not finite; another box than the simulation's, or one that it
-            ignores; no way to strain what it sees.
+        AdmissionError: values are not finite, the function uses another box than the simulation's or ignores
+            the box, or its input cannot be strained.
     """
     how = trial.call.how
     words = ("cell",) if how.native else how.keywords
@@ -120,7 +119,7 @@ def _resolve(trial: Trial) -> None:
 
 
 def _keep(trial: Trial, box: str) -> None:
-    """Keep how the box is followed, and the keywords that this takes; energies must be finite then."""
+    """Store how the function uses the box, and the keywords needed for this; energies must be finite."""
     how = trial.call.how
     trial.learn(box=box)
     energy, forces = trial.there()
@@ -144,9 +143,9 @@ def _keep(trial: Trial, box: str) -> None:
 
 
 class _Moved:
-    """Of the atom that has most neighbors: what moving it by lattice vectors does to the energy of its pairs.
+    """Effects of moving the atom with most neighbors by lattice vectors, on the energy of its pairs.
 
-    Its pairs are those whose nearest image stays the same in a box that is sheared.
+    Only pairs whose nearest image remains the same in a sheared box are used.
     """
 
     def __init__(self, trial: Trial):
@@ -161,12 +160,13 @@ class _Moved:
         self.whole = np.where(whole, near, n).astype(np.int32)
 
     def by(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
-        """Positions with the atom moved by each of some vectors; last those unmoved."""
+        """Return positions with the atom moved by each of some vectors, and finally the original positions.
+        """
         x, moved = self.trial.x, np.arange(self.trial.n) == self.central
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 
     def takes_images(self) -> bool:
-        """Whether it may move by a lattice vector, and by none of another convention."""
+        """Return True if the energy is invariant under lattice vectors, but only those of this convention."""
         if not self.unchanged(self.trial.cell):
             return False
         # of a fractional function units are lattice vectors, and perhaps these are whole numbers of units
@@ -174,7 +174,7 @@ class _Moved:
         return call.how.fractional or not self.unchanged(np.eye(3) * call.length)
 
     def unchanged(self, vectors, cell=None) -> bool:
-        """Whether moving it by any of some vectors leaves the energy as it is."""
+        """Return True if moving the atom by any of some vectors does not change the energy."""
         trial, idx = self.trial, self.idx
         none = np.nan_to_num(trial.energy(idx=np.full_like(idx, trial.n)))
         *moved, x = self.by(vectors)
@@ -184,7 +184,7 @@ class _Moved:
         return all(abs(trial.energy(x, idx, cell) - energy) <= allowed for x in moved)
 
     def follows(self) -> bool:
-        """Whether a box that is slightly sheared counts, and counts as what it is."""
+        """Return True if a slightly sheared box changes the energy in the expected way."""
         trial = self.trial
         cell = trial.cell + trial.cell @ _SHEAR
         energy, push = trial.energy(idx=self.whole), np.abs(trial.there(idx=self.whole)[1]).max()
@@ -197,7 +197,7 @@ class _Moved:
 
 
 def _check(trial: Trial) -> None:
-    """Raise where its numbers cannot be right; note what should be known."""
+    """Raise an error if the function's values cannot be correct; add notes about other properties."""
     n, rng, inside = trial.n, np.random.default_rng(0), trial.inside
     energy, wide = trial.there()[0], trial.energy()
 
@@ -243,12 +243,12 @@ def _check(trial: Trial) -> None:
 
 
 def _over_both_lists(trial: Trial) -> dict[str, float]:
-    """Energies over the pairs inside the cutoff, and with those of the skin."""
+    """Return the energies over the pairs inside the cutoff, and over those including the skin."""
     return {"inside": trial.energy(), "skin": trial.energy(idx=trial.idx)}
 
 
 def _derivatives(trial: Trial, rng: np.random.Generator) -> None:
-    """Forces, and stress where the box counts, against differences of energies."""
+    """Compare forces, and stress if the box is used, with finite differences of the energy."""
     step, allowed = (1e-5, 1e-4) if trial.double else (3e-3, 5e-2)
     r_cut = trial.model.r_cut
     step *= r_cut
@@ -296,7 +296,7 @@ def _derivatives(trial: Trial, rng: np.random.Generator) -> None:
 
 
 def _at_the_cutoff(trial: Trial) -> None:
-    """Find what a crossing of its cutoff does, of the pairs that are nearest to it, and its own range."""
+    """Find the effect of crossing the cutoff, for the pairs nearest to it, and the function's own range."""
     n, r_cut, size = trial.n, trial.model.r_cut, trial.scale
     r = np.where(trial.idx < n, trial.distances(trial.idx, trial.x), np.inf)
     found, acts = [], []
@@ -308,7 +308,7 @@ def _at_the_cutoff(trial: Trial) -> None:
         toward = np.concatenate(displacement(trial.box, trial.x[[i]], trial.x[[j]])) / r[i, slot]
 
         def crossing(factor: float, i=i, j=j, toward=toward, r=r[i, slot]) -> tuple[float, float]:
-            """What the pair adds to the energy, and to a force."""
+            """Return the contributions of the pair to the energy and to a force."""
             x = trial.x.copy()
             x[j] += toward * (r_cut * factor - r)
             listed = trial.within(trial.idx, x, r_cut)
@@ -351,11 +351,11 @@ def _at_the_cutoff(trial: Trial) -> None:
 
 
 def _threes(trial: Trial) -> tuple[Any, Any, np.ndarray]:
-    """Atoms in threes that have no other neighbors: a list of some of them, and all firsts and thirds.
+    """Arrange the atoms in isolated groups of three.
 
     Returns:
-        a list with the first so many threes; positions by the distance of the third atom from the first one,
-        the second at 0.6 of the cutoff; the third atoms.
+        a function that returns the list of chosen groups; a function that returns positions for a distance of
+        third atoms from first atoms, with second atoms at 0.6 of the cutoff; the third atoms.
     """
     n, x = trial.n, trial.x
     first, second, third = np.arange(n - n % 3).reshape(3, -1)
@@ -377,7 +377,7 @@ def _threes(trial: Trial) -> tuple[Any, Any, np.ndarray]:
 
 
 def _adds(trial: Trial) -> bool:
-    """Whether the energy of two groups of atoms that have no pair in common is the sum of both."""
+    """Return True if the energies of two groups of atoms without common pairs are additive."""
     listed, placed, third = _threes(trial)
     if len(third) < 2:
         return True
@@ -388,9 +388,9 @@ def _adds(trial: Trial) -> bool:
 
 
 def _reach(trial: Trial) -> tuple[float | None, float]:
-    """The largest distance at which a listed pair has a force, and the largest that was tried.
+    """Return the largest distance at which a listed pair has a force, and the largest distance tested.
 
-    None where it has no force at any distance.
+    The first value is None if the pair has no force at any distance.
     """
     r_cut, (listed, placed, third) = trial.model.r_cut, _threes(trial)
     furthest = min(2 * r_cut, 0.49 * trial.width if trial.pbc.any() else np.inf)
@@ -413,7 +413,7 @@ def _reach(trial: Trial) -> tuple[float | None, float]:
 
 
 def second_derivative(simulation: Simulation) -> str:
-    """The first operation that makes second derivatives of an energy function not finite; empty for none."""
+    """Return the first operation that makes second derivatives of an energy function not finite, or ""."""
     if not isinstance(simulation.model, EnergyFunction):
         return ""
     with jaxmd.standard_promotion():

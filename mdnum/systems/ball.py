@@ -1,4 +1,4 @@
-"""What a system file with `world = "ball"` may say: frozen pydantic models, with the unit of every number.
+"""Schema of a system file with `world = "ball"`: frozen pydantic models, with the unit of every number.
 
 Heights are in m, velocities in m/s, times in s. Stiffness and damping are per mass (1/s², 1/s), so that no
 mass is needed; the gain of a projection has no unit.
@@ -25,7 +25,8 @@ MethodName = Literal["unrolled", "implicit", "frozen", "event-aware", "smoothed"
 
 
 def _numbers(value: Any) -> Any:
-    """A number, or an array of numbers as a tuple; a union of the two would report every mistake twice."""
+    """Validate a number or an array of numbers (as a tuple); a union type would report every mistake twice.
+    """
     for item in value if isinstance(value, list | tuple) else (value,):
         if isinstance(item, bool) or not isinstance(item, int | float):
             raise PydanticKnownError("float_type")
@@ -39,7 +40,7 @@ Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
 
 
 class BoundaryTable(TomlTable):
-    """A batch at rest whose penetrations sum to stop.tol exactly: one an ulp short of it, and many small."""
+    """A batch at rest whose penetrations sum to exactly stop.tol: one is an ulp smaller, the others tiny."""
 
     terms: int = Field(
         default=8, ge=1, le=1_000_000, description="how many small penetrations make up the missing ulp"
@@ -50,7 +51,7 @@ class BoundaryTable(TomlTable):
 
 
 class StartTable(TomlTable):
-    """Where the balls are at step 0."""
+    """The state of the balls at step 0."""
 
     height: Numbers = Field(default=1.0, description="height above the floor (m), one or one per ball")
     velocity: Numbers = Field(default=0.0, description="velocity, up is positive (m/s), one or one per ball")
@@ -74,20 +75,20 @@ class StartTable(TomlTable):
 
 
 class NoControl(TomlTable):
-    """Nothing but gravity acts in flight."""
+    """No acceleration other than gravity acts in flight."""
 
     kind: Literal["none"]
 
 
 class ConstantControl(TomlTable):
-    """A constant acceleration."""
+    """A constant acceleration acts in flight."""
 
     kind: Literal["constant"]
     value: float = Field(description="acceleration, up is positive (m/s²)")
 
 
 class SineControl(TomlTable):
-    """amplitude · sin(2π t / period + phase)."""
+    """The acceleration is amplitude · sin(2π t / period + phase)."""
 
     kind: Literal["sine"]
     amplitude: float = Field(description="largest acceleration (m/s²)")
@@ -96,7 +97,7 @@ class SineControl(TomlTable):
 
 
 class ValuesControl(TomlTable):
-    """An acceleration for each step, held during the step."""
+    """Each step has a given acceleration, which is constant during the step."""
 
     kind: Literal["values"]
     values: Annotated[tuple[float, ...], from_array] = Field(
@@ -110,7 +111,7 @@ Control = Annotated[
 
 
 class Flight(TomlTable):
-    """What acts on a ball in flight."""
+    """Forces on a ball in flight."""
 
     gravity: NonNegative = Field(default=9.81, description="acceleration, downward (m/s²)")
     control: Control = Field(
@@ -128,7 +129,7 @@ class _Contact(TomlTable):
 
 
 class PenaltyContact(_Contact):
-    """A spring that pushes while the ball is below the floor."""
+    """A spring that pushes the ball while it is below the floor."""
 
     kind: Literal["penalty"]
     k: Positive = Field(description="stiffness per mass (1/s²)")
@@ -137,7 +138,7 @@ class PenaltyContact(_Contact):
 
 
 class ProjectionContact(_Contact):
-    """y <- y + alpha k p with p = max(0, -y), until [stop] says enough; then clamped to the floor."""
+    """y <- y + alpha k p with p = max(0, -y), until the rule in [stop] ends it; then clamped to the floor."""
 
     kind: Literal["projection"]
     k: Positive = Field(description="gain (no unit)")
@@ -179,31 +180,31 @@ class _Tolerance(TomlTable):
 
 
 class SumRule(_Tolerance):
-    """The sum of the residuals of all balls, in the order of precision.reduction."""
+    """Stop on the sum of the residuals of all balls, added in the order of precision.reduction."""
 
     rule: Literal["sum"]
 
 
 class PerInstanceRule(_Tolerance):
-    """Each ball by itself."""
+    """Stop each ball on its own residual."""
 
     rule: Literal["per-instance"]
 
 
 class MaximumRule(_Tolerance):
-    """The largest residual of the batch."""
+    """Stop on the largest residual of the batch."""
 
     rule: Literal["maximum"]
 
 
 class RelativeRule(_Tolerance):
-    """The sum, as a share of what it was before the first iteration."""
+    """Stop on the sum of the residuals, relative to the sum before the first iteration."""
 
     rule: Literal["relative"]
 
 
 class FixedRule(TomlTable):
-    """So many iterations, whatever the residual."""
+    """Make a fixed number of iterations, whatever the residual."""
 
     rule: Literal["fixed"]
     count: int = Field(ge=1, le=_MOST, description="iterations of every solve")
@@ -213,7 +214,7 @@ Stop = Annotated[SumRule | PerInstanceRule | MaximumRule | RelativeRule | FixedR
 
 
 class IntegratorTable(TomlTable):
-    """From one step to the next."""
+    """The integration method, the time step and the number of steps."""
 
     kind: Literal[
         "explicit-euler", "semi-implicit-euler", "velocity-verlet", "implicit-midpoint", "event-located"
@@ -226,7 +227,7 @@ class IntegratorTable(TomlTable):
 
 
 class BallPrecision(TomlTable):
-    """Which float plays which role, and in which order a sum is made."""
+    """The floating-point format of each role, and the order of sums."""
 
     state: FloatName = Field(default="float64", description="heights and velocities")
     arithmetic: FloatName = Field(default="float64", description="everything a step computes")
@@ -245,7 +246,7 @@ class BallPrecision(TomlTable):
 
 
 class LossTable(TomlTable):
-    """The number that a gradient is of."""
+    """The quantity whose gradient is computed."""
 
     kind: Literal["final-height", "mean-height", "residual-penetration"] = Field(
         default="final-height",
@@ -258,7 +259,7 @@ class LossTable(TomlTable):
 
 
 class GradientTable(TomlTable):
-    """The derivatives asked for."""
+    """The requested derivatives."""
 
     of: Annotated[tuple[ParameterName, ...], from_array] = Field(
         default=(), description="parameters; y0 and v0 move all balls together"
@@ -269,7 +270,7 @@ class GradientTable(TomlTable):
 
 
 def _changes(value: Any) -> Any:
-    """Tables of changes with dotted keys, also where TOML made tables of the dots."""
+    """Return tables of changes with dotted keys, even if TOML parsed the dots as tables."""
     if not isinstance(value, Mapping):
         return value
     return {name: flat(table) if isinstance(table, Mapping) else table for name, table in value.items()}
@@ -302,7 +303,7 @@ class BallSpec(TomlTable):
 
     @property
     def balls(self) -> int:
-        """How many balls the file describes."""
+        """Number of balls that the file describes."""
         start = self.start
         if start.boundary is not None:
             return start.boundary.terms + 1
@@ -317,7 +318,7 @@ class BallSpec(TomlTable):
 
     @staticmethod
     def follow(data: dict[str, Any], values: Mapping[Key, Any]) -> None:
-        """Drop what the file says of another contact or integrator than the one that is asked for."""
+        """Remove settings of the file that do not apply to a newly requested contact or integrator."""
         contact, integrator, gradient = (data.get(key) for key in ("contact", "integrator", "gradient"))
         if not {("contact", "kind"), ("integrator", "kind")} & set(values):
             return
@@ -345,12 +346,12 @@ Problem = tuple[str, str, str]
 
 
 def parameters(contact: str) -> tuple[str, ...]:
-    """Names of the parameters that a gradient can be asked for, where the contact is of some kind."""
+    """Return the names of the parameters whose gradient is available for a kind of contact."""
     return (*_PARAMETERS.get(contact, ()), "gravity", "h", "y0", "v0")
 
 
 def solves(contact: str | None, integrator: str | None) -> bool:
-    """Whether a step of this kind iterates: a projection, and the implicit equation of a spring."""
+    """Return True if a step iterates: with a projection, or an implicit integrator and a spring."""
     return contact == "projection" or (integrator == "implicit-midpoint" and contact == "penalty")
 
 
@@ -497,7 +498,8 @@ def _stops(spec: BallSpec) -> Iterator[Problem]:
 
 
 def _unrepresentable(spec: BallSpec) -> Iterator[Problem]:
-    """Numbers that the format of their role cannot hold, tolerances that no residual but 0 would be below."""
+    """Find numbers that the format of their role cannot hold, and tolerances that only a residual of 0 meets.
+    """
     precision, stop = spec.precision, spec.stop
     # every number with a role: key, value, role, the smallest that the role can use
     held: list[tuple[str, float, str, float | None]] = []
@@ -562,7 +564,8 @@ def _losses(spec: BallSpec) -> Iterator[Problem]:
 
 
 def remarks(spec: BallSpec) -> Iterator[tuple[str, dict[str, Any]]]:
-    """What runs, and is probably not what was meant: codes of findings, and the values of their sentences."""
+    """Find settings that run but are probably unintended: codes of findings, and values of their sentences.
+    """
     stop, contact = spec.stop, spec.contact
     if isinstance(contact, ProjectionContact):
         # a height just below the floor is the difference of two numbers of the size of one step's fall

@@ -1,5 +1,4 @@
-"""Construction of simulations from objects: compatible parts are assembled, incompatible parts are rejected.
-"""
+"""Construction of simulations from objects: compatible parts are assembled, others are rejected."""
 
 from __future__ import annotations
 

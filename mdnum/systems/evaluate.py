@@ -1,4 +1,4 @@
-"""Energies and forces of single configurations, with a Verlet list that is kept while it serves."""
+"""Energies and forces of single configurations, with a Verlet list that is reused while it is valid."""
 
 from __future__ import annotations
 
@@ -44,28 +44,28 @@ class Evaluation:
 
     @property
     def i(self) -> Int[np.ndarray, "pairs"]:
-        """First atoms of the pairs inside."""
+        """First atoms of the pairs inside the cutoff."""
         return self._pairs[0]
 
     @property
     def j(self) -> Int[np.ndarray, "pairs"]:
-        """Second atoms of the pairs inside."""
+        """Second atoms of the pairs inside the cutoff."""
         return self._pairs[1]
 
     @property
     def distance(self) -> Float[np.ndarray, "pairs"]:
-        """Distances of the pairs inside, length."""
+        """Distances of the pairs inside the cutoff, length."""
         return self._pairs[2]
 
 
 class Evaluator:
-    """Evaluates one configuration after another, with a list rebuilt once motion and strain used its skin.
+    """Evaluator of successive configurations; the list is rebuilt once motion and strain have used its skin.
 
     Args:
         simulation: the system as objects.
-        skin: skin of the list, length; default the system's. A box too narrow for it gets what fits.
-        often: whether there are many calls; of an energy function that is compiled for a few, programs are
-            compiled in a hurry, which takes a quarter of the time.
+        skin: skin of the list, length; default the system's. A narrow box gets the largest possible skin.
+        often: whether many calls are expected. If not, the program of an energy function is compiled with few
+            optimizations, which takes a quarter of the time.
     """
 
     def __init__(self, simulation: Simulation, skin: float | None = None, often: bool = True):
@@ -83,12 +83,12 @@ class Evaluator:
         cell: Float[np.ndarray, "3 3"] | None = None,
         stress: bool = True,
     ) -> Evaluation:
-        """Energy, forces, stress and pairs.
+        """Compute energy, forces, stress and pairs of a configuration.
 
         Args:
-            positions: length; default the structure's.
+            positions: positions, length; default the structure's.
             cell: lattice vectors as rows; default the system's.
-            stress: whether it is needed; it takes about as long as the forces.
+            stress: whether to compute the stress, which takes about as long as the forces.
 
         Raises:
             InputError: the cutoff exceeds half the smallest perpendicular width.
@@ -109,7 +109,7 @@ class Evaluator:
         )
 
     def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
-        """The potential energy alone, and the numbers behind it (see `Simulation.numbers`)."""
+        """Compute only the potential energy and related numbers (see `Simulation.numbers`)."""
         own = self.simulation
         _, _, _, tables, x = self._sorted(positions, None)
         bare = own.potential if own.pairwise else None
@@ -119,7 +119,7 @@ class Evaluator:
         return float(energy), found
 
     def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
-        """The simulation in this cell, wrapped positions, the list for them, and positions in its order."""
+        """Return the simulation in this cell, wrapped positions, their list, and positions in its order."""
         check_not_forked()
         own = self.simulation
         same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
@@ -131,7 +131,7 @@ class Evaluator:
         return here, wrapped, table, tables, jax.device_put(x)
 
     def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
-        """The list in use, rebuilt where it no longer holds every pair inside."""
+        """Return the current list, rebuilt if it may not contain every pair inside the cutoff."""
         if self._kept is not None:
             table, tables, reference, reference_cell = self._kept
             if self._verlet.consumed(wrapped, here.cell, reference, reference_cell) <= 1.0:
@@ -147,7 +147,7 @@ class Evaluator:
 
 
 def _listed(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool) -> Any:
-    """Forces and decisions, with the virial as a tensor where the stress is needed."""
+    """Compute forces and decisions, with the virial as a tensor if the stress is needed."""
     return force(x, tables, decisions=True, tensor=stress)
 
 

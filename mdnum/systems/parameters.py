@@ -128,8 +128,7 @@ def is_positive(simulation: Simulation, name: str) -> bool:
 
 
 def by(simulation: Simulation, name: str) -> str:
-    """Return the index of a parameter's entries, "pair type", "species" or "atom", or "" for a single value.
-    """
+    """Return what indexes a parameter: "pair type", "species" or "atom"; "" for a single value."""
     if name.startswith("initial.") or is_weight(name):
         return "atom"
     if not _is_typed(simulation, name) or simulation.pair_types == 1:

@@ -1,8 +1,8 @@
-"""What a system file may hold: frozen pydantic models, one per table, with the unit of every number.
+"""Schema of a system file: frozen pydantic models, one per table, with the unit of every number.
 
-Why strict: a system file decides what is computed, so a misspelled key or a string where a number belongs
-is an error (mdnum.systems.load makes one line of each). Lengths, energies and times are in the units of the
-file: Å, eV, amu, ps and K for "metal"; multiples of σ, ε, m and τ for "lj".
+Validation is strict because a system file decides what is computed: a misspelled key or a string in place of
+a number is an error (mdnum.systems.load prints one line for each). Lengths, energies and times are in the
+units of the file: Å, eV, amu, ps and K for "metal"; multiples of σ, ε, m and τ for "lj".
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ ONSET_FRACTION = 0.9
 
 
 def pair_key(a: str, b: str) -> str:
-    """The one spelling under which a pair of species is looked up: "Ni-P" for either order."""
+    """Return the unique name of a pair of species for look-up: "Ni-P" for either order."""
     return "-".join(sorted((a, b)))
 
 
 def pair_names(symbols: Sequence[str]) -> list[str]:
-    """The pairs of some species in the order of pair types, such as "Ni-Ni", "Ni-P", "P-P"."""
+    """Return the pairs of some species in the order of pair types, such as "Ni-Ni", "Ni-P", "P-P"."""
     return [f"{a}-{b}" for a, b in combinations_with_replacement(symbols, 2)]
 
 
@@ -51,14 +51,14 @@ def _check_pairs(pairs: Mapping[str, Any] | None) -> None:
 
 
 class LennardJonesPair(TomlTable):
-    """Constants of one pair of species, Lennard-Jones."""
+    """Lennard-Jones constants of one pair of species."""
 
     sigma: Length = Field(description="distance of zero energy (Å or σ)")
     epsilon: Energy = Field(description="well depth (eV or ε)")
 
 
 class MorsePair(TomlTable):
-    """Constants of one pair of species, Morse."""
+    """Morse constants of one pair of species."""
 
     depth: Energy = Field(description="well depth D (eV or ε)")
     alpha: float = Field(gt=0, description="stiffness (1/length)")
@@ -66,7 +66,7 @@ class MorsePair(TomlTable):
 
 
 class SoftSpherePair(TomlTable):
-    """Constants of one pair of species, soft sphere."""
+    """Soft-sphere constants of one pair of species."""
 
     sigma: Length = Field(description="diameter (Å or σ)")
     epsilon: Energy = Field(description="energy scale (eV or ε)")
@@ -74,7 +74,7 @@ class SoftSpherePair(TomlTable):
 
 
 class PairPotentialTable(TomlTable):
-    """A pair potential: one set of constants, or one for each pair of species."""
+    """A pair potential, with one set of constants for all pairs or one set for each pair of species."""
 
     if TYPE_CHECKING:
         kind: str
@@ -97,7 +97,8 @@ class PairPotentialTable(TomlTable):
 
 
 def _pair_table(name: str, kind: str, row: type[TomlTable], description: str) -> Any:
-    """The table of a potential whose constants are given once, or as a row for each pair of species."""
+    """Create the table of a potential whose constants are given once, or in a row for each pair of species.
+    """
     columns: dict[str, Any] = {"kind": (Literal[kind], ...)}
     for key, field in row.model_fields.items():
         value: Any = Annotated[field.annotation, *field.metadata]
@@ -118,7 +119,7 @@ SoftSphereTable = _pair_table(
 
 
 class ManyBodyTable(TomlTable):
-    """A potential that is no sum over pairs, and has its own cutoff."""
+    """A potential that is not a sum over pairs, and that includes its own cutoff."""
 
     if TYPE_CHECKING:
         kind: str
@@ -140,14 +141,14 @@ class TersoffTable(ManyBodyTable):
 
 
 class EmbeddedAtomTable(ManyBodyTable):
-    """Embedded-atom method from a table."""
+    """Embedded-atom potential, read from a table."""
 
     kind: Literal["eam"]
     file: str = Field(description="setfl table (.eam.alloy), relative to this file")
 
 
 class PythonTable(PairPotentialTable):
-    """A pair potential as a function u(r, ...) or u(r2, ...) in a Python file, executed where allowed."""
+    """A pair potential given as a function u(r, ...) or u(r2, ...) in a Python file, executed if allowed."""
 
     kind: Literal["python"]
     function: str = Field(description='file and name, "mine.py:morse", relative to this file')
@@ -159,7 +160,7 @@ class PythonTable(PairPotentialTable):
 
     @property
     def constants(self) -> tuple[str, ...]:
-        """Names of its parameters, which its function checks."""
+        """Always empty, because the function itself checks its parameters."""
         return ()
 
 
@@ -172,19 +173,19 @@ def _kinds(*tables: type[TomlTable]) -> list[str]:
 
 
 def _other_than(*tables: type[TomlTable]) -> Any:
-    """A kind that an editor does not take for that of one of these tables."""
+    """Define a kind that an editor distinguishes from the kinds of these tables."""
     return Field(json_schema_extra={"not": {"enum": [*_kinds(*tables)]}})
 
 
 class OtherRow(TomlTable):
-    """Constants of one pair of species, of a potential that another package adds."""
+    """Constants of one pair of species, for a potential from another package."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float]
 
 
 class OtherTable(PairPotentialTable):
-    """A pair potential that another package adds; its constants are the fields of its class."""
+    """A pair potential from another package; its constants are the fields of its class."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float]
@@ -212,7 +213,7 @@ def _check_names(given: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def _or_other(tables: Sequence[type[TomlTable]], other: type[TomlTable], registry: str) -> Any:
-    """One of some tables by its kind, or that of a kind which another package adds to a registry."""
+    """Define a union of tables selected by kind, plus a table for kinds that other packages register."""
     tags = dict(zip(_kinds(*tables), tables, strict=True))
 
     def kind_of(value: Any) -> Any:
@@ -240,7 +241,7 @@ def _switches(kind: Any) -> bool:
 
 
 class CutoffTable(TomlTable):
-    """How a pair potential ends, and where."""
+    """The kind of cutoff of a pair potential, and its radius."""
 
     kind: Annotated[str, Named("mdnum.md.cutoffs:CUTOFFS")]
     radius: Length | None = Field(default=None, description="cutoff radius (Å or σ)")
@@ -259,17 +260,17 @@ class CutoffTable(TomlTable):
 
     @property
     def switches(self) -> bool:
-        """Whether the kind has an onset."""
+        """True if this kind of cutoff has an onset."""
         return _switches(self.kind)
 
     @property
     def base(self) -> float | None:
-        """The number that the onset is a part of."""
+        """Length or multiple of sigma that the onset refers to."""
         return self.radius if self.radius is not None else self.in_sigma
 
     @staticmethod
     def foreign_keys(table: Mapping[str, Any]) -> set[str]:
-        """Keys without a meaning for the kind that a table names."""
+        """Return the keys that do not apply to the kind of cutoff in a table."""
         kind = table.get("kind")
         return set() if _switches(kind) else {"onset"}
 
@@ -328,7 +329,7 @@ class FileStructure(_Structure):
 
 
 class BuilderStructure(_Structure):
-    """A perfect crystal, built."""
+    """A perfect crystal that is generated."""
 
     builder: Literal["fcc", "bcc", "sc", "diamond"] = Field(description="lattice, with its cubic cell")
     symbol: str = Field(description="chemical symbol")
@@ -358,7 +359,7 @@ Structure = Annotated[
 
 
 class RebuildTable(TomlTable):
-    """When the list is rebuilt, in the words of LAMMPS's neigh_modify."""
+    """When the list is rebuilt, with the options of LAMMPS's neigh_modify."""
 
     every: int = Field(default=1, ge=1, description="consider a rebuild every so many steps")
     delay: int = Field(
@@ -371,7 +372,7 @@ class RebuildTable(TomlTable):
 
 
 class NeighborsTable(TomlTable):
-    """The Verlet list."""
+    """Settings of the Verlet list."""
 
     skin: NonNegative | None = Field(
         default=None, description="extra radius of the list (Å or σ); default 1.0 Å for metal, 0.3 σ for lj"
@@ -391,7 +392,7 @@ class _Dynamics(TomlTable):
 
 
 class NVETable(_Dynamics):
-    """Constant energy: velocity Verlet."""
+    """Constant energy, with velocity Verlet."""
 
     kind: Literal["nve"]
     temperature: NonNegative = Field(
@@ -401,7 +402,7 @@ class NVETable(_Dynamics):
 
 
 class LangevinTable(_Dynamics):
-    """Constant temperature: BAOAB."""
+    """Constant temperature, with Langevin dynamics (BAOAB)."""
 
     kind: Literal["langevin"]
     temperature: NonNegative = Field(description="of the bath, and of drawn velocities (K or ε/k)")
@@ -425,27 +426,27 @@ Links = Annotated[int, Field(ge=1, le=20, description="thermostats of a chain")]
 
 
 class NoseHooverTable(_ThermostatTable):
-    """Constant temperature: a Nosé-Hoover chain."""
+    """Constant temperature, with a Nosé-Hoover chain."""
 
     kind: Literal["nose-hoover"]
     chain: Links = 3
 
 
 class CSVRTable(_ThermostatTable):
-    """Constant temperature: stochastic velocity rescaling."""
+    """Constant temperature, with stochastic velocity rescaling."""
 
     kind: Literal["csvr"]
 
 
 class MTKTable(_BarostatTable):
-    """Constant pressure and temperature: Martyna, Tobias and Klein."""
+    """Constant pressure and temperature, with the method of Martyna, Tobias and Klein."""
 
     kind: Literal["mtk"]
     chain: Links = 3
 
 
 class CellRescalingTable(_BarostatTable):
-    """Constant pressure and temperature: stochastic cell rescaling."""
+    """Constant pressure and temperature, with stochastic cell rescaling."""
 
     kind: Literal["cell-rescaling"]
     compressibility: Positive = Field(
@@ -457,7 +458,7 @@ _DYNAMICS = (NVETable, LangevinTable, NoseHooverTable, CSVRTable, MTKTable, Cell
 
 
 class OtherDynamics(_Dynamics):
-    """An integrator that another package adds; its keys are the fields of its class."""
+    """An integrator from another package; its keys are the fields of its class."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, bool | int | float | str]
@@ -482,13 +483,13 @@ Dynamics = _or_other(_DYNAMICS, OtherDynamics, _INTEGRATORS)
 
 
 class DynamicsAlone(TomlTable):
-    """Dynamics without a system, as objects have them."""
+    """A dynamics table without a system, for simulations made from objects."""
 
     dynamics: Dynamics
 
 
 class PrecisionTable(TomlTable):
-    """Which float plays which role."""
+    """The floating-point format of each role."""
 
     state: Literal["float64", "float32", "lattice"] = Field(
         default="float64",
@@ -515,7 +516,7 @@ class PrecisionTable(TomlTable):
 
 
 class ForkTable(TomlTable):
-    """What `mdnum fork` does with this system where the command line does not say."""
+    """Defaults of `mdnum fork` for this system, used for options missing on the command line."""
 
     vary: str | None = Field(
         default=None,
@@ -530,7 +531,7 @@ class ForkTable(TomlTable):
 
 
 class RecordTable(TomlTable):
-    """What is kept besides series, flips and epochs."""
+    """Data to record in addition to series, flips and epochs."""
 
     save_every: int = Field(
         default=0, ge=0, description="write a trajectory frame every so many steps; 0: none"
@@ -538,14 +539,14 @@ class RecordTable(TomlTable):
 
 
 class Interaction(NamedTuple):
-    """A potential and its end, without a system around them."""
+    """A potential and its cutoff, independent of a system."""
 
     potential: Any  # a table of `Potential`
     cutoff: CutoffTable | None
 
 
 def check_interaction(potential: Any, cutoff: CutoffTable | None) -> None:
-    """Raise ValueError where a potential and a cutoff do not belong together."""
+    """Raise ValueError if a potential and a cutoff are incompatible."""
     kind = potential.kind
     if isinstance(potential, PairPotentialTable):
         if cutoff is None:
@@ -557,7 +558,7 @@ def check_interaction(potential: Any, cutoff: CutoffTable | None) -> None:
 
 
 class TermTable(TomlTable):
-    """One of several pair potentials that add."""
+    """One of several pair potentials that are added."""
 
     potential: Potential
     cutoff: CutoffTable | None = None
@@ -582,12 +583,12 @@ def _with_onset(cutoff: CutoffTable | None) -> CutoffTable | None:
 
 
 def _one_of(made: dict[str, Any]) -> None:
-    """Of a table that may be left out, what an editor expects where it is not."""
+    """Replace a nullable table in the JSON schema by the table itself, as editors expect."""
     made |= made.pop("anyOf")[0]
 
 
 class SystemSpec(TomlTable):
-    """A system file."""
+    """The contents of a system file."""
 
     name: str | None = Field(default=None, description="what to call the system; default the file's name")
     about: str = Field(default="", description="one sentence or more for people, with the source")
@@ -620,25 +621,25 @@ class SystemSpec(TomlTable):
 
     @property
     def interactions(self) -> dict[str, Interaction]:
-        """Potentials with their cutoffs by the name of their term, "" where there are no terms."""
+        """Potentials with their cutoffs by name of the term; the name is "" if there are no terms."""
         if self.terms is None:
             return {"": Interaction(self.potential, self.cutoff)}
         return {name: Interaction(one.potential, one.cutoff) for name, one in self.terms.items()}
 
     @property
     def compare(self) -> str:
-        """What inside means."""
+        """Comparison that defines the inside of a cutoff."""
         return next((one.cutoff.compare for one in self.interactions.values() if one.cutoff), "r <")
 
     @property
     def skin(self) -> float:
-        """The Verlet skin, the default of the unit system where the file is silent."""
+        """Verlet skin; if the file gives none, the default of the unit system."""
         skin = self.neighbors.skin
         return DEFAULT_SKIN[unit_systems.get(self.units).name] if skin is None else skin
 
     @property
     def resolved(self) -> SystemSpec:
-        """With the defaults that depend on other keys written out."""
+        """Tables in which defaults that depend on other keys are filled in."""
         update: dict[str, Any] = {"neighbors": self.neighbors.model_copy(update={"skin": self.skin})}
         update["cutoff"] = _with_onset(self.cutoff)
         if self.terms is not None:
@@ -650,7 +651,7 @@ class SystemSpec(TomlTable):
 
     @staticmethod
     def follow(data: dict[str, Any], values: Mapping[Key, Any]) -> None:
-        """Draw velocities anew for a temperature or seed that is asked for, which would be ignored else."""
+        """Draw new velocities for a requested temperature or seed, which would otherwise have no effect."""
         structure, dynamics = data.get("structure"), data.get("dynamics")
         if not isinstance(structure, dict) or not isinstance(dynamics, dict) or dynamics.get("kind") != "nve":
             return

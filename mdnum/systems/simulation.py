@@ -125,9 +125,7 @@ class Simulation:
 
     @property
     def file(self) -> System | None:
-        """System file that fully describes the simulation; None if made from objects or changed since
-        loading.
-        """
+        """System file that describes the simulation; None if it was changed or made from objects."""
         its = self.origin.parts
         same = bool(its) and all(getattr(self, name) is part for name, part in its.items())
         return self.origin.system if same else None
@@ -250,9 +248,7 @@ class Simulation:
         return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
 
     def first_atoms(self, i: Any) -> dict[str, Any]:
-        """Return the labels of decisions' first atoms (i as in `type_of`), and the terms if there are
-        channels.
-        """
+        """Return the first atoms of decisions (i as in `type_of`), and terms if there are channels."""
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
@@ -414,8 +410,9 @@ class Simulation:
             positions: shape (atoms, 3), length; default those of the structure.
 
         Returns:
-            energy; by name `force` on the atoms, energy/length, `r2`: smallest squared distance of each pair
-            type and largest of all, length², `pair`: bare energies at the smallest; 0 for none.
+            the energy, and by name: `force` on the atoms, energy/length; `r2`, smallest squared distance of
+            each pair type and largest of all, length²; `pair`, bare energies at the smallest distances; 0
+            without a pair.
         """
         return Evaluator(self, skin=0.0, often=False).numbers(positions)
 
