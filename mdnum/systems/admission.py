@@ -160,8 +160,7 @@ class _Moved:
         self.whole = np.where(whole, near, n).astype(np.int32)
 
     def by(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
-        """Return positions with the atom moved by each of some vectors, and finally the original positions.
-        """
+        """Return positions with the atom moved by each of some vectors, then the original positions."""
         x, moved = self.trial.x, np.arange(self.trial.n) == self.central
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 

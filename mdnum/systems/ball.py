@@ -25,8 +25,7 @@ MethodName = Literal["unrolled", "implicit", "frozen", "event-aware", "smoothed"
 
 
 def _numbers(value: Any) -> Any:
-    """Validate a number or an array of numbers (as a tuple); a union type would report every mistake twice.
-    """
+    """Validate a number or an array of numbers; a union type would report each mistake twice."""
     for item in value if isinstance(value, list | tuple) else (value,):
         if isinstance(item, bool) or not isinstance(item, int | float):
             raise PydanticKnownError("float_type")
@@ -498,8 +497,7 @@ def _stops(spec: BallSpec) -> Iterator[Problem]:
 
 
 def _unrepresentable(spec: BallSpec) -> Iterator[Problem]:
-    """Find numbers that the format of their role cannot hold, and tolerances that only a residual of 0 meets.
-    """
+    """Find numbers that a role's format cannot hold, and tolerances met only by a residual of 0."""
     precision, stop = spec.precision, spec.stop
     # every number with a role: key, value, role, the smallest that the role can use
     held: list[tuple[str, float, str, float | None]] = []
@@ -564,8 +562,7 @@ def _losses(spec: BallSpec) -> Iterator[Problem]:
 
 
 def remarks(spec: BallSpec) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Find settings that run but are probably unintended: codes of findings, and values of their sentences.
-    """
+    """Find settings that run but are probably unintended; yield codes of findings and their values."""
     stop, contact = spec.stop, spec.contact
     if isinstance(contact, ProjectionContact):
         # a height just below the floor is the difference of two numbers of the size of one step's fall

@@ -1,4 +1,4 @@
-"""From a system file to a simulation: the one place where the words of a file become objects."""
+"""Building a simulation from a system file: the only module that converts the file's tables to objects."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _CHANGE_OBJECTS = "Change the objects: mdnum.changed(simulation, {...})"
 
 
 def interaction(potential: Mapping[str, Any], cutoff: Mapping[str, Any] | None) -> schema.Interaction:
-    """The tables of a potential and of its cutoff, checked.
+    """Validate the tables of a potential and of its cutoff.
 
     Raises:
-        InputError: tables that a system file could not hold.
+        InputError: the tables would not be valid in a system file.
     """
     try:
         made = schema.Interaction(
@@ -54,13 +54,13 @@ def interaction(potential: Mapping[str, Any], cutoff: Mapping[str, Any] | None) 
 
 
 def model_of(spec: schema.SystemSpec | schema.Interaction, atoms: Atoms, folder: Path) -> Any:
-    """The potential of some tables for atoms: a `CutPotential`, or one of many bodies.
+    """Create the potential of some tables for atoms: `CutPotential`, `Channels`, or a many-body potential.
 
     Args:
-        folder: where the files that the tables name are.
+        folder: folder of the files that the tables name.
 
     Raises:
-        InputError: a species for which there are no constants.
+        InputError: a species has no constants.
     """
     if isinstance(spec, schema.SystemSpec) and spec.terms is not None:
         tables = spec.interactions
@@ -88,14 +88,14 @@ def _pair_model(tables: schema.Interaction, atoms: Atoms, folder: Path, own: tup
 
 
 def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any] | None = None) -> Simulation:
-    """The objects of a system.
+    """Build a simulation from a system.
 
     Example:
         >>> mdnum.build("argon/liquid-864", {"cutoff.kind": "switched"})
 
     Args:
         system: a loaded system, a name or path to load, or a simulation, which is returned as it is.
-        overrides: as for `load`, where a name or path is given.
+        overrides: overrides as for `load`, if a name or path is given.
 
     Raises:
         InputError: the cutoff and skin do not fit the box, or the file cannot be run.
@@ -129,13 +129,14 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
 
 
 def again(folder: Path, given: Simulation | None = None) -> Simulation:
-    """The simulation that ran in a folder.
+    """Recreate the simulation that ran in a folder.
 
     Args:
-        given: needed where it was made of objects, of which a folder holds only what they were.
+        given: the simulation; required if it was made from objects, of which the folder holds only a
+            description.
 
     Raises:
-        InputError: it is needed, not needed, or another one than ran there.
+        InputError: `given` is required but missing, given but not required, or not the simulation that ran.
     """
     if not (folder / SIMULATION_FILE).is_file():
         if given is not None:

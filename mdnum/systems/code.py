@@ -1,4 +1,4 @@
-"""Code that a system file names: read where somebody said so, and never unasked."""
+"""Python code that a system file names: it is executed only with explicit permission."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _ALLOWED: ContextVar[bool] = ContextVar("allowed", default=False)
 
 @contextmanager
 def allow_code(allow: bool = True) -> Iterator[None]:
-    """In here the Python that a system file names is executed.
+    """Allow the execution of Python code that a system file names.
 
     Example:
         >>> mdnum.allow_code()
         >>> mdnum.run("mine.toml")  # its [potential] names mine.py:morse
 
     Args:
-        allow: False leaves it as it was.
+        allow: False keeps the current permission.
     """
     before = _ALLOWED.set(allow or _ALLOWED.get())
     try:
@@ -34,15 +34,15 @@ def allow_code(allow: bool = True) -> Iterator[None]:
 
 
 def is_allowed() -> bool:
-    """Whether code that a file names may be executed here."""
+    """Return True if code named by a file may be executed in this context."""
     return _ALLOWED.get()
 
 
 def parts(place: str, folder: Path) -> tuple[Path, str]:
-    """File and name of "mine.py:morse", in a folder.
+    """Split text such as "mine.py:morse" into the path of a file in a folder and a name.
 
     Raises:
-        InputError: it is not of that form.
+        InputError: the text does not have this form.
     """
     file, _, name = place.rpartition(":")
     if not file.endswith(".py") or not name.isidentifier():
@@ -51,13 +51,13 @@ def parts(place: str, folder: Path) -> tuple[Path, str]:
 
 
 def function(place: str, folder: Path) -> Callable[..., Any]:
-    """The function that a system file names; its file is executed.
+    """Execute the file that a system file names, and return the named function.
 
     Args:
-        place: "mine.py:morse", relative to folder.
+        place: text such as "mine.py:morse", relative to folder.
 
     Raises:
-        InputError: it is not allowed here, or the file has no such function or cannot be executed.
+        InputError: execution is not allowed, the file cannot be executed, or it has no such function.
     """
     file, name = parts(place, folder)
     if not is_allowed():

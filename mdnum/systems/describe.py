@@ -1,6 +1,6 @@
-"""What a simulation is, in words and numbers: for its folder, its digest, and what two of them differ in.
+"""Description of a simulation as plain tables: for its folder, its digest, and the comparison of simulations.
 
-The tables and keys are those of a system file, whether there was one or not.
+Tables and keys are those of a system file, even for simulations that were made from objects.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def program(simulation: Simulation) -> dict[str, Any]:
-    """Tables of plain values, ready for JSON: every number and choice of a simulation but its structure."""
+    """Return all numbers and choices of a simulation except its structure, as JSON-compatible tables."""
     rule, draw, policy = simulation.rule, simulation.draw, simulation.policy
     tables: dict[str, Any] = {
         "units": simulation.units.name,
@@ -58,7 +58,7 @@ def program(simulation: Simulation) -> dict[str, Any]:
 
 
 def described(simulation: Simulation) -> dict[str, Any]:
-    """What the objects of a simulation are, with its name and the digest of what step 0 is made of."""
+    """Describe the objects of a simulation, with its name and a digest of the state at step 0."""
     formula = simulation.structure.get_chemical_formula()
     return {
         "name": simulation.name,
@@ -69,7 +69,7 @@ def described(simulation: Simulation) -> dict[str, Any]:
 
 
 def write(simulation: Simulation, folder: Path) -> None:
-    """Write what a simulation is into a folder: its file's, or simulation.json and structure.extxyz."""
+    """Write a simulation into a folder: its system file, or simulation.json and structure.extxyz."""
     if simulation.file is not None:
         simulation.file.write(folder)
         return
@@ -82,7 +82,7 @@ def write(simulation: Simulation, folder: Path) -> None:
 
 
 def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The tables of two simulations that are to be compared: of their files where both have one."""
+    """Return comparable tables of two simulations: those of their files if both have one."""
     files = [one.origin.system for one in (a, b)]
     if a.file is not None and None not in files:
         first, second = (one.spec.model_dump(mode="json") for one in files if one is not None)
@@ -91,12 +91,12 @@ def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any
 
 
 def reduction_word(reduction: Any) -> str:
-    """The word of a system file for an order of sums; its numbers as Python writes them where it has none."""
+    """Return the word of a system file for a reduction, or its representation in Python."""
     return next((word for word, known in BY_NAME.items() if known == reduction), repr(reduction))
 
 
 def plain_leaf(leaf: Any) -> Any:
-    """A number, a list of a few, or the digest of many."""
+    """Return a number, a list of a few numbers, or the digest of many numbers."""
     array = np.asarray(leaf)
     if array.size == 1:
         return array.reshape(()).item()
@@ -106,7 +106,7 @@ def plain_leaf(leaf: Any) -> Any:
 
 
 def by_pair(simulation: Simulation, leaf: Any) -> Any:
-    """A number of each pair type: one where all are the same, else by pair of species."""
+    """Return one number if all pair types have the same value, else the values by pair of species."""
     values = np.asarray(leaf, np.float64)
     if len(set(values.tolist())) == 1:
         return float(values[0])
@@ -114,7 +114,7 @@ def by_pair(simulation: Simulation, leaf: Any) -> Any:
 
 
 def _start(simulation: Simulation) -> str:
-    """SHA-256 of what step 0 is made of."""
+    """Compute the SHA-256 digest of the state at step 0."""
     sums = hashlib.sha256()
     arrays = (
         simulation.structure.numbers, simulation.masses, simulation.positions, simulation.velocities,
@@ -127,7 +127,7 @@ def _start(simulation: Simulation) -> str:
 
 
 def _interactions(simulation: Simulation) -> dict[str, Any]:
-    """The tables of the potential and its cutoff, or one of several terms."""
+    """Return the tables of the potential and its cutoff, or of several terms."""
     model = simulation.model
     if not simulation.pairwise:
         known = {"kind": model.name, **_leaves(model)}
@@ -168,7 +168,7 @@ def _leaves(tree: Any) -> dict[str, Any]:
 
 
 def _code(function: Any) -> dict[str, Any]:
-    """The text of a function that a person wrote, and its digest; where there is no text, its code's."""
+    """Return the source of a user's function and its digest; without source, the digest of its bytecode."""
     if function is None:
         return {}
     try:

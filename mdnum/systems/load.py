@@ -1,4 +1,4 @@
-"""Where system files are, shipped ones by name, a person's own by path; and what comes of reading one."""
+"""Locating system files (shipped files by name, a user's files by path), and loading them."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ BALL_SCHEMA = "ball-schema.json"
 
 
 def shipped_folder(kind: Literal["systems", "demos"] = "systems") -> Path:
-    """The folder of shipped files: the packaged copy, else the repository's (editable installs)."""
+    """Return the folder of shipped files: the packaged copy, or the repository's for editable installs."""
     package = Path(str(importlib.resources.files("mdnum")))
     packaged = package / f"_{kind}"
     return packaged if packaged.is_dir() else package.parent / kind
 
 
 def names(world: Literal["md", "ball"] | None = None) -> list[str]:
-    """Names of the shipped systems, such as "argon/liquid-864".
+    """Return the names of the shipped systems, such as "argon/liquid-864".
 
     Args:
-        world: only those of this world.
+        world: "md" or "ball" to return only the systems of this world.
     """
     root = shipped_folder()
     found = list(root.glob("*/*.toml"))
@@ -53,10 +53,10 @@ def names(world: Literal["md", "ball"] | None = None) -> list[str]:
 
 
 def world_of(name: Any) -> str:
-    """ "md" or "ball", of a system or simulation, or read from a file unchecked; "md" where that is no TOML.
+    """ Return the world, "md" or "ball", of an object or an unvalidated file; "md" if the file is not TOML.
 
     Raises:
-        InputError: nothing of that name.
+        InputError: no system has this name.
     """
     if not isinstance(name, str | Path):
         return "ball" if isinstance(name, BallSystem) else "md"
@@ -72,10 +72,10 @@ def _world(path: Path) -> str:
 
 
 def find(name: str | Path) -> tuple[str, Path]:
-    """Name and file of a system: a path to a TOML file, a folder that holds system.toml, or a shipped name.
+    """Find the name and file of a system: a TOML file, a folder that contains system.toml, or a shipped name.
 
     Raises:
-        InputError: nothing of that name; says the nearest shipped one.
+        InputError: no system has this name; the message suggests the most similar shipped name.
     """
     expect_path(name, "Give a shipped name, the path of a system file or its folder, or a loaded system")
     path = Path(name)
@@ -107,7 +107,7 @@ def find(name: str | Path) -> tuple[str, Path]:
 
 
 def shown(path: Path) -> str:
-    """A path as a message names it: from here where it is below here."""
+    """Return a path for messages: relative to the working directory if it is inside."""
     try:
         return str(path.resolve().relative_to(Path.cwd()))
     except ValueError:
@@ -115,7 +115,7 @@ def shown(path: Path) -> str:
 
 
 def _made(folder: str | Path) -> Path:
-    """A folder, made where it is missing."""
+    """Create a folder if it is missing, and return its path."""
     target = Path(folder)
     with disk_errors(target):
         target.mkdir(parents=True, exist_ok=True)
@@ -124,14 +124,14 @@ def _made(folder: str | Path) -> Path:
 
 @dataclass(frozen=True)
 class System:
-    """A checked system: what a file says, with the atoms it means.
+    """A validated system: the tables of a file, and the atoms that they describe.
 
     Attributes:
-        name: such as "argon/liquid-864".
-        spec: the file's tables, defaults filled in.
-        path: the file, or None.
-        atoms: positions in the file's unit of length; momenta in ASE's units (reduced units for lj) when the
-            structure has velocities, else none, and velocities are drawn at the start of a run.
+        name: name of the system, such as "argon/liquid-864".
+        spec: tables of the file, with defaults filled in.
+        path: path of the file, or None.
+        atoms: positions in the file's unit of length; momenta in ASE's units (reduced units for lj) if the
+            structure has velocities; otherwise velocities are drawn at the start of a run.
     """
 
     name: str
@@ -141,12 +141,12 @@ class System:
 
     @property
     def units(self) -> unit_systems.Units:
-        """The unit system."""
+        """Unit system of the file."""
         return unit_systems.get(self.spec.units)
 
     @property
     def folder(self) -> Path:
-        """Where the files the system names are looked for."""
+        """Folder of the files that the system names."""
         return self.path.parent if self.path else Path()
 
     @property
@@ -156,30 +156,30 @@ class System:
 
     @property
     def draw(self) -> structures.Draw:
-        """How the velocities of step 0 are made."""
+        """How the velocities of step 0 are created."""
         dynamics, drawn = self.spec.dynamics, not self.atoms.has("momenta")
         return structures.Draw(float(dynamics.temperature), dynamics.seed, dynamics.remove_drift, drawn)
 
     @property
     def without_skin(self) -> System:
-        """The same with a list that asks the box for no room."""
+        """The same system with a list whose skin is 0, for small boxes."""
         neighbors = self.spec.neighbors.model_copy(update={"skin": 0.0})
         return replace(self, spec=self.spec.model_copy(update={"neighbors": neighbors}))
 
     @property
     def ignored(self) -> list[str]:
-        """Columns of the structure's file that look like velocities, where none of it are read."""
+        """Structure file columns that look like velocities, unless any velocities are read from it."""
         structure = self.spec.structure
         return structures.ignored(structure, self.folder) if structure.velocities == "file" else []
 
     @property
     def r_cut(self) -> float:
-        """The longest interaction (length)."""
+        """Longest interaction radius (length)."""
         return pairs.longest_radius(self.spec, self.species, self.folder)
 
     @property
     def program(self) -> dict[str, Any]:
-        """Every number and choice but the structure, plain values: what is hashed."""
+        """All numbers and choices except the structure, as plain values, for hashing."""
         made = self.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
         if made.get("terms") is None:
             made.pop("terms", None)
@@ -189,7 +189,7 @@ class System:
         return made
 
     def _potentials(self, data: dict[str, Any]) -> list[tuple[dict[str, Any], Any]]:
-        """The table of each potential in the tables of the file, with what it was read as."""
+        """Return the table of each potential in the file's tables, with its validated model."""
         tables = {"": data} if self.spec.terms is None else data["terms"]
         return [(tables[name]["potential"], one.potential) for name, one in self.spec.interactions.items()]
 
@@ -200,16 +200,16 @@ class System:
 
     @property
     def tables(self) -> set[Path]:
-        """Files the potential reads, or executes."""
+        """Files that the potential reads or executes."""
         return {file for one in self.spec.interactions.values() for file in self._files(one.potential)}
 
     def to_toml(self, *, beside: bool = True) -> str:
-        """The system file with every default written out.
+        """Return the text of the system file with every default written out.
 
         Args:
-            beside: for the folder that write() makes: it refers to the structure that is put beside it, and
-                loading it there gives this system again, bit for bit. Otherwise it refers to the files that
-                this system was read from, wherever it is saved.
+            beside: True for the folder that write() creates: the text refers to the structure file in this
+                folder, and loading it there recreates the system bit for bit. If False, the text refers to
+                the original files of this system by absolute paths.
         """
         spec = self.spec.model_dump(mode="python", exclude_none=True)
         structure = spec["structure"]
@@ -229,7 +229,7 @@ class System:
         return toml.dump({"name": self.name, **spec})
 
     def write(self, folder: str | Path) -> Path:
-        """Write system.toml, structure.extxyz and the potential's tables; returns the TOML file's path."""
+        """Write system.toml, structure.extxyz and the potential's tables; return system.toml's path."""
         target = _made(folder)
         with disk_errors(target):
             for table in self.tables:
@@ -244,13 +244,13 @@ class System:
 
 @dataclass(frozen=True)
 class BallSystem:
-    """A checked system of the ball.
+    """A validated system of the ball.
 
     Attributes:
-        name: such as "ball/drop".
-        spec: the file's tables, defaults filled in.
-        path: the file, or None.
-        variants: the file with some keys changed (spec.variants says which), by name, each checked like it.
+        name: name of the system, such as "ball/drop".
+        spec: tables of the file, with defaults filled in.
+        path: path of the file, or None.
+        variants: validated tables with some keys changed (listed in spec.variants), by name of the variant.
     """
 
     name: str
@@ -260,20 +260,20 @@ class BallSystem:
 
     @property
     def program(self) -> dict[str, Any]:
-        """Every number and choice, plain values: what is hashed."""
+        """All numbers and choices, as plain values, for hashing."""
         return self.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
 
     @property
     def balls(self) -> int:
-        """How many balls there are."""
+        """Number of balls in the system."""
         return self.spec.balls
 
     def against(self, changes: Mapping[str, Any], name: str | None = None) -> BallSystem:
-        """This system with one more variant.
+        """Return this system with an additional variant.
 
         Args:
             changes: dotted keys to values; text is read as TOML would read it.
-            name: what to call the variant; default the changes themselves.
+            name: name of the variant; default the text of the changes.
 
         Raises:
             InputError: the variant cannot be run, or its name is taken.
@@ -288,10 +288,11 @@ class BallSystem:
         return BallSystem(self.name, spec, self.path, {**self.variants, name: variant})
 
     def for_steps(self, steps: int) -> BallSystem:
-        """This system with another number of steps; a control given by values is cut, or keeps its last.
+        """Return this system with another number of steps; control values are cut, or the last one is
+        repeated.
 
         Args:
-            steps: of a run, at least 1.
+            steps: number of steps of a run, at least 1.
         """
         update: dict[str, Any] = {
             "integrator": self.spec.integrator.model_copy(update={"steps": steps}),
@@ -306,21 +307,21 @@ class BallSystem:
         return replace(self, spec=self.spec.model_copy(update=update))
 
     def to_toml(self, *, beside: bool = True) -> str:
-        """The system file with every default written out; a ball has no other files to be beside."""
+        """Return the text of the system file with every default written out; `beside` has no effect."""
         return toml.dump({"name": self.name, **self.spec.model_dump(exclude_none=True)})
 
     def write(self, folder: str | Path) -> Path:
-        """Write system.toml; returns its path."""
+        """Write system.toml; return its path."""
         path = _made(folder) / SYSTEM_FILE
         write_text(path, self.to_toml())
         return path
 
 
 def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> BallSpec:
-    """The system with keys changed, checked.
+    """Return the tables of a system with some keys changed, after validation.
 
     Raises:
-        InputError: it cannot be run.
+        InputError: the changed system cannot be run.
     """
     if not changes:
         raise InputError(
@@ -357,10 +358,10 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
 
 
 def copy(name: str | Path, folder: str | Path) -> Path:
-    """Copy a shipped system, its structure and its tables, to edit; returns the copied system file.
+    """Copy a shipped system, its structure and its tables, for editing; return the copied system file.
 
     Raises:
-        InputError: no such system, or a file of that name is there already.
+        InputError: the system does not exist, or a file of the same name exists already.
     """
     system: System | BallSystem = load(name)
     if system.path is None:
@@ -407,22 +408,22 @@ def load(
     *,
     world: Literal["md", "ball"] | None = None,
 ) -> System | BallSystem:
-    """A system by name or path, checked: a System, or a BallSystem where the file says `world = "ball"`.
+    """Load and validate a system by name or path: a System, or a BallSystem if the file has `world = "ball"`.
 
     Example:
         >>> mdnum.load("argon/liquid-864").spec.cutoff.kind
         'hard'
 
     Args:
-        name: a shipped name, a path to a TOML file, a folder that holds system.toml, or a loaded system,
-            which is returned as it is.
-        overrides: dotted key to value, as `--set` gives them: `{"cutoff.kind": "switched"}`; text is read as
-            TOML would read it. Changing a kind drops the file's keys that the new kind does not have;
-            changing the temperature or seed of an NVE run draws its velocities anew.
-        world: refuse systems of the other world.
+        name: a shipped name, a path to a TOML file, a folder that contains system.toml, or a loaded system,
+            which is returned unchanged.
+        overrides: dotted key to value, as given by `--set`: `{"cutoff.kind": "switched"}`; text is parsed as
+            a TOML value. A changed kind removes keys that the new kind does not have; a changed temperature
+            or seed of an NVE run draws new velocities.
+        world: "md" or "ball" to reject systems of the other world.
 
     Raises:
-        InputError: anything that cannot be run, in one line.
+        InputError: the system cannot be run; the message is one line.
     """
     if isinstance(name, System | BallSystem):
         if overrides:
@@ -504,7 +505,7 @@ def _ball(spec: BallSpec, source: Source) -> BallSystem:
 
 
 def json_schema(file: str) -> dict[str, Any]:
-    """The JSON schema of system files that editors use, schema.json or BALL_SCHEMA."""
+    """Return the JSON schema of system files for editors, of schema.json or BALL_SCHEMA."""
     root, title = (BallSpec, " of the ball") if file == BALL_SCHEMA else (schema.SystemSpec, "")
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

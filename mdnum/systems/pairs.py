@@ -1,4 +1,4 @@
-"""Constants and cutoff radii of every pair of species, by pair type; and the longest interaction.
+"""Constants and cutoff radii of every pair of species, by pair type, and the longest interaction radius.
 
 A system file gives one set of constants, or one per pair of species. No mixing rule is applied: a structure
 with several species must list every pair, so that a forgotten cross term is an error and not a guess.
@@ -21,7 +21,7 @@ Table = Float64[np.ndarray, "types"]
 
 
 def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> dict[str, Table]:
-    """Each constant of a pair potential for every pair of species.
+    """Return each constant of a pair potential for every pair of species.
 
     Args:
         spec: a system with a pair potential.
@@ -58,11 +58,11 @@ def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> 
 
 
 def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tuple[Table, Table | None]:
-    """Cutoff radius and onset for every pair of species.
+    """Return cutoff radius and onset for every pair of species.
 
     Returns:
-        radius and onset, as `pair_constants` has them; onset is None for a cutoff without one. Pairs with a
-        radius of their own keep the ratio onset / radius.
+        radius and onset, in the order of `pair_constants`; the onset is None for a cutoff that does not
+        switch. Pairs with a separate radius keep the ratio onset / radius.
 
     Raises:
         InputError: a pair of species has no radius.
@@ -93,7 +93,7 @@ def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tu
 
 
 def longest_radius(spec: SystemSpec, species: tuple[str, ...], folder: Path) -> float:
-    """The distance beyond which no pair of atoms interacts directly (length)."""
+    """Return the distance (length) beyond which no pair of atoms interacts directly."""
     potential = spec.potential
     if potential is None or isinstance(potential, schema.PairPotentialTable):
         longest = 0.0
@@ -107,10 +107,10 @@ def longest_radius(spec: SystemSpec, species: tuple[str, ...], folder: Path) -> 
 def many_body(
     potential: Any, species: Sequence[str], folder: Path, pbc: tuple[bool, bool, bool] = (True, True, True)
 ) -> Any:
-    """The many-body potential of a table, a `ManyBody`.
+    """Create the many-body potential (a `ManyBody`) that a table describes.
 
     Raises:
-        InputError: its constants are not those of these species, or its file cannot be used.
+        InputError: the table has no constants for these species, or its file cannot be used.
     """
     from mdnum.md import embedded_atom, tetrahedral
 

@@ -97,8 +97,7 @@ class PairPotentialTable(TomlTable):
 
 
 def _pair_table(name: str, kind: str, row: type[TomlTable], description: str) -> Any:
-    """Create the table of a potential whose constants are given once, or in a row for each pair of species.
-    """
+    """Create a potential's table, with constants given once or for each pair of species."""
     columns: dict[str, Any] = {"kind": (Literal[kind], ...)}
     for key, field in row.model_fields.items():
         value: Any = Annotated[field.annotation, *field.metadata]

@@ -1,4 +1,4 @@
-"""Structures: reading or building one, checking that it can be simulated, writing it without losing a bit."""
+"""Structures: reading or building, validation for a simulation, and writing without loss of a bit."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _SMALLEST_IN_SIGMA = 0.4
 
 @dataclass(frozen=True)
 class Draw:
-    """How the velocities of step 0 are made, unless the structure has them."""
+    """How the velocities of step 0 are created, unless the structure contains velocities."""
 
     temperature: float  # Maxwell-Boltzmann's, and a thermostat's, in the unit of the simulation
     seed: int = 0  # of the draw and of a thermostat's noise
@@ -46,10 +46,10 @@ class Draw:
     def velocities(
         self, masses: Float64[np.ndarray, " atoms"], units: Units, own: Float64[np.ndarray, "atoms 3"] | None
     ) -> Float64[np.ndarray, "atoms 3"]:
-        """Velocities of step 0, length per internal time.
+        """Return the velocities of step 0, length per internal time.
 
         Args:
-            own: the structure's, or None for a draw.
+            own: velocities of the structure, or None to draw velocities.
         """
         velocities = own
         if velocities is None:
@@ -61,18 +61,18 @@ class Draw:
 
 
 def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, folder: Path) -> Atoms:
-    """The atoms a [structure] table describes, in float64, with nothing attached.
+    """Create the atoms that a [structure] table describes, in float64, without a calculator or constraints.
 
     Args:
-        structure: the table.
-        units: "metal" or "lj"; in lj every mass is 1 unless given.
-        folder: where structure.file is looked for.
+        structure: the structure table.
+        units: "metal" or "lj"; in "lj" every mass is 1 unless given.
+        folder: folder of structure.file.
 
     Returns:
-        atoms with positions, cell, pbc, masses where they differ from ASE's, momenta where the file has them.
+        atoms with positions, cell, pbc, masses if they differ from ASE's, and momenta if the file has them.
 
     Raises:
-        InputError: a missing or unreadable file, an unknown symbol, constraints.
+        InputError: the file is missing or unreadable, a symbol is unknown, or there are constraints.
     """
     from ase import Atoms
 
@@ -94,7 +94,7 @@ def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, 
 
 
 def species_of(atoms: Atoms) -> tuple[tuple[str, ...], Int64[np.ndarray, " atoms"]]:
-    """Chemical symbols present, sorted, and each atom's place among them."""
+    """Return the chemical symbols present, sorted, and the index of each atom's symbol."""
     from ase.data import chemical_symbols
 
     numbers, place = np.unique(atoms.numbers, return_inverse=True)
@@ -104,7 +104,7 @@ def species_of(atoms: Atoms) -> tuple[tuple[str, ...], Int64[np.ndarray, " atoms
 
 
 def ignored(structure: schema.FileStructure | schema.BuilderStructure, folder: Path) -> list[str]:
-    """Columns of a structure's file that look like velocities and are not read as such."""
+    """Return the columns of a structure file that look like velocities but are not read as velocities."""
     if isinstance(structure, schema.BuilderStructure):
         return []
     return ignored_velocities(_read(folder / structure.file, structure.index).arrays)
@@ -192,16 +192,17 @@ def _set_masses(
 
 
 def check(atoms: Atoms, r_cut: float, skin: float, smallest: float, length: str) -> None:
-    """Refuse a structure that cannot be simulated.
+    """Raise an error if a structure cannot be simulated.
 
     Args:
-        r_cut: longest interaction (length).
-        skin: of the Verlet list (length).
-        smallest: atoms closer than this are a mistake (length).
+        r_cut: longest interaction radius (length).
+        skin: skin of the Verlet list (length).
+        smallest: distance below which two atoms must be a mistake (length).
         length: name of the unit of length, for messages.
 
     Raises:
-        InputError: non-finite numbers, a missing cell vector, a box too small for r_cut + skin, overlaps.
+        InputError: a number is not finite, a cell vector is missing, the box is too small for r_cut + skin,
+            or atoms overlap.
     """
     from mdnum.md.cell import Cell
 
@@ -230,7 +231,7 @@ def _check_finite(atoms: Atoms) -> None:
 
 
 def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
-    """Refuses coordinates whose own last digit is too coarse for distances to be told from them."""
+    """Raise an error if coordinates are so large that their rounding spoils distances."""
     farthest = _FARTHEST * r_cut
     places = np.abs(atoms.positions).max(axis=1)
     if (places > farthest).any():
@@ -268,12 +269,12 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
 
 
 def repeats(cell: Cell, r_list: float) -> str:
-    """How often a box must be repeated along a, b and c for one image to be enough."""
+    """Return how often a box must be repeated along a, b and c for the minimum image to be sufficient."""
     return " x ".join(str(max(1, math.ceil(2 * r_list / width))) for width in cell.widths)
 
 
 def smallest_distance(kind: str, units: str, sigmas: Sequence[float] = ()) -> float:
-    """Atoms closer than this are a mistake in a structure with this potential (and its sigmas), length."""
+    """Return the distance (length) below which two atoms with this potential and sigma must be a mistake."""
     if kind == "soft-sphere":
         # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
         return 1e-9
@@ -307,7 +308,7 @@ def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> No
 def _nearest(
     atoms: Atoms, within: float
 ) -> tuple[Float64[np.ndarray, " atoms"], Int64[np.ndarray, " atoms"], int]:
-    """Of each atom the nearest other one within a distance, over periodic faces, and how many such pairs."""
+    """Find the nearest periodic neighbor of each atom within a distance, and the number of such pairs."""
     from scipy.spatial import KDTree
 
     count = len(atoms)
@@ -322,7 +323,7 @@ def _nearest(
 
 
 def nearest_distance(atoms: Atoms, within: float) -> float:
-    """The distance of the closest pair of atoms, or `within` where none is as close."""
+    """Return the distance of the closest pair of atoms, or `within` if no pair is as close."""
     from scipy.spatial import KDTree
 
     places, _ = with_images(atoms, within)
@@ -333,7 +334,7 @@ def nearest_distance(atoms: Atoms, within: float) -> float:
 def with_images(
     atoms: Atoms, reach: float
 ) -> tuple[Float64[np.ndarray, "places 3"], Int64[np.ndarray, " places"]]:
-    """Positions in the box, then their images out to twice the reach beyond its faces; whose each is."""
+    """Return wrapped positions and images up to twice the reach beyond the faces, with the atom of each."""
     from mdnum.md.cell import complete
 
     cell = complete(atoms.cell.array, atoms.pbc)
@@ -363,7 +364,7 @@ _LONGEST_HEAD = 1000
 
 
 def _from_extxyz(path: Path) -> Atoms | None:
-    """The atoms of a file that is just as `to_extxyz` writes it; None of any other, which is left to ASE."""
+    """Read atoms from a file in the exact format of `to_extxyz`; return None for any other file."""
     from ase import Atoms
     from pyarrow import ArrowInvalid, csv
 
@@ -401,11 +402,11 @@ def _from_extxyz(path: Path) -> Atoms | None:
 
 
 def to_extxyz(atoms: Atoms, names: Sequence[str] = ("momenta", "masses")) -> str:
-    """Extended XYZ text that gives every float64 back bit for bit (ase's own writer keeps 8 decimals).
+    """Write extended XYZ text that preserves every float64 bit for bit (ASE's own writer keeps 8 decimals).
 
     Args:
-        atoms: any.
-        names: of the arrays that are written beside symbols and positions, where the atoms have them.
+        atoms: any atoms.
+        names: names of arrays to write in addition to symbols and positions, if the atoms have them.
     """
     import pyarrow as pa
     from ase.data import chemical_symbols

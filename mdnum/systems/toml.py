@@ -1,9 +1,9 @@
-"""System files as text and as tables: reading with errors that name the line, writing, messages, overrides.
+"""System files as text and tables: reading with line numbers in errors, writing, messages, and overrides.
 
-The standard library reads TOML but neither writes it nor remembers where a key stood; both are small for the
-tables a system file holds. A table whose keys depend on its kind is a union of pydantic models told apart by
-a key such as `kind` or `rule`; `models` follows a key through such unions. Mistakes become one line: what was
-seen and expected, and where.
+The standard library reads TOML, but does not write TOML or record the position of keys; both are simple for
+the tables of a system file. A table whose keys depend on its kind is a union of pydantic models, selected by
+a key such as `kind` or `rule`; `models` follows a key through such unions. Errors become one line: what was
+found, what was expected, and where.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ _PART = re.compile(r"""\s*(?:"((?:[^"\\]|\\.)*)"|'([^']*)'|([A-Za-z0-9_-]+))\s*"
 
 
 def parse(text: str, where: str | Path) -> dict[str, Any]:
-    """The tables in a TOML text.
+    """Parse a TOML text into tables.
 
     Raises:
-        InputError: not TOML; names the line and shows it.
+        InputError: the text is not TOML; the message names and shows the line.
     """
     try:
         tables = tomllib.loads(text)
@@ -69,9 +69,9 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
 
 
 def scalar(text: str) -> Any:
-    """A value from the command line, read as TOML would read it, or as plain text where that fails.
+    """Parse a value from the command line as a TOML value, or as plain text if this fails.
 
-    `switched` and `"switched"` are the same; `0.5` is a number, `true` a truth value, `[2, 2, 2]` an array.
+    `switched` and `"switched"` are equivalent; `0.5` is a number, `true` a Boolean, `[2, 2, 2]` an array.
     """
     try:
         parsed = tomllib.loads(f"value = {text}")
@@ -81,7 +81,7 @@ def scalar(text: str) -> Any:
 
 
 def _is_deep(value: Any) -> bool:
-    """Whether tables and arrays hold one another more often than anybody writes down."""
+    """Return True if tables and arrays are nested more deeply than in any reasonable file."""
     level = [value]
     for _ in range(_DEEPEST):
         level = [
@@ -96,10 +96,10 @@ def _is_deep(value: Any) -> bool:
 
 
 def dotted(text: str) -> Key:
-    """The parts of a dotted key such as `potential.pairs.Ni-P.sigma`.
+    """Split a dotted key such as `potential.pairs.Ni-P.sigma` into its parts.
 
     Raises:
-        InputError: not a dotted key.
+        InputError: the text is not a dotted key.
     """
     parts, end = _dotted_prefix(text)
     if not parts or end != len(text):
@@ -124,7 +124,7 @@ def _dotted_prefix(text: str) -> tuple[Key, int]:
 
 
 def line_of(text: str, key: Key) -> int | None:
-    """The line (from 1) at which a key is set, else the line of the nearest table around it, else None."""
+    """Return the line (from 1) that sets a key, else the line of the nearest enclosing table, else None."""
     best: tuple[int, int] | None = None
     table: Key = ()
     for number, line in enumerate(text.splitlines(), start=1):
@@ -144,9 +144,10 @@ def line_of(text: str, key: Key) -> int | None:
 
 
 def dump(tables: Mapping[str, Any]) -> str:
-    """TOML text of nested tables; None means absent, floats keep every bit.
+    """Return TOML text of nested tables; None means absent, and floats keep every bit.
 
-    Scalars come first in each table, as TOML asks, of them the kind or rule; empty tables are left out.
+    In each table, scalars come first, as TOML requires, beginning with the kind or rule; empty tables are
+    omitted.
     """
     lines: list[str] = []
     _dump_table((), tables, lines)
@@ -199,17 +200,18 @@ _LARGEST_INT = 2**62
 
 
 def loaded(registry: str) -> Any:
-    """The registry at "module:attribute", whose module may be a slow one."""
+    """Import the registry at "module:attribute", whose module may be slow to import."""
     module, _, attribute = registry.partition(":")
     return getattr(importlib.import_module(module), attribute)
 
 
 class Named:
-    """A name of a registry, perhaps with an argument; checked where a file gives one.
+    """Type annotation for a name from a registry, possibly with an argument; validated in files.
 
     Args:
-        registry: "module:attribute"; imported when a name is checked, because the module may be a slow one.
-        others: further words that are allowed.
+        registry: "module:attribute"; imported for the first validation, because the module may be slow to
+            import.
+        others: further allowed words.
     """
 
     def __init__(self, registry: str, *others: str):
@@ -240,7 +242,7 @@ class Named:
 
 
 class TomlTable(BaseModel):
-    """Base of every table: frozen, strict, no unknown keys, finite numbers only."""
+    """Base class of all tables: frozen, strict, no unknown keys, finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -264,17 +266,17 @@ class TomlTable(BaseModel):
 
     @staticmethod
     def foreign_keys(table: Mapping[str, Any]) -> set[str]:
-        """Keys without a meaning for the kind that a table names."""
+        """Return the keys that do not apply to the kind in a table."""
         return set()
 
 
 def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
-    """The error of a table that cannot be run, with the dotted key at fault."""
+    """Create the error for a table that cannot be run, with the dotted key at fault."""
     return PydanticCustomError("unusable", "{said}", {"said": message, "remedy": remedy, "key": key})
 
 
 def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
-    """Models that the table at a key may have, that of the kind which data names first; none of a value."""
+    """Return possible models of the table at a key, that of the kind in data first; empty for a value."""
     found, table = [root], data
     for part in key:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}
@@ -295,7 +297,7 @@ def _models_in(annotation: Any) -> Iterator[type[TomlTable]]:
 
 
 def _chosen(options: Sequence[type[TomlTable]], table: Any) -> type[TomlTable] | None:
-    """Of the models of a union the one that a table is meant for."""
+    """Select the model of a union for a table."""
     tag = _tag_of(options)
     given = table.get(tag) if tag and isinstance(table, Mapping) else None
     if tag and isinstance(given, str):
@@ -309,7 +311,7 @@ def _chosen(options: Sequence[type[TomlTable]], table: Any) -> type[TomlTable] |
 
 
 def _tag_of(options: Sequence[type[TomlTable]]) -> str | None:
-    """The key that tells the models of a union apart, or None."""
+    """Return the key that distinguishes the models of a union, or None."""
     keys = {name for model in options for name in model.model_fields}
     return next((name for name in ("kind", "rule") if name in keys), None)
 
@@ -320,7 +322,7 @@ def _literals(model: type[TomlTable], name: str) -> tuple[Any, ...]:
 
 
 def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as one, by dotted keys."""
+    """Flatten nested tables into one table with dotted keys."""
     rows: dict[str, Any] = {}
     for key, value in table.items():
         rows |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
@@ -360,7 +362,7 @@ class Source:
     values: Mapping[Key, Any] = field(default_factory=dict)  # overrides, by key
 
     def place(self, key: Key) -> str:
-        """The file with line, or the override, that a key came from."""
+        """Return the file and line, or the override, that set a key."""
         if any(key[: len(given)] == given for given in self.values):
             return f"--set {'.'.join(key)}"
         number = line_of(self.text, key) if key else None
@@ -375,10 +377,10 @@ Root = TypeVar("Root", bound=TomlTable)
 
 
 def checked(root: type[Root], data: Mapping[str, Any], source: Source) -> Root:
-    """The tables of a file as their model.
+    """Validate the tables of a file and return their model.
 
     Raises:
-        InputError: what the model refuses, in one line for the most telling mistake.
+        InputError: the model rejects the tables; the message is one line about the most informative mistake.
     """
     try:
         return root.model_validate(data)
@@ -406,7 +408,7 @@ def checked(root: type[Root], data: Mapping[str, Any], source: Source) -> Root:
 
 
 def _place(detail: Any, root: type[TomlTable], data: Mapping[str, Any]) -> Key:
-    """The dotted key that a mistake is about."""
+    """Return the dotted key that a validation error refers to."""
     key: Key = ()
     tag_follows = False
     for part in detail["loc"]:
@@ -493,20 +495,20 @@ _RIVALS: dict[Key, tuple[str, ...]] = {
 
 
 def read_overrides(overrides: Mapping[str, Any] | None) -> dict[Key, Any]:
-    """Dotted keys to values; text is read as TOML would read it.
+    """Parse overrides from dotted keys to values; text is parsed as a TOML value.
 
     Raises:
-        InputError: a key that is none.
+        InputError: a key is not a dotted key.
     """
     changes = {dotted(key): value for key, value in (overrides or {}).items()}
     return {key: scalar(value) if isinstance(value, str) else value for key, value in changes.items()}
 
 
 def apply_overrides(data: dict[str, Any], values: Mapping[Key, Any], root: type[TomlTable]) -> None:
-    """Put values into the tables, and drop the keys of another kind than the one they choose.
+    """Put override values into the tables, and remove keys that do not apply to a newly chosen kind.
 
     Raises:
-        InputError: a key below one that is a value and no table.
+        InputError: a key lies below a key that holds a value instead of a table.
     """
     for key, value in values.items():
         table = data

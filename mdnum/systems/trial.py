@@ -1,7 +1,7 @@
-"""An energy function called at one configuration, over lists that are the same in other words.
+"""Trial calls of an energy function at one configuration, over equivalent lists.
 
-One program gives energy and derivatives, another the energy alone over a list with more padding; both are
-compiled in a hurry, for the few dozen calls that it takes to find out what a function is (`admission`).
+One program computes energy and derivatives, another only the energy, over a list with more padding. Both are
+compiled with few optimizations, because classifying a function takes only a few dozen calls (`admission`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MORE = 8
 
 
 class AdmissionError(InputError):
-    """An energy function cannot be simulated as it is; `code` says why, `values` with which numbers."""
+    """Error for an energy function that cannot be simulated; `code` is the reason, `values` its numbers."""
 
     def __init__(self, code: str, name: str, **values: Any):
         entry = _TEXTS[code]
@@ -43,16 +43,17 @@ class AdmissionError(InputError):
 
 
 class Trial:
-    """An energy function at one configuration, in the order of the structure.
+    """Trial of an energy function at one configuration, with atoms in the order of the structure.
 
     Args:
-        atoms: number of atoms that are tried, those closest to the first one, in the box of all.
+        atoms: number of atoms in the trial: those closest to the first atom, in the box of the whole
+            structure.
 
     Attributes:
-        model: the function as far as it is known.
-        notes: what should be known about it, values by code.
-        scale: size of the energy, once it is known.
-        idx, inside: neighbors within cutoff and skin, and within the cutoff, as wide as the fullest row.
+        model: the energy function with the properties found so far.
+        notes: notes on the function: values by code.
+        scale: magnitude of the energy, once known.
+        idx, inside: neighbors within cutoff and skin, and within the cutoff; as wide as the fullest row.
     """
 
     def __init__(self, simulation: Simulation, atoms: int):
@@ -87,22 +88,22 @@ class Trial:
         self._compile()
 
     def error(self, code: str, **values: Any) -> AdmissionError:
-        """Why it cannot be simulated."""
+        """Create the error that explains why the function cannot be simulated."""
         return AdmissionError(code, self.model.name, **values)
 
     @property
     def call(self) -> Call:
-        """The function with the convention that is known so far."""
+        """The function with the calling convention found so far."""
         return self.model.call
 
     def learn(self, **found: Any) -> None:
-        """Keep what was found of its convention."""
+        """Store properties of the calling convention."""
         self.model = replace(self.model, function=replace(self.call, how=replace(self.call.how, **found)))
 
     # --- the programs ---------------------------------------------------------------------------------
 
     def _lists(self) -> None:
-        """The format of its own list, whether that lists atoms themselves, and its parameters."""
+        """Find the format of the function's own list, whether atoms list themselves, and the parameters."""
         model, lists, own = self.model, self.model.lists, None
         if lists is not None:
             for x in (self.x / self.call.length, self.x @ np.linalg.inv(self.cell)):
@@ -129,7 +130,7 @@ class Trial:
             self.model = replace(model, parameters=model.start(key, x, own))
 
     def bare(self, parameters, x, idx, real, cell, box, strain, code):
-        """The function's own energy, of positions and a box in its own terms."""
+        """Return the function's own energy, for positions and a box in the function's own convention."""
         call, model = self.call, self.model
         neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
         if call.how.images:
@@ -137,7 +138,7 @@ class Trial:
         return call.bare(parameters, x, neighbor, {"cell": cell, "box": box, "perturbation": strain})
 
     def arguments(self, idx=None, x=None, cell=None, code=0) -> tuple[Any, ...]:
-        """Of `bare`, at real positions in a box, by the convention that is known so far."""
+        """Return the arguments of `bare` for real positions in a box, by the convention found so far."""
         call, how = self.call, self.call.how
         idx, x, cell = (
             own if one is None else one for one, own in ((idx, self.inside), (x, self.x), (cell, self.cell))
@@ -150,7 +151,7 @@ class Trial:
         return (self.model.parameters, *map(jnp.asarray, given))
 
     def _compile(self) -> None:
-        """Find a format, keywords and a result that fit, and compile energy and derivatives."""
+        """Find a format, keywords and a result that work, and compile energy and derivatives."""
         formats = FORMATS if self.model.format == "any" else (self.model.format,)
         words, failed = self.call.how.keywords, ""
         # a space of jax-md may raise at a keyword that the function passes on
@@ -171,7 +172,7 @@ class Trial:
         raise self.error("NOT_CALLABLE", error=failed, tried=", ".join(formats))
 
     def _returned(self) -> str:
-        """What it returns, as `Convention.returns`."""
+        """Return the kind of the function's result, as defined by `Convention.returns`."""
         shape = jax.tree.map(lambda one: one.shape, jax.eval_shape(self.bare, *self.arguments()))
         one = ((), (1,))
         if isinstance(shape, Mapping):
@@ -184,13 +185,13 @@ class Trial:
 
     @cached_property
     def _alone(self) -> tuple[Any, Any]:
-        """The energy's program, over a list with more padding; and as it was traced."""
+        """Compiled program for the energy over a list with more padding, and its traced operations."""
         traced = jax.jit(self.bare).trace(*self.arguments(self._padded(self.inside)))
         return _quick(traced), traced.jaxpr
 
     @property
     def jaxpr(self) -> Any:
-        """The operations of the energy."""
+        """Traced operations of the energy."""
         return self._alone[1]
 
     def _padded(self, idx) -> Int[np.ndarray, "atoms slots"]:
@@ -199,7 +200,7 @@ class Trial:
     # --- calling it -----------------------------------------------------------------------------------
 
     def there(self, x=None, idx=None, cell=None, code=0) -> tuple[float, Float[np.ndarray, "atoms 3"]]:
-        """Energy and forces in the simulation's units; arguments as for `arguments`."""
+        """Compute energy and forces in the simulation's units; for arguments see `arguments`."""
         how, call, cell = self.call.how, self.call, self.cell if cell is None else cell
         energy, (slope, *_) = self.slopes(*self.arguments(idx, x, cell, code))
         honest = how.fractional and not how.real_slope
@@ -207,12 +208,12 @@ class Trial:
         return float(energy) * call.unit, -np.asarray(slope) @ by_x * call.unit
 
     def energy(self, x=None, idx=None, cell=None) -> float:
-        """The energy alone, which takes a quarter of the time, over a list with more padding."""
+        """Compute only the energy, over a list with more padding, in a quarter of the time."""
         idx = self._padded(self.inside if idx is None else idx)
         return float(self._alone[0](*self.arguments(idx, x, cell))) * self.call.unit
 
     def without_itself(self) -> float:
-        """The energy where no atom is listed as its own neighbor."""
+        """Compute the energy with a list in which no atom is its own neighbor."""
         model, arguments = self.model, self.arguments()
         self.model = replace(model, self_edges=False)
         # not the method, whose earlier trace would be taken
@@ -221,25 +222,25 @@ class Trial:
         return float(made(*arguments)) * self.call.unit
 
     def within(self, idx, x, radius: float) -> Int[np.ndarray, "atoms slots"]:
-        """Of listed pairs those closer than a radius."""
+        """Keep the listed pairs that are closer than a radius."""
         near = (idx < self.n) & (self.distances(idx, x) < radius)
         return np.where(near, idx, self.n).astype(np.int32)
 
     def distances(self, idx, x) -> Float[np.ndarray, "atoms slots"]:
-        """Of the listed pairs, some number for padding."""
+        """Compute the distances of listed pairs; values for padding are arbitrary."""
         d = displacement(self.box, x[:, None], x[np.minimum(idx, self.n - 1)])
         return np.sqrt(sum(c * c for c in d))
 
     def culprit(self, idx) -> str:
-        """The first operation over a list that makes the energy or its derivative not finite."""
+        """Return the first operation over a list that makes the energy or its derivative not finite."""
         return named(first_not_finite(jax.value_and_grad(self.bare, 1), *self.arguments(idx)))
 
 
 def _quick(traced: Any) -> Any:
-    """A program compiled for a few calls."""
+    """Compile a traced program with few optimizations, for a few calls."""
     return traced.lower().compile(compiler_options={"xla_backend_optimization_level": 0})
 
 
 def named(found: Operation | None) -> str:
-    """An operation and where it was written."""
+    """Return the name of an operation and its place in the source code."""
     return "one of several" if found is None else f"{found.name} ({found.source or 'in a function of jax'})"
