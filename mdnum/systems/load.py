@@ -53,7 +53,7 @@ def names(world: Literal["md", "ball"] | None = None) -> list[str]:
 
 
 def world_of(name: Any) -> str:
-    """ Return the world, "md" or "ball", of an object or an unvalidated file; "md" if the file is not TOML.
+    """Return the world, "md" or "ball", of an object or an unvalidated file; "md" if the file is not TOML.
 
     Raises:
         InputError: no system has this name.
