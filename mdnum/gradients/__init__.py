@@ -1,7 +1,7 @@
-"""Gradients of long rollouts, and how far each can be trusted.
+"""Gradients of long rollouts, with estimates of how far each gradient can be trusted.
 
-A rollout is differentiated at the states and decisions that it recorded; what the flips on the way add is a
-term of its own. Each way of doing it is a `Method`, each number that can be differentiated a `Loss`.
+A rollout is differentiated at its recorded states and decisions; the contribution of the flips is a separate
+term. Each way to differentiate is a `Method`; each number that can be differentiated is a `Loss`.
 """
 
 from mdnum.gradients.differentiate import differentiable, value_and_grad

@@ -1,12 +1,12 @@
-"""The reverse pass of a rollout, stretch by stretch: at the states and decisions that the run recorded.
+"""Reverse-mode derivatives of a rollout, stretch by stretch, at the recorded states and decisions.
 
-Inside jax.value_and_grad a compiler makes another forward pass, with a rounding, and after some thousand
-steps with decisions, of its own. Here the run is made first, by the program that makes every run.
+Inside jax.value_and_grad a compiler makes another forward pass, which rounds differently and, after some
+thousand steps, decides differently. Here the program that makes every run makes this run first.
 
-A conservative force is a gradient, so its Jacobian is symmetric and the transpose of the Jacobian times a
-vector is the Jacobian times that vector. Of a pair potential that is a tangent evaluation, pair by pair,
-gathered as the forces are: nothing is scattered. Of any other energy it is one tangent through one gradient
-of the energy. No tape is kept.
+A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals
+J times that vector. For a pair potential this product is a tangent evaluation, pair by pair, gathered like
+the forces: no scatter is needed. For any other energy it is one tangent through one gradient of the energy.
+No tape of operations is kept.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ALL = frozenset((MODEL, SCALE, FORCE, WEIGHT))
 
 
 class ForceCotangents(NamedTuple):
-    """What comes back through one evaluation of forces."""
+    """Cotangents obtained by transposing one evaluation of forces."""
 
     x: Float[Array, "3 atoms"]  # on the positions
     model: Any  # on the parameters, a pytree of arrays like theirs; zeros where it was not asked for
@@ -64,15 +64,16 @@ def pull_back(
     onto_virial: Float[Array, "*axes"],
     wanted: frozenset[str] = frozenset(),
 ) -> ForceCotangents:
-    """The transpose of one evaluation of forces, energy and virial at given decisions.
+    """Propagate cotangents back through one evaluation of forces, energy and virial at given decisions.
 
     Args:
-        x: sorted, wrapped positions, length. bits: the decisions that were acted on, packed.
+        x: sorted, wrapped positions, length. bits: the packed decisions that this evaluation used.
         onto_force, onto_energy: cotangents of the forces and of the potential energy.
-        onto_virial: of the virial, or of its tensor, shape (3, 3) and symmetric.
-        wanted: of MODEL, SCALE, FORCE, WEIGHT and STRAIN; what is not wanted comes back as zeros.
+        onto_virial: cotangent of the virial, or of its tensor, shape (3, 3) and symmetric.
+        wanted: derivatives to compute, of MODEL, SCALE, FORCE, WEIGHT and STRAIN; the others are returned as
+            0.
 
-    Error: a rounding error for each pair, in the dtype of the force; sums slot by slot.
+    Error: one rounding error per pair, in the dtype of the force; sums are taken slot by slot.
     """
     if isinstance(force, ChannelForce):
         each = zip(force.parts, force.split(bits), strict=True)
@@ -109,15 +110,16 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return r2, jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
 
     def virials(d, r2):
-        """What the virial's cotangent multiplies in a pair's slope, and that of its tensor times the pair."""
+        """Return the virial's cotangent V contracted with the pair vector: d·V·d, and V·d for a tensor."""
         if not virial.ndim:
             return virial * r2, None
         turned = [reduce(add, (virial[a, b] * d[b] for b in range(3))) for a in range(3)]
         return reduce(add, (d[a] * turned[a] for a in range(3))), turned
 
     def through(r2, along, inside, types, weights):
-        """Energy and slope as a function of r², of each slot's own parameters and end and of what all share;
-        those of the slots; and the cotangents of energy and slope."""
+        """Return energy and slope as a function of r², slot parameters (with cutoff values) and shared ones;
+        the slot parameters; and the cotangents of energy and slope.
+        """
         # each slot has parameters of its own, so that no sum over slots stands inside the loop
         slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
 
@@ -130,8 +132,9 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return ended, slots, onto
 
     def with_shared(r2, along, inside, types, weights):
-        """The slope of each slot, the cotangents of its r² and of its own parameters and end, and those of
-        the shared parameters in all slots: by one reverse pass, which is cheaper than two for a network."""
+        """Compute each slot's slope, the cotangents of its r², own parameters and cutoff values, and the
+        cotangents of the shared parameters; for a network, one reverse pass is cheaper than two.
+        """
         ended, slots, onto = through(r2, along, inside, types, weights)
 
         def in_a_row(r2, slots, shared):
@@ -144,14 +147,15 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return slope, *back(onto)
 
     def onto_weights(r2, along, inside, types, weights, others):
-        """Of each slot, what it adds to its atom: the pair is in a slot of the other one, too."""
+        """Compute each slot's contribution to its atom; the pair also occupies a slot of the other atom."""
         onto = jnp.where(inside, energy, 0), -2 * jnp.where(inside, along, 0)
         by = jax.vjp(lambda *weights: model.evaluate(r2, types, at, *weights), *weights)[1](onto)
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
     def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
-        """What a slot adds: on positions, then the forces, the scale and the parameters that are wanted; and
-        what a block of slots adds on those that all pairs share."""
+        """Return a slot's contributions to positions, then forces, scale and the wanted parameters, and the
+        contribution of a block of slots to the parameters that all pairs share.
+        """
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
         own_virial, turned = virials(d, r2)
@@ -217,15 +221,16 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
 
 def _differences(cell, own, other):
-    """Of two vectors of two atoms, the first a position; then products of their weights, and the other's."""
+    """Return pair differences of position and vector, products of weights, and the other atom's weights."""
     d = [b - a for a, b in zip(own[:6], other[:6], strict=True)]
     products = (a * b for a, b in zip(own[6:], other[6:], strict=True))
     return [*cell.minimum_image(*d[:3]), *d[3:], *products, *other[6:]]
 
 
 def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
-    """Sums over the slots of each atom of what they add, from the differences of two vectors; and what all
-    slots add together, where there is such."""
+    """Sum each atom's slot terms, computed from differences of two vectors; also sum the terms that are
+    common to all slots, if there are any.
+    """
 
     def pair(own, other, types, inside):
         # padding is nowhere
@@ -253,7 +258,7 @@ def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
 
 
 def _added(totals: tuple[Array, ...], terms: list[Array]) -> tuple[Array, ...]:
-    """Sums of four slots each, slot after slot: the compiler vectorizes over atoms, the order is fixed."""
+    """Add the terms of four slots in a fixed order, so that the compiler vectorizes over atoms."""
     out = []
     for total, term in zip(totals, terms, strict=True):
         for k in range(term.shape[0]):
@@ -298,11 +303,11 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
 
 
 class AdjointCarry(NamedTuple):
-    """What the reverse pass carries from step to step.
+    """Cotangents that the reverse pass carries from step to step.
 
-    In the trace of a stretch, row k belongs to the state (x, half-kicked v) that step first + k begins with,
-    before the crossings that lead there, in the order of the stretch's list; rows beyond the used ones are
-    void, and the origin is left out.
+    In the trace of a stretch, row k belongs to the state (x, half-kicked v) at the beginning of step first +
+    k, before the crossings that lead there are transposed, in the order of the stretch's list; rows beyond
+    the used ones are undefined, and the origin is omitted.
     """
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
@@ -329,21 +334,22 @@ def reverse(
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[TapeStretch, AdjointCarry], None] | None = None,
 ) -> tuple[Cotangents, list[Crossings]]:
-    """Derivatives of a tape's loss by everything that the run is made of.
+    """Compute the derivatives of a tape's loss with respect to all inputs of the run.
 
     Args:
-        wanted: what is wanted beyond the start: of MODEL, SCALE, FORCE (the integrator's numbers) and WEIGHT.
-        saltation: whether to add what every flip does through the time at which it happens.
+        wanted: derivatives to compute beyond the start: MODEL, SCALE, FORCE (the integrator's numbers),
+            WEIGHT.
+        saltation: whether to add the effect of every flip through the time at which it happens.
         guard: radial speed, length per internal time, below which a flip counts as grazing and adds nothing.
-        watch: called with every stretch, last first, and what was carried at its steps.
+        watch: called with every stretch, last first, and the cotangents carried at its steps.
 
     Returns:
         The derivatives, and the crossings of every stretch with their weights, last stretch first.
 
     Raises:
-        InputError: a many-body potential that decides by itself, with its flips.
+        InputError: saltation was requested for a many-body potential that makes its own decisions.
 
-    Error: a rounding error times the growth of the adjoint; none of truncation, for the program as it ran.
+    Error: a rounding error times the growth of the adjoint; no truncation error, for the program as it ran.
     """
     back = StretchReversal(tape, wanted, guard if saltation else None)
     found: list[Crossings] = []
@@ -359,11 +365,11 @@ def reverse(
 
 
 class StretchReversal:
-    """A reverse pass on its way, from the end of a tape to its start; arguments as for `reverse`.
+    """A reverse pass in progress, from the end of a tape to its start; arguments as for `reverse`.
 
     Attributes:
-        carry: what is carried, atoms in the user's order. guard: None where flips do not count.
-        met: the crossings of the stretch that was gone through last.
+        carry: the carried cotangents, atoms in the user's order. guard: None if flips are not included.
+        met: the crossings of the stretch that was transposed last.
     """
 
     def __init__(self, tape: RunTape, wanted: frozenset[str], guard: float | None):
@@ -396,7 +402,7 @@ class StretchReversal:
         )
 
     def arguments(self, stretch: TapeStretch) -> tuple[Any, ...]:
-        """What `transposed` is called with for a stretch, from where the pass stands."""
+        """Return the arguments of `transposed` for a stretch, at the current point of the reverse pass."""
         simulation, order = self.tape.simulation, stretch.table.order
         self.met = None if self.guard is None else crossings(simulation, stretch, self.guard)
         tape, tables = self.tape, simulation.tables(stretch.table)
@@ -408,12 +414,12 @@ class StretchReversal:
         )  # fmt: skip
 
     def through(self, stretch: TapeStretch) -> tuple[Float[np.ndarray, "room most"], AdjointCarry]:
-        """Carry everything through a stretch: the weights of its crossings, and what each step carried."""
+        """Transpose a stretch; return the weights of its crossings and the cotangents at each step."""
         self.carry, (weights, trace) = transposed(*self.arguments(stretch))
         return np.asarray(weights), trace
 
     def cotangents(self) -> Cotangents:
-        """The derivatives, once the start has been reached."""
+        """Return the derivatives, once the reverse pass has reached the start."""
         simulation, carry, start = self.tape.simulation, self.carry, self.tape.start.state
         through = carry.integrator, carry.x, carry.v
         if jax.tree.leaves(carry.extra):
@@ -442,11 +448,11 @@ def transposed(
     carry: AdjointCarry,
     wanted: frozenset[str],
 ):
-    """The transpose of a stretch of steps: the carry before it, the weights of its crossings, its trace.
+    """Transpose a stretch of steps; return the carry before it, the weights of its crossings, and its trace.
 
-    The step between two evaluations of forces is transposed by JAX, by its positions, velocities, extra
-    state, forces, virial and box. That of a linear `KickDrift` has the same derivative whatever the forces,
-    so these need not be in the rows; the integrator's numbers get what `pull_back` has made.
+    The part of a step between two force evaluations is transposed by JAX, with respect to positions,
+    velocities, extra state, forces, virial and box. For a linear `KickDrift` this derivative does not depend
+    on the forces, so the rows need not contain them; `pull_back` returns them for the integrator's numbers.
     """
     loss, origin, around, onto_total, pace = looking
     order, moves = tables.order, integrator.moves_cell
@@ -469,7 +475,7 @@ def transposed(
         return end.x, end.kicked, ahead, end.cell.matrix, end.v
 
     def look(row):
-        """Cotangents of one frame and of the origin, from those of the sums."""
+        """Return the cotangents of one frame and of the origin, given the cotangents of the loss's sums."""
 
         def seen_at(x, v, potential, virial, origin, timestep, *box):
             here = (in_box(around, *box) if box else around)._replace(timestep=timestep)

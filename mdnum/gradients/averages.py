@@ -1,9 +1,9 @@
 """Derivatives of averages over states, from one run that is not differentiated.
 
-Averages do not care how frames hang together in time. What they need of a parameter is how it changes each
-frame's term at fixed positions; which pairs are inside (an average of what jumps when a pair enters changes
-with the radius by the jump times the density of pairs there, which no derivative at fixed decisions has);
-and, under a thermostat, how often such a frame is met: with the weight exp(-U/kT).
+An average over states does not depend on the time order of the frames. Its derivative by a parameter has
+three contributions: the change of each frame's term at fixed positions; the pairs at the cutoff (a term that
+jumps when a pair enters changes with the radius by the jump times the density of pairs there, which no
+derivative at fixed decisions contains); and, under a thermostat, the change of the weight exp(-U/kT).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ WIDTHS = 5
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames that a loss looks at, each by itself."""
+    """The frames that a loss uses, each treated independently."""
 
     step: Int[np.ndarray, "frames"]  # of each
     x: Float[np.ndarray, "frames 3 atoms"]  # wrapped positions, user's order, length
@@ -56,27 +56,27 @@ class Frames:
 
 
 def known(name: str) -> bool:
-    """Whether a frame's term or energy depends on it at fixed positions."""
+    """Return whether a frame's term or energy depends on the named parameter at fixed positions."""
     return name.startswith(("potential.", "cutoff.")) or name == "box.scale"
 
 
 def energy_of_forces(simulation: Simulation) -> Simulation:
-    """The system whose energy has these forces as its gradient everywhere.
+    """Return the system whose energy has the given system's forces as its gradient everywhere.
 
     A hard cutoff has the forces of the shifted one, and no force at the sphere where its energy jumps: a run
-    samples the ensemble of the shifted energy, whatever energy it reports.
+    samples the ensemble of the shifted energy, whatever energy is reported.
     """
     return simulation.with_cutoff("shifted") if isinstance(simulation.cutoff, Hard) else simulation
 
 
 def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], None] | None = None) -> Frames:
-    """The frames of a tape's loss.
+    """Evaluate the frames of a tape's loss, with derivatives by the named parameters.
 
     Args:
         tape: the run, of a pair potential.
-        names: full names of parameters; those that a frame does not know of are left out.
+        names: full names of parameters; a parameter that no single frame depends on is skipped.
 
-    Error: a rounding error for each pair.
+    Error: one rounding error per pair.
     """
     simulation = tape.simulation
     assert isinstance(simulation.force, PairForce)
@@ -160,7 +160,7 @@ def _look(forces: tuple[PairForce, PairForce], tables, rows, bits, seen, looking
 
 
 def standard_error(series: Float[np.ndarray, "frames"]) -> float:
-    """Standard error of the mean of a correlated series: the largest over a few numbers of blocks.
+    """Return the standard error of the mean of a correlated series, the largest over a few numbers of blocks.
 
     Source: H. Flyvbjerg, H. G. Petersen, J. Chem. Phys. 91, 461 (1989).
     """
@@ -176,7 +176,7 @@ def standard_error(series: Float[np.ndarray, "frames"]) -> float:
 
 @dataclass(frozen=True)
 class Density:
-    """How many pairs there are per length at the cutoff, weighted frame by frame."""
+    """Number of pairs per length at the cutoff, weighted frame by frame."""
 
     # each frame's share of the estimate that was chosen, shape (frames, types)
     frames: Float[np.ndarray, "frames types"]
@@ -190,7 +190,7 @@ class Density:
 def distances(
     simulation: Simulation, x: Float[np.ndarray, "3 atoms"], reach: float
 ) -> list[Float[np.ndarray, "pairs"]]:
-    """Distances of the pairs within `reach` of their cutoff, less the cutoff, by pair type.
+    """Return distance minus cutoff of all pairs within `reach` of their cutoff, one array per pair type.
 
     Args:
         x: wrapped positions.
@@ -212,16 +212,16 @@ def density(
     reach: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> Density:
-    """Sum over frames of a weight times the density of pairs at the cutoff, delta(r_cut - r_ij).
+    """Sum over frames a weight times the density of pairs at the cutoff, delta(r_cut - r_ij).
 
-    The delta function is a parabola of finite width. Its bias is even in the width, and three widths, each
-    half of the one before, extrapolate to none up to the fourth order. Of these triples the widest is taken
-    that differs from no narrower one by more than twice the standard error of the difference.
+    The delta function is replaced by a parabola of finite width. The bias is even in the width; extrapolation
+    from three widths, each half of the previous one, removes the second and fourth orders. The widest triple
+    is used that differs from no narrower triple by more than twice the standard error of the difference.
 
     Args:
-        weights: of each frame and pair type. reach: the largest width, length.
+        weights: one per frame and pair type. reach: the largest width, length.
 
-    Source: O. V. Lepski, Theory Probab. Appl. 35, 454 (1990), for the choice.
+    Source: O. V. Lepski, Theory Probab. Appl. 35, 454 (1990), for the choice of the width.
     """
     widths = reach / 2.0 ** np.arange(WIDTHS)
     found = np.zeros((WIDTHS, len(seen), simulation.pair_types))
@@ -254,7 +254,7 @@ def density(
 
 @dataclass(frozen=True)
 class BoundaryTerm(Method):
-    """The derivative of an average over given states: of what is inside, and of which pairs are."""
+    """The derivative of an average over given states, with a boundary term for pairs at the cutoff."""
 
     # half the width of the widest kernel as a share of the cutoff; less where the box is narrow
     reach: float = 0.1
@@ -290,7 +290,7 @@ class BoundaryTerm(Method):
         return self.result(tape.value, gradient, details={"frames": len(seen), **details})
 
     def terms(self, simulation: Simulation, seen: Frames, names: Sequence[str], progress=None):
-        """Each frame's share of the derivative, by name, and the details of it."""
+        """Return each frame's contribution to the derivative, by parameter name, and the details."""
         energy, force = simulation.jumps()
         radii = np.asarray(simulation.decider.r_cut)
         # what a pair that enters adds to the loss of each frame
@@ -322,13 +322,13 @@ class BoundaryTerm(Method):
 
 @dataclass(frozen=True)
 class Reweighting(Method):
-    """Differentiable trajectory reweighting: explicit derivative and response of the weights.
+    """Differentiable trajectory reweighting: the explicit derivative plus the response of the weights.
 
     The explicit part is that of `BoundaryTerm`; the response is minus the covariance of the loss's terms with
-    the derivative of the energy, over kT.
+    the derivative of the energy, divided by kT.
 
-    Error: statistical; a standard error from blocks is in the details. With a few correlated frames it is
-        large, and one over the steps of the run at best.
+    Error: statistical; the details hold a standard error from block averages. With few correlated frames the
+        error is large; the estimate covers only the variation within this run.
     Source: S. Thaler, J. Zavadlav, Nature Communications 12, 6884 (2021).
     """
 
@@ -383,7 +383,7 @@ class Reweighting(Method):
 
 
 def _score(simulation: Simulation, seen: Frames, name: str) -> Float[np.ndarray, "frames *types"]:
-    """Derivative of the logarithm of each frame's weight."""
+    """Return the derivative of the logarithm of each frame's weight by the named parameter."""
     bath = simulation.integrator
     kT = float(getattr(bath, bath.keys()["temperature"].name))
     if name == "dynamics.temperature":

@@ -1,10 +1,11 @@
-"""Derivatives of a ball's rollout: a program with decisions has several, and each is a method of its own.
+"""Derivatives of a ball's rollout: a program with decisions has several, and each has a method of its own.
 
-Of the operations that ran (unrolled), with every decision pinned (frozen), of the mean loss over random
-parameters (randomized); those that change what a contact is are in `ball_contacts`.
+The methods here differentiate the operations that ran (unrolled), the program with every decision pinned
+(frozen), or the mean loss over random parameters (randomized). `ball_contacts` has methods that change the
+contact.
 
-JAX has no `requires_grad`: a parameter that a run never used has the derivative 0.0, and so has one whose
-derivative underflowed or was clamped away. `dependence` tells them apart.
+JAX has no `requires_grad`: the derivative is 0.0 both for a parameter that the run never used and for one
+whose derivative underflowed or was clamped to zero. `dependence` distinguishes the two cases.
 """
 
 from __future__ import annotations
@@ -37,20 +38,20 @@ class Use(NamedTuple):
 
 
 class BallMethod(Method):
-    """A way to differentiate a ball's rollout: a `Method` that is called with a `BallProblem`.
+    """Base class of methods that differentiate a ball's rollout: a `Method` called with a `BallProblem`.
 
-    A batch moves as a whole along y0 and v0.
+    The parameters y0 and v0 shift all balls of a batch together.
     """
 
     def known(self, problem: BallProblem, names: Sequence[str]) -> tuple[str, ...]:
-        """The names, as they are."""
+        """Check that the parameters exist, and return their names unchanged."""
         problem.values(names)
         return tuple(names)
 
     def of(
         self, value: float, slopes: dict[str, float], use: dict[str, Use], details: dict[str, Any]
     ) -> Gradient:
-        """A gradient of this method."""
+        """Create this method's `Gradient` from slopes and notes on dependence."""
         gradient = {name: np.asarray(slope, np.float64) for name, slope in slopes.items()}
         made = self.result(value, gradient, {name: one.note for name, one in use.items()}, details)
         return replace(made, depends={name: one.depends for name, one in use.items()})
@@ -80,14 +81,14 @@ class BallGradients:
 def compare(
     problem: BallProblem, names: Sequence[str], methods: Sequence[str | BallMethod] | None = None
 ) -> BallGradients:
-    """The derivative of one loss by several methods, and why some do not apply.
+    """Differentiate one loss by several methods, and record why other methods do not apply.
 
     Args:
-        names: parameters, "y0" and "v0" among them.
-        methods: names or objects; default all.
+        names: parameters, which may include "y0" and "v0".
+        methods: names or objects; all methods by default.
 
     Raises:
-        InputError: there is no such parameter or method.
+        InputError: a parameter or method does not exist.
     """
     problem.values(names)
     asked = BALL_METHODS if methods is None else methods
@@ -104,7 +105,7 @@ def compare(
 
 
 class Dependence(NamedTuple):
-    """Whether any path of a program leads from a parameter to the loss, and whether one that ran does."""
+    """Whether any path of a program leads from a parameter to the loss, and whether an executed path does."""
 
     written: bool
     used: bool
@@ -116,18 +117,18 @@ def dependence(
     names: Sequence[str] | None = None,
     rest: tuple[Any, ...] = (),
 ) -> dict[str, Dependence]:
-    """Whether a scalar loss depends on its parameters, in the branches and iterations that ran.
+    """Determine whether a scalar loss depends on its parameters, in the branches and iterations that ran.
 
-    A tangent that is NaN stays NaN through everything that carries a derivative, whatever it is multiplied
-    by, and goes nowhere else.
+    The test uses tangents that are NaN: NaN passes through every operation that carries a derivative,
+    whatever the factor, and reaches nothing else.
 
     Args:
-        function: from a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as
+        function: maps a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as
             it is the same object (or an equal `eqx.Module`).
-        values: the parameters, floating point, of any shape. names: those asked about, all by default.
-        rest: further arguments. What must not become a constant of the compiled program is passed here.
+        values: the parameters, floating point, of any shape. names: parameters to test, all by default.
+        rest: further arguments; arrays passed here do not become constants of the compiled program.
 
-    Error: a slope that is infinite where it is multiplied by the tangent 0 of another element counts as used.
+    Error: an infinite slope times the zero tangent of another element is NaN, and counts as used.
     """
     given = {name: jnp.asarray(value) for name, value in values.items()}
     names = tuple(given if names is None else names)
@@ -156,7 +157,7 @@ def _used(function: Any, values: dict[str, jax.Array], rest: tuple, names: tuple
 
 
 def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str) -> bool:
-    """Whether the text of the derivative has the tangent in it, through any branch and round."""
+    """Return whether the traced derivative contains the tangent in any branch or iteration."""
 
     def slope(tangent):
         return jax.jvp(lambda q: function(values | {name: q}, *rest), (values[name],), (tangent,))[1]
@@ -166,8 +167,9 @@ def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str
 
 
 def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The program with the loops of `stopping.elementwise` in it instead of their rule, which multiplies by
-    a Jacobian: its zeros would not tell a flat loop from one that did not run."""
+    """Inline the loops of `stopping.elementwise` in place of their custom rule: it multiplies by a Jacobian,
+    and zeros in this Jacobian would not distinguish a flat loop from a loop that did not run.
+    """
 
     def run(*inputs):
         jaxpr = program.jaxpr
@@ -195,7 +197,7 @@ def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 class _Rollout(eqx.Module):
-    """The loss of so many steps: equal for equal problems, so that it is compiled once."""
+    """Loss after a given number of steps; equal for equal problems, so that the function is compiled once."""
 
     steps: int = eqx.field(static=True)
     loss: BallLoss
@@ -212,12 +214,12 @@ def used(
     *,
     own: bool = True,
 ) -> dict[str, Use]:
-    """Whether the run used each parameter on the way to the loss.
+    """Determine whether the run used each parameter to compute the loss.
 
     Args:
         slopes: derivatives already known.
-        run: of this problem, made here when None.
-        own: the slopes are those of the problem's own operations: one that is not 0 came through a use.
+        run: a run of this problem; None to make one.
+        own: whether the slopes are those of the problem's own operations, so that a nonzero slope proves use.
     """
     found = dict.fromkeys(names, Dependence(True, True))
     if not own or any(slopes[name] == 0 or not np.isfinite(slopes[name]) for name in names):
@@ -262,10 +264,10 @@ class ThroughIterations(BallMethod):
     )
 
     def __call__(self, problem: BallProblem, names: Sequence[str], run: BallRun | None = None) -> Gradient:
-        """The derivative, by reverse mode.
+        """Compute the derivative by reverse mode.
 
         Args:
-            run: of this problem, where there already is one.
+            run: a run of this problem, if there already is one.
 
         Error: rounding of the reverse pass in the dtypes of the policy.
         """
@@ -278,10 +280,10 @@ class ThroughIterations(BallMethod):
 
 @dataclass(frozen=True)
 class Frozen(BallMethod):
-    """The derivative of the program whose decisions and iteration counts are those of a recording.
+    """The derivative of the program whose decisions and iteration counts are those of a recorded run.
 
-    The pinned program has no branches left, so finite differences of it exist; in float64 they are taken as
-    a check.
+    The pinned program has no branches, so its finite differences exist; in float64 they are computed as a
+    check.
     """
 
     name = "frozen"
@@ -290,9 +292,9 @@ class Frozen(BallMethod):
     )
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """The derivative, by reverse mode, with central differences of the pinned program beside it.
+        """Compute the derivative by reverse mode, and central differences of the pinned program as a check.
 
-        Error: of the derivative, rounding; of the differences, about u^(2/3) relative.
+        Error: rounding in the derivative; about u^(2/3) relative in the differences.
         """
         run = problem.run(keep=False)
         decisions = jax.tree.map(jnp.asarray, run.decisions())
@@ -309,17 +311,18 @@ class Frozen(BallMethod):
 
 
 def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
-    """Sizes of parameters, 1 for those that are 0."""
+    """Return the largest magnitude of each parameter, or 1 for a parameter that is 0."""
     at = problem.values(names)
     return {name: float(np.max(np.abs(np.asarray(value, np.float64)))) or 1.0 for name, value in at.items()}
 
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(BallMethod):
-    """The derivative of E[loss(parameters + width * noise)], estimated from values alone.
+    """The derivative of E[loss(parameters + width * noise)], estimated from loss values alone.
 
-    It sees through jumps (of iteration counts, of contacts), and is that of a smoother loss; the same seed
-    gives the same bits. Each sample is used with its mirror image, which removes the value from the variance.
+    The estimate includes jumps (of iteration counts, of contacts) and belongs to a smoother loss; the same
+    seed gives the same bits. Each sample is used with its mirror image, which removes the value from the
+    variance.
     """
 
     # standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0)
@@ -335,12 +338,12 @@ class RandomizedSmoothing(BallMethod):
     )
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """The estimate; `details` holds its standard error for each name.
+        """Estimate the derivative; `details` holds its standard error for each name.
 
         Raises:
-            InputError: width or samples out of range.
+            InputError: width or samples are out of range.
 
-        Error: the standard error, and the bias of averaging, of the order of width².
+        Error: the standard error, plus a bias of order width² from the averaging.
 
         Source: Nesterov and Spokoiny (2017), with antithetic samples.
         """

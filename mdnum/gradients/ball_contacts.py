@@ -1,4 +1,4 @@
-"""Derivatives of a ball with contacts in view: of a solver's fixed point, of a soft floor, of the motion."""
+"""Derivatives that account for a ball's contacts: of a solver's fixed point, a soft floor, or the motion."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ _NARROW = 1e-6
 
 
 def _moving(x: Any) -> Any:
-    """0 with the derivative of x: what a value is given another derivative with."""
+    """Return 0 with the derivative of x; adding this term gives a value another derivative."""
     return x - lax.stop_gradient(x)
 
 
 class FixedPointRule(eqx.Module):
-    """Gives a projection's result the derivative of the fixed point it stands for.
+    """Custom rule: gives a projection's result the derivative of the fixed point that it approximates.
 
-    For a ball in contact the fixed point of y ← y + gain max(0, -y) that is reached from below is y = 0. It
-    lies on the kink of max(0, -y), where dG/dy has two values: the one from below is used, because the ball
-    comes from there (a choice of branch, as the active set of a complementarity problem). By the implicit
-    function theorem (1 - dG/dy) dy = dG/dgain dgain, ball by ball: gain dy = -y dgain.
+    For a ball in contact the fixed point of y ← y + gain max(0, -y) that is reached from below is y = 0. This
+    point lies on the kink of max(0, -y), where dG/dy has two values: the value from below is used, because
+    the ball comes from there (a choice of branch, like the active set of a complementarity problem). By the
+    implicit function theorem (1 - dG/dy) dy = dG/dgain dgain, for each ball: gain dy = -y dgain.
     """
 
     # added to 1 - dG/dy; moves the answer by about regularization / gain, relative
@@ -58,12 +58,12 @@ class FixedPointRule(eqx.Module):
     def attach(
         self, y: Float[Array, "balls"], gain: Float[Array, "balls"], contact: Bool[Array, "balls"]
     ) -> Float[Array, "balls"]:
-        """y, unchanged, with the other derivative.
+        """Return y, unchanged, with the derivative of the fixed point.
 
         Args:
             y: heights where the iteration stopped.
-            gain: alpha k, by ball.
-            contact: the contact decision.
+            gain: alpha k of each ball.
+            contact: the contact decisions.
         """
         ends = y if self.at_iterate else _Settled().attach(y, gain, contact)
         moved = lax.stop_gradient(-ends / (gain + self.regularization)) * _moving(gain)
@@ -71,10 +71,10 @@ class FixedPointRule(eqx.Module):
 
 
 class _Settled(eqx.Module):
-    """Puts every ball in contact where its iteration was heading."""
+    """Rule that puts every ball in contact at the fixed point of its iteration."""
 
     def attach(self, y, gain, contact):
-        """The fixed point."""
+        """Return the fixed point: 0 for balls in contact below the floor, otherwise y."""
         return jnp.where(contact & (y < 0), jnp.zeros_like(y), y)
 
 
@@ -82,8 +82,8 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """The derivative of the projection's fixed point, by the implicit function theorem.
 
-    The loss is that of the iterations that ran; its derivative is that of where they were heading: the floor,
-    whatever the gain. What the unrolled one gives by k is an artefact of the tolerance.
+    The loss is that of the iterations that ran; the derivative is that of their limit: the floor, whatever
+    the gain. A nonzero derivative by k from the method unrolled is an artifact of the tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
@@ -96,12 +96,12 @@ class Implicit(BallMethod):
     )
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """The derivative, by reverse mode.
+        """Compute the derivative by reverse mode.
 
         Raises:
-            InputError: nothing is iterated here, or 1 - dG/dy is too ill conditioned.
+            InputError: the contact is not solved by iteration, or 1 - dG/dy is too ill conditioned.
 
-        Error: rounding times the condition number of 1 - dG/dy, and what regularization moves.
+        Error: rounding times the condition number of 1 - dG/dy, plus the change caused by regularization.
         """
         contact = problem.world.contact
         if not isinstance(contact, Projection):
@@ -141,7 +141,7 @@ def _with_contact(problem: BallProblem, contact: Any) -> BallProblem:
 class SoftImpact(eqx.Module):
     """An impact without a decision: a soft spring that pushes harder on the way in than on the way out.
 
-    The spring has stiffness k while the ball falls and restitution² k while it rises, with smooth passages
+    The spring has stiffness k while the ball falls and restitution² k while it rises, with smooth transitions
     between the two and at the floor, so that the ball leaves with restitution times its speed.
 
     Source: the latching spring of Walton and Braun (1986), smoothed.
@@ -153,13 +153,13 @@ class SoftImpact(eqx.Module):
     slow: Any  # in velocity, of the passage, m/s
 
     def acceleration(self, y, v, free, contact, r):
-        """Gravity, control and the spring; the decision is not used."""
+        """Return the acceleration by gravity, control and the spring; the contact decision is not used."""
         depth = self.eps * jax.nn.softplus(-y / self.eps)
         share = self.restitution**2
         return free + self.k * depth * (share + (1 - share) * jax.nn.sigmoid(-v / self.slow))
 
     def move(self, motion: Motion) -> Moved:
-        """One step of the scheme under this force; the contact decision is only recorded."""
+        """Integrate one step under this force; the contact decision is only recorded."""
 
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, motion.rounding)
@@ -184,12 +184,12 @@ class SoftFloor(BallMethod):
     )
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """The derivative, by reverse mode, of the smooth program; the value is its loss.
+        """Compute derivative and loss of the smooth program by reverse mode.
 
         Raises:
-            InputError: eps is not positive, or a parameter that the smooth program does not have.
+            InputError: eps is not positive, or the smooth program does not have the parameter.
 
-        Error: rounding; as a derivative of the given program a bias that shrinks with eps only where that
+        Error: rounding; as a derivative of the given program, a bias that shrinks with eps only if that
         program has a derivative.
         """
         eps = _suitable(problem) if self.eps is None else self.eps
@@ -210,10 +210,10 @@ class SoftFloor(BallMethod):
 
 
 def softened(problem: BallProblem, eps: float) -> BallProblem:
-    """The problem with a soft floor: a softplus penalty, or a spring that an impact sinks into by about eps.
+    """Return the problem with a soft floor: a softplus penalty, or a spring of depth about eps for an impact.
 
     Raises:
-        InputError: the ball would pass so narrow a floor in a few steps.
+        InputError: the ball would cross the floor of width eps in too few steps.
     """
     world = problem.world
     contact, dtype = world.contact, world.policy.dtype("arithmetic")
@@ -241,7 +241,7 @@ def softened(problem: BallProblem, eps: float) -> BallProblem:
 
 
 def _speed(problem: BallProblem) -> float:
-    """With which a ball of this problem arrives at the floor, m/s; 1 where none falls."""
+    """Return the speed at which a ball of this problem reaches the floor, m/s; 1 if no ball falls."""
     height = max(float(np.max(np.asarray(problem.y0, np.float64))), 0.0)
     square = float(np.max(np.asarray(problem.v0, np.float64) ** 2))
     return float(np.sqrt(square + 2 * abs(float(problem.world.gravity)) * height)) or 1.0
@@ -256,13 +256,13 @@ def _suitable(problem: BallProblem) -> float:
 
 @dataclass(frozen=True)
 class ThroughContacts(BallMethod):
-    """The derivative of the ball's motion, contacts included, rather than of the steps that imitate it.
+    """The derivative of the ball's motion, contacts included, rather than of the steps that approximate it.
 
-    A step decides about contact at its end, so its derivative does not know that a ball which starts higher
-    arrives later. Here every contact has the derivative of its saltation matrix. Where the impact is located
-    inside the step the program's own derivative is already this one. A projection is read as the impact that
-    it stands for. The force of a spring without a damper does not jump: of a spring this is the unrolled
-    derivative, and says so.
+    A step decides about contact at its end, so its derivative misses that a ball which starts higher arrives
+    later. This method uses the saltation matrix of every contact. For an impact located inside the step, the
+    program's own derivative already contains it. A projection is treated as the impact that it approximates.
+    The force of a spring without a damper does not jump: for such a spring the result equals the unrolled
+    derivative, and the description says so.
     """
 
     name = "event-aware"
@@ -270,13 +270,13 @@ class ThroughContacts(BallMethod):
     description = "the derivative of the motion, the times of its contacts moving along (saltation at each)"
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """The derivative, by reverse mode.
+        """Compute the derivative by reverse mode.
 
         Raises:
             NumericalError: a contact grazes the floor, so that its time has no derivative.
 
-        Error: none beyond rounding where impacts are located inside the step; else of the order of the step,
-        as the rollout itself.
+        Error: none beyond rounding if impacts are located inside the step; otherwise of the order of the
+        step, like the error of the rollout itself.
         """
         world = problem.world
         located = isinstance(world.integrator, EventLocated)
@@ -313,7 +313,7 @@ class _SaltatingReset:
     """A contact that resets the velocity at the end of a step, with the derivative of the motion."""
 
     def move(self, motion: Motion) -> Moved:
-        """The step of the contact; derivatives go through the flight and the saltation matrix alone."""
+        """Compute the step with its contact; derivatives use only the flight and the saltation matrix."""
         made = super().move(motion)  # type: ignore[misc]
         height, v = motion.integrator.fly(motion.y, motion.v, motion.free, motion.rounding)
         arrived, nothing, bounce = lax.stop_gradient(v), jnp.zeros_like(v), self.restitution.astype(v.dtype)  # type: ignore[attr-defined]
@@ -343,7 +343,7 @@ class _SaltatingProjection(_SaltatingReset, Projection):
 
 class _SaltatingPenalty(Penalty):
     def move(self, motion: Motion) -> Moved:
-        """A spring that starts at 0 moves no tangent, a damper does: the force jumps by -damping v."""
+        """Compute a step: the force of a damper jumps by -damping v, which changes tangents."""
         contact = super().move(motion).record.contact
         y, v = lax.stop_gradient((motion.y, motion.v))
         jump = jnp.where(contact, -1.0, 1.0).astype(v.dtype) * lax.stop_gradient(self.damping) * v
@@ -365,7 +365,7 @@ def _normal(v):
 
 
 def _events(problem: BallProblem, run: BallRun) -> tuple[int, int]:
-    """How many contacts a run has, and how many of them graze."""
+    """Count the contacts of a run, and the grazing ones among them."""
     world, contact = problem.world, run.contact
     free = jax.vmap(lambda step: world.free(step, contact.shape[1:]))(jnp.arange(run.steps))
     free, v = np.asarray(free, np.float64), run.v[:-1].astype(np.float64)

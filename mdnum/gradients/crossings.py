@@ -1,10 +1,10 @@
-"""What a flip does to a gradient: the time at which a pair crosses its cutoff moves with everything else.
+"""Contribution of flips to a gradient, through the time at which a pair crosses its cutoff.
 
-Where the force jumps, a perturbed pair feels it earlier or later, and its momentum is another one ever
-after. Differentiating the steps of a program never sees that; the error does not shrink with the time step.
+Where the force jumps, a perturbed pair crosses earlier or later, and its momentum differs ever after.
+Differentiating the steps of a program misses this change; the error does not shrink with the time step.
 The term is the saltation term of mdnum.numerics, with the cutoff's sphere as the threshold, written for the
-reverse pass. A loss that sees the potential energy or the virial jumps with them too: where its frames follow
-one another at equal times, a later crossing moves the jump across a share of them.
+reverse pass. A loss that uses the potential energy or the virial jumps with them too: if its frames follow
+one another at equal times, a later crossing moves the jump across a fraction of a frame.
 
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
 dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.
@@ -36,7 +36,7 @@ _ROOM_BITS = 6
 
 
 class Met(NamedTuple):
-    """Crossings in a compiled program, padded: those of a row, or of all rows one after the other."""
+    """Crossings in a compiled program, padded to a fixed size, of one row or of all rows in sequence."""
 
     # i, j: sorted atoms; beyond the last one where there is no crossing
     i: Int[Array, "most"]
@@ -52,14 +52,14 @@ class Met(NamedTuple):
 
 
 class MetRows(NamedTuple):
-    """The crossings of a stretch, as a compiled program is given them."""
+    """The crossings of a stretch of steps, in the padded form that a compiled program needs."""
 
     met: Met  # of all rows
     spans: Int[np.ndarray, "room 2"]  # where each row begins, and how many crossings it has
     slots: Int[np.ndarray, "most"]  # numbers from 0, as many as the row with the most has, or a few more
 
     def row(self, span: Int[Array, "2"], atoms: int) -> Met:
-        """Those of the row of a span."""
+        """Return the crossings of the row that a span describes."""
         most = len(self.slots)
         own = Met(*(lax.dynamic_slice_in_dim(column, span[0], most, -1) for column in self.met))
         # behind them are those of the next row
@@ -70,7 +70,7 @@ class MetRows(NamedTuple):
 
 @dataclass(frozen=True)
 class Crossings:
-    """The flips of one stretch, as events with a time."""
+    """The flips of one stretch of steps, as events with a time."""
 
     ledger: FlipTable  # the flips
     row: Int[np.ndarray, "crossings"]  # row of each in its stretch, ascending
@@ -97,17 +97,18 @@ class Crossings:
 
     @property
     def kick(self) -> Float[np.ndarray, "crossings"]:
-        """How the momentum along the pair follows its distance through the crossing, energy/length per
-        (length/time): of the saltation of (distance, momentum), whose threshold is the cutoff."""
+        """Derivative of the momentum along the pair by its distance through the crossing, energy/length per
+        (length/time): the saltation of (distance, momentum), whose threshold is the cutoff.
+        """
         return self.force / self.speed
 
     def spans(self, room: int) -> Int[np.ndarray, "room 2"]:
-        """Where each row begins, and how many crossings it has."""
+        """Return where each row begins and how many crossings it has."""
         starts = np.searchsorted(self.row, np.arange(room + 1))
         return np.stack([starts[:-1], np.diff(starts)], axis=1)
 
     def rows(self, room: int) -> MetRows:
-        """As a compiled program is given them, of as many rows as there is room for."""
+        """Return the crossings in padded form for a compiled program, with `room` rows."""
         spans = self.spans(room)
         most = _padded(int(spans[:, 1].max(initial=0)))
         # a slice of so many fits everywhere
@@ -127,16 +128,16 @@ class Crossings:
         return MetRows(Met(*map(padded, columns)), spans, np.arange(most))
 
     def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
-        """Values of padded rows, one crossing after the other."""
+        """Return the values of padded rows as one sequence without padding, one entry per crossing."""
         return values[np.arange(values.shape[1]) < self.spans(len(values))[:, 1:]]
 
     def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
-        """With the weights that the reverse pass found."""
+        """Return the crossings with the weights that the reverse pass computed."""
         return replace(self, weight=self.gathered(weights))
 
 
 def _padded(count: int) -> int:
-    """A power of four that holds so many: few are compiled for."""
+    """Return a power of four that is at least the count, so that few sizes are compiled."""
     bits = max(_ROOM_BITS, count.bit_length())
     return 1 << (bits + bits % 2)
 
@@ -152,31 +153,31 @@ def onto_crossings(
     pull: Float[Array, "most"] | None = None,
     squeeze: Float[Array, "*axes"] | None = None,
 ) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"], Float[Array, "3 3"]]:
-    """The transpose of the saltation of one step's crossings.
+    """Transpose the saltation of one step's crossings.
 
     A crossing lies between two steps, on average in their middle, where positions are half a drift short of
-    the later step's. With n from i to j, the force jump f and the radial speed s = n · (v_j - v_i) +
-    n · (dh/dt h^-1) r, in which the box has its part, a distance that is longer by dr there (by
-    n · (dx_j - dx_i) less what the lattice vectors between the two moved) changes by a share dr/s of a time
-    how long the jump has acted:
+    the later step's. Let n be the unit vector from i to j, f the force jump and s = n · (v_j - v_i) +
+    n · (dh/dt h^-1) r the radial speed, including the motion of the box. If the distance there is longer by
+    dr (n · (dx_j - dx_i), less the change of the lattice vectors between the two), the jump acts for a time
+    that differs by dr/s:
 
         d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
-        d(W) = (f r_cut n ⊗ n) dr/s        on whatever the integrator makes of the virial's tensor W
+        d(W) = (f r_cut n ⊗ n) dr/s        on the integrator's use of the virial tensor W
 
-    so the cotangent of dr is f/s n · (v̄_j/m_j - v̄_i/m_i) + f r_cut/s n · S n, where S is the cotangent of the
-    virial in a step over the time step.
+    so the cotangent of dr is f/s n · (v̄_j/m_j - v̄_i/m_i) + f r_cut/s n · S n, where S is the cotangent of
+    the virial in a step, divided by the time step.
 
     Args:
-        met: the crossings between the step before and this one.
+        met: the crossings between the previous step and this one.
         onto_x, onto_v: cotangents of this step's positions and of the velocities that lead there.
-        onto_sums: cotangents of potential energy and virial per time, as frames at equal times see them.
+        onto_sums: cotangents of potential energy and virial per time, for frames at equal times.
         timestep: internal time. types: number of pair types.
-        pull: cotangent of each distance, where a crossing does not act along its pair alone.
-        squeeze: cotangent of the virial that the integrator acts on, or of its tensor, over the time step.
+        pull: cotangent of each distance, for a crossing that does not act along its pair alone.
+        squeeze: cotangent of the virial that the integrator uses, or of its tensor, over the time step.
 
     Returns:
-        what is added to the cotangent of the positions, derivatives of the loss by the cutoff of each
-        crossing, by the cutoff of each pair type, and by the lattice vectors.
+        the contribution to the cotangent of the positions, and the derivatives of the loss by the cutoff of
+        each crossing, by the cutoff of each pair type, and by the lattice vectors.
     """
     dtype = onto_x.dtype
     half = (0.5 * timestep).astype(dtype)
@@ -196,7 +197,7 @@ def onto_crossings(
 
 
 def _of_tensor(squeeze, normal):
-    """n · S n of each normal, of a tensor S or of a number times the unit tensor."""
+    """Return n · S n for each normal n, where S is a tensor or a number times the unit tensor."""
     return jnp.sum(normal * (squeeze @ normal), axis=0) if squeeze.ndim else squeeze
 
 
@@ -210,14 +211,14 @@ def of_energy(
     onto: tuple[Float[Array, "3 atoms"], Float[Array, ""], Float[Array, ""]],
     squeeze: Float[Array, "*axes"] | None = None,
 ) -> Float[Array, "most"]:
-    """The cotangents of the distances at which an energy gets or loses a pair: E(with) - E(without).
+    """Compute cotangents of the distances at which an energy gains or loses a pair: E(with) - E(without).
 
-    Not the pair alone, but all whose energy it is part of feel it. The pair is put at its cutoff; the others
-    of the same step are as they are at its end.
+    Besides the pair, all atoms whose energy includes the pair are affected. The pair is placed at its cutoff;
+    other crossing pairs of the same step are as they are at the end of the step.
 
     Args:
-        met: whose `push` is one over the radial speed, negative where the pair leaves.
-        count: of its crossings.
+        met: crossings whose `push` is one over the radial speed, negative where the pair leaves.
+        count: number of crossings.
         x: this step's wrapped positions.
         onto: cotangents of the velocities, over the masses, and of potential energy and virial.
         squeeze: as for `onto_crossings`.
@@ -253,8 +254,9 @@ def of_energy(
 def _along(
     met: Met, vectors: Float[Array, "3 atoms"], matrix: Float[Array, "3 3"] | None = None
 ) -> Float[Array, "most"]:
-    """Component along each pair of the difference of a vector between its atoms; of nearest images where
-    lattice vectors are given."""
+    """Return the component along each pair of the difference of a vector between its atoms; for given lattice
+    vectors, of the nearest images.
+    """
     dtype = vectors.dtype
     there = vectors.at[:, met.j].get(mode="fill", fill_value=0)
     here = vectors.at[:, met.i].get(mode="fill", fill_value=0)
@@ -273,16 +275,16 @@ def push_through(
     r_cut: Float[Array, "types"],
     matrix: Float[Array, "3 3"],
 ) -> tuple[Float[Array, "most"], tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]], Float[Array, "2"]]:
-    """The saltation of one step's crossings, on one tangent.
+    """Apply the saltation of one step's crossings to one tangent.
 
     Args:
-        met: the crossings between the step before and this one.
+        met: the crossings between the previous step and this one.
         x, v: tangents of this step's wrapped positions and of the velocities that lead there.
         timestep: internal time. r_cut, matrix: tangents of the cutoffs and of the lattice vectors.
 
     Returns:
-        tangents of the distances at the crossings, what is added to x and v, and the times by which the
-        jumps of potential energy and virial come earlier, times these jumps, summed.
+        tangents of the distances at the crossings, increments of x and v, and the sums over crossings of the
+        jumps of potential energy and virial, each times the time by which the jump comes earlier.
     """
     dtype = x.dtype
     half = (0.5 * timestep).astype(dtype)
@@ -297,14 +299,14 @@ def push_through(
 
 
 def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Crossings:
-    """The flips of a stretch as events: their normals and radial speeds between two steps.
+    """Return the flips of a stretch as events, with their normals and radial speeds between two steps.
 
     Args:
-        stretch: made with its flips.
+        stretch: recorded with its flips.
         guard: radial speed, length per internal time, below which a crossing is left out.
 
     Raises:
-        InputError: it was made without.
+        InputError: the stretch was recorded without flips.
     """
     ledger = stretch.ledger
     if ledger is None:
@@ -320,13 +322,13 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
     atoms = stretch.x.shape[2]
 
     def positions(rows: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Of an atom in each of some rows; row -1 is the step before the first."""
+        """Return the positions of an atom in each of some rows; row -1 is the step before the first."""
         axes = [of + k * atoms for k in range(3)]
         seen = [x.take(3 * atoms * rows + at, mode="clip") for at in axes]
         return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)
 
     def apart(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nearest images of the differences, and the lattice vectors from these to the wrapped ones."""
+        """Return minimum-image differences, and the lattice vectors from these to the wrapped ones."""
         start, end = positions(rows, i).astype(np.float64), positions(rows, j).astype(np.float64)
         inverse = inverses[rows + 1]
         if stretch.cell.size:

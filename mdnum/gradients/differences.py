@@ -1,11 +1,11 @@
 """Gradients from many runs: differences that estimate their own error, and means over replicas.
 
-A replica is the same system with other velocities, and with another noise where there is a thermostat. Each
-is a run with lists of its own, so replicas are made one after another, on the devices that there are.
+A replica is the same system with different velocities, and with different noise under a thermostat. Each
+replica is a run with its own neighbor lists, so replicas run one after another on the available devices.
 
 Between two crossings that change the step at which they happen, a loss with a force jump follows the
-derivative of its steps; at each of them it jumps. What the event-aware gradient predicts is the slope over
-many such jumps, so a difference that shall be compared with it must reach across many of them.
+derivative of its steps; at each of them it jumps. The event-aware gradient predicts the slope over many such
+jumps, so a finite difference that is compared with it must span many jumps.
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ class Differentiated(NamedTuple):
 
 
 def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
-    """The derivative of f at x by Richardson's extrapolation of central differences (Ridders 1982).
+    """Differentiate f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
-    Steps shrink by 1.4 and the extrapolation with the least estimated error wins, so that neither a step
-    that is too wide nor the noise of one that is too narrow does.
+    Steps shrink by a factor of 1.4, and the extrapolation with the least estimated error is returned: it
+    avoids both the truncation error of wide steps and the noise of narrow steps.
 
     Args:
-        f: of one number. x: where. step: the largest step. levels: number of steps.
+        f: function of one number. x: point. step: the largest step. levels: number of steps.
     """
     shrink = 1.4
     table = np.full((levels, levels), np.nan)
@@ -91,14 +91,14 @@ def richardson(f: Callable[[float], float], x: float, step: float, levels: int =
 
 
 def noise_of(values: Float[np.ndarray, "points"]) -> float:
-    """The standard deviation of the noise in values at equal, tiny spacings; 0 where all are the same.
+    """Estimate the standard deviation of the noise in values at equal, tiny spacings; 0 if all are equal.
 
-    Differences of an order k take away what is smooth and keep the noise, enlarged by a known factor.
+    Differences of order k remove the smooth part and keep the noise, enlarged by a known factor.
 
     Args:
-        values: at least 4, so close that the function is nearly straight over all of them.
+        values: at least 4, so closely spaced that the function is nearly linear over all of them.
 
-    Error: within a factor of a few, from so few values.
+    Error: a factor of a few, because the values are few.
     Source: J. J. Moré, S. M. Wild, Estimating Computational Noise, SIAM J. Sci. Comput. 33 (2011) 1292.
     """
     levels, signs = [], []
@@ -124,14 +124,14 @@ class DifferenceStep(NamedTuple):
 
 
 def choose_step(f: Callable[[float], float], x: float, first: float, spacing: float) -> DifferenceStep:
-    """The step at which truncation and noise of a central difference are about alike.
+    """Choose the step at which truncation and noise of a central difference are about equal.
 
     Args:
-        first: the step to begin with, which is never passed: beyond it the function may be another one.
-        spacing: between the values of which the noise is estimated: some rounding errors of x.
+        first: the initial step, which is also the largest: beyond it the function may differ in kind.
+        spacing: between the values from which the noise is estimated: some rounding errors of x.
 
-    Error: the truncation is estimated from differences over one and two steps, and a function that jumps in
-    between may have one that is too small by chance; extrapolate and compare.
+    Error: the truncation is estimated from differences over one and two steps; for a function that jumps in
+    between, the estimate may be too small by chance; extrapolate and compare.
     """
     values = np.full(_POINTS, f(x))
     for _ in range(_WIDENINGS):
@@ -156,10 +156,10 @@ def choose_step(f: Callable[[float], float], x: float, first: float, spacing: fl
 
 
 def nonzero(problem: Problem, name: str) -> float:
-    """The value of a scalar parameter, of which a step is a share.
+    """Return the value of a scalar parameter, to which finite-difference steps are relative.
 
     Raises:
-        InputError: it is 0.
+        InputError: the value is 0.
     """
     here = float(parameters.value(problem.simulation, name))
     if here == 0:
@@ -172,7 +172,7 @@ def nonzero(problem: Problem, name: str) -> float:
 
 @dataclass(frozen=True)
 class FiniteDifferences(Method):
-    """Values of the loss at shifted parameters, extrapolated; scalars only.
+    """Central differences of the loss at shifted values of a scalar parameter, extrapolated to zero shift.
 
     Errors, steps and the noise are in the details.
     """
@@ -188,7 +188,7 @@ class FiniteDifferences(Method):
 
     @property
     def runs(self) -> int:
-        """About the number of runs that a parameter takes."""
+        """Approximate number of runs per parameter."""
         return 2 * self.levels + (0 if self.relative is not None else _CHOOSING)
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
@@ -224,7 +224,7 @@ class FiniteDifferences(Method):
 
 
 def _counter(progress: Progress | None, runs: int, phase: str) -> Callable[[], None]:
-    """To be called at every run."""
+    """Return a function that counts runs and reports progress; call it once per run."""
     done = 0
 
     def count() -> None:
@@ -238,10 +238,10 @@ def _counter(progress: Progress | None, runs: int, phase: str) -> Callable[[], N
 
 @dataclass(frozen=True)
 class ShadowDifferences(Method):
-    """Differences of the same run in a wider format than its own: what it would give without its rounding.
+    """Differences of the same run in a wider format than its own: the derivative without the run's rounding.
 
-    Float64 has no wider format that a long run could be made in; its differences state themselves how far
-    their noise lets them be trusted.
+    For float64 no wider format is practical in a long run; finite differences in float64 estimate their own
+    noise.
     """
 
     relative: float = 1e-4  # the largest step as a share of the parameter
@@ -283,7 +283,7 @@ class Replicas:
             raise InputError(f"{seen}; expected at least 2, and at least 0")
 
     def of(self, problem: Problem) -> list[Problem]:
-        """The problem with each of the starts."""
+        """Return the problem with each of the starts."""
         return [
             replace(problem, simulation=replica(problem.simulation, self.seed + k, self.settle))
             for k in range(self.count)
@@ -291,7 +291,7 @@ class Replicas:
 
 
 def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
-    """The same system with new velocities of its temperature, and a noise of its own.
+    """Return the same system with new velocities at its temperature, and with noise of its own.
 
     Args:
         seed: of velocities and noise. settle: steps to run before the start.
@@ -313,7 +313,7 @@ def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
 
 
 def settled(simulation: Simulation, steps: int) -> Simulation:
-    """The simulation where it is after this many steps, as a start.
+    """Run a simulation for this many steps and return the final state as a new start.
 
     Raises:
         NumericalError: the run blew up.
@@ -340,7 +340,7 @@ class Estimate:
 
     @classmethod
     def from_replicas(cls, values: Sequence[Any] | np.ndarray) -> Estimate:
-        """From the values of all replicas."""
+        """Create the estimate from the values of all replicas."""
         of = np.stack([np.asarray(value, np.float64) for value in values])
         return cls(np.asarray(of.mean(axis=0)), np.asarray(of.std(axis=0, ddof=1) / np.sqrt(len(of))), of)
 
@@ -349,7 +349,7 @@ class Estimate:
 class Ensemble(Method):
     """The mean over replicas of another method's gradient, at several horizons.
 
-    Standard errors and the horizon of noise are in the details.
+    Standard errors and the noise horizon are in the details.
     """
 
     method: Method = field(default_factory=EventAware)  # applied to each replica
@@ -393,7 +393,7 @@ class Ensemble(Method):
         return replace(made, description=f"the mean over replicas of {self.method.description}")
 
     def _horizons(self, problem: Problem) -> list[int]:
-        """Steps, shortest first; those at which the loss sees nothing are left out."""
+        """Return the horizons in steps, shortest first, without those at which the loss uses no frame."""
         found = []
         for k in reversed(range(self.halvings + 1)):
             steps = problem.steps >> k
@@ -407,7 +407,7 @@ class Ensemble(Method):
 
 
 def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
-    """A method's gradient of every problem, in order; one worker for each device where there are several."""
+    """Yield a method's gradient of every problem, in order; several devices get one worker each."""
     devices = jax.local_devices()
     if len(devices) < 2:
         yield from (method(one, names) for one in problems)
@@ -422,7 +422,7 @@ def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
 
 
 def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
-    """The first horizon from which on the standard error passes the mean; None where it does not."""
+    """Return the first horizon from which on the standard error exceeds the mean; None if there is none."""
     mine = [row for row in rows if row["name"] == name]
     kept = [k for k, row in enumerate(mine) if row["error"] < row["mean"]]
     after = max(kept, default=-1) + 1
@@ -433,9 +433,10 @@ def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
 class SmoothedDifferences(Method):
     """Central differences with wide steps over replicas that share their random numbers.
 
-    Of several steps, each twice the next, pairs are extrapolated to no step. The widest pair is taken that
-    differs from no narrower one by more than twice the standard error of the difference: narrower steps
-    have more of the noise of single events. Standard errors, steps and moved crossings are in the details.
+    Each pair of successive steps (the first twice the second) is extrapolated to zero step. The widest pair
+    is used that differs from no narrower pair by more than twice the standard error of the difference:
+        narrower
+    steps have more noise from single events. Standard errors, steps and moved crossings are in the details.
     """
 
     relative: float = 0.002  # the widest step as a share of the parameter
@@ -482,7 +483,7 @@ class SmoothedDifferences(Method):
 
 
 def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable[[], None]):
-    """The loss of every start at shifted parameters, and the set of its crossings, by step and pair."""
+    """Return the loss of every start at shifted parameters, and the set of its crossings by step and pair."""
     found = []
     for start in starts:
         made, met = start.at(values), set()
@@ -499,14 +500,14 @@ def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable
 
 
 def _share(high, low) -> float | None:
-    """Share of the crossings that are not in both runs at the same step; None where there are none."""
+    """Return the fraction of crossings that are not in both runs at the same step; None if there are none."""
     total = sum(len(a[1]) + len(b[1]) for a, b in zip(high, low, strict=True))
     differing = sum(len(a[1] ^ b[1]) for a, b in zip(high, low, strict=True))
     return differing / total if total else None
 
 
 def _chosen(found: Float[np.ndarray, "steps replicas"]) -> tuple[Estimate, float, int]:
-    """The extrapolated derivative, its error, and which step it is from, of differences by step."""
+    """From differences by step, return the extrapolated derivative, its error, and the index of its step."""
     if len(found) == 1:
         only = Estimate.from_replicas(found[0])
         return only, float(only.error), 0

@@ -1,6 +1,7 @@
-"""Gradients in the shape that JAX gives them, for training loops.
+"""Gradients for training loops, in the form that JAX returns.
 
-The run is made on the host, list by list; a transformation that would trace it as one program cannot.
+The host runs the simulation, one neighbor list after another, so a transformation that traces it as one
+program (jit, vmap) is not supported.
 """
 
 from __future__ import annotations
@@ -23,27 +24,27 @@ from mdnum.gradients.problem import Gradient, Method, Problem, Values, method
 def value_and_grad(
     problem: Problem, names: Sequence[str], method: Method | str = "event-aware", *, has_aux: bool = False
 ) -> Callable[[Values], tuple[Any, dict[str, np.ndarray]]]:
-    """A function that gives the loss and its gradient, as `jax.value_and_grad` does.
+    """Return a function that computes the loss and its gradient, like `jax.value_and_grad`.
 
     Example:
         >>> f = mdnum.value_and_grad(problem, ["sigma"])
         >>> value, slopes = f({"sigma": 1.01})
 
     Args:
-        names: parameters to differentiate by, full or short names. method: a method, or its name.
-        has_aux: whether to return the whole `Gradient` too, as ((value, gradient), gradient by name).
+        names: full or short names of the parameters to differentiate by. method: a method, or its name.
+        has_aux: whether to return the `Gradient` object too, as ((value, gradient), gradient by name).
 
     Returns:
-        values by name (any of the names; the others stay as the system file has them) to (value, gradient by
-        name), spelled as they were asked for. Of a complex loss z both are complex, and the derivative by a
+        a function from values by name (parameters without a value keep that of the system file) to (value,
+        gradient by name), with names as given. For a complex loss z both are complex; the derivative by a
         real parameter p is dz/dp = d Re z/dp + i d Im z/dp, without a conjugate: d|z|² = 2 Re(conj(z) dz),
         d arg z = Im(dz/z). It is no direction of descent; `mdnum grad` and `trust` take real losses only.
 
     Raises:
-        InputError: no such parameter or method, or it does not apply; a value is not real.
+        InputError: a parameter or method does not exist, the method does not apply, or a value is not real.
 
     Warns:
-        UserWarning: a derivative that is exactly zero, with the reason.
+        UserWarning: a derivative is exactly zero; the warning gives the reason.
     """
     chosen, full = _chosen(problem, names, method)
     # a word for several parameters is none of them
@@ -64,18 +65,18 @@ def differentiable(
     method: Method | str = "event-aware",
     watch: Callable[[Gradient], None] | None = None,
 ) -> Callable[[Values], jax.Array]:
-    """The loss as a function that JAX can differentiate in reverse mode.
+    """Return the loss as a function that JAX can differentiate in reverse mode.
 
-    Parameters may be any pytree: put a function of your own before it, which makes the named values of it,
-    and `jax.grad` goes through both.
+    To use any pytree of parameters, compute the named values from it in a function of your own; `jax.grad`
+    differentiates the composition.
 
     Args:
-        problem, names, method: as for `value_and_grad`, which see for what is raised and warned of.
-        watch: called with the whole gradient each time that one is worked out.
+        problem, names, method: as for `value_and_grad`, which also lists errors and warnings.
+        watch: called with the `Gradient` object each time that a gradient is computed.
 
     Returns:
-        values by name to the loss, a scalar; of a complex one `jax.grad` takes real functions, as jnp.abs.
-        It runs outside of `jit` and `vmap`.
+        a function from values by name to the scalar loss; apply a real function such as jnp.abs to a complex
+        loss before `jax.grad`. The function runs only outside of `jit` and `vmap`.
     """
     chosen, full = _chosen(problem, names, method)
 
@@ -117,10 +118,10 @@ def _chosen(problem: Problem, names: Sequence[str], word: Method | str) -> tuple
 
 
 def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) -> Gradient:
-    """The gradient, with a warning of a derivative that is exactly zero: a training loop reads no notes.
+    """Compute the gradient, and warn of a derivative that is exactly zero: a training loop reads no notes.
 
     Raises:
-        NumericalError: it is not finite; names the first operation at fault where one is.
+        NumericalError: the gradient is not finite; the error names the first operation at fault, if known.
     """
     found = chosen(problem, names)
     for name, value in found.gradient.items():
@@ -145,10 +146,10 @@ def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) ->
 
 
 def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str, np.ndarray]:
-    """Values by full name.
+    """Return the values by full name.
 
     Raises:
-        InputError: a name that is not differentiated by.
+        InputError: a value was given for a parameter that is not differentiated by.
     """
     out = {}
     for word, value in values.items():

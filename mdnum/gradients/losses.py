@@ -1,8 +1,8 @@
 """Losses of a trajectory, evaluated frame by frame: the trajectory is never stored whole.
 
-A loss looks at some frames, each together with the first, adds up what it sees, and makes a number of the
-sums. That is enough for averages, correlations with the start and histograms, and its derivative needs one
-frame at a time too. A loss that the command line can name is a class here with a name, a label and a unit.
+A loss observes some frames, each together with the first frame, sums its observations, and computes a number
+from the sums. This covers averages, correlations with the start, and histograms; the derivative also needs
+one frame at a time. A loss available on the command line is a class here with a name, a label and a unit.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ NOT_REAL = ("it is complex; expected a real number", "Use gradients.value_and_gr
 
 
 class LossFrame(NamedTuple):
-    """One step as a loss sees it, atoms in the user's order."""
+    """One step of a trajectory as input of a loss, atoms in the user's order."""
 
     step: Int[Array, ""]  # its number
     x: Float[Array, "3 atoms"]  # positions as if the box had no faces, length
@@ -40,7 +40,7 @@ class LossFrame(NamedTuple):
 
 
 class LossContext(NamedTuple):
-    """Quantities that a loss may use besides a frame; the box is that of the frame."""
+    """Quantities that a loss may use in addition to a frame; the box is that of the frame."""
 
     masses: Float[Array, "atoms"]  # of the atoms
     matrix: Float[Array, "3 3"]  # lattice vectors as rows, length
@@ -51,7 +51,7 @@ class LossContext(NamedTuple):
 
 
 class Loss(eqx.Module):
-    """A number made of the frames of a trajectory."""
+    """A number computed from the frames of a trajectory."""
 
     # name, label, unit: its name on the command line, a few words, and its unit with the names of `Units` in
     # braces
@@ -70,28 +70,28 @@ class Loss(eqx.Module):
             )
 
     def wrong(self, seen: str, remedy: str | None = None) -> InputError:
-        """The error for options that make no sense."""
+        """Return an error for inconsistent options of this loss."""
         return InputError(seen, remedy=remedy, where=f"loss {self.name}")
 
     @classmethod
     def named(cls, options: dict[str, Any], simulation: Simulation, steps: int) -> Loss:
-        """The loss of a system with these options, as the command line gives them."""
+        """Create the loss of a system from the options of the command line."""
         return cls(**options)
 
     def looks_at(self, steps: Int[np.ndarray, "rows"], last: int) -> Bool[np.ndarray, "rows"]:
-        """Steps whose frames the loss uses, for a run with a given last step."""
+        """Return which steps' frames the loss uses, for a run with a given last step."""
         return (steps >= self.first) & ((steps - self.first) % self.every == 0)
 
     @abstractmethod
     def observe(self, frame: LossFrame, origin: LossFrame, around: LossContext) -> Any:
-        """What one frame adds: a pytree of arrays, differentiable in both frames; `origin` is step 0."""
+        """Return a frame's contribution as a pytree, differentiable in both frames; `origin` is step 0."""
 
     def value(self, total: Any, frames: Int[Array, ""] | int) -> Inexact[Array, ""]:
-        """The number, from the sum of what was observed and the number of frames: the mean."""
+        """Compute the loss from the sum of observations and the number of frames: the mean by default."""
         return total / frames
 
     def reason_unavailable(self, around: LossContext) -> str | None:
-        """Why it has no meaning in these surroundings; None where it has."""
+        """Return why the loss is not defined for this system and box; None if it is defined."""
         return None
 
 
@@ -106,12 +106,12 @@ class _OfLast(Loss):
 
 
 class Custom(Loss):
-    """Any function of the trajectory that is a function of sums over frames.
+    """A user-defined loss: any function of sums over frames.
 
     Attributes:
-        see: (frame, origin, surroundings) to a pytree of arrays that is summed over frames.
-        conclude: (sum, number of frames) to a scalar.
-        single: `see` does not look at the origin, so that the loss is one of an ensemble, too.
+        see: maps (frame, origin, surroundings) to a pytree of arrays that is summed over frames.
+        conclude: maps (sum, number of frames) to a scalar.
+        single: whether `see` ignores the origin, so that the loss is also an ensemble average.
     """
 
     name = "custom"
@@ -133,7 +133,7 @@ class Custom(Loss):
 
 
 class ComplexPart(Loss):
-    """The real part of a factor times a complex loss: with -i its imaginary part."""
+    """The real part of a factor times a complex loss; the factor -i gives the imaginary part."""
 
     name = "part of a complex loss"
     inner: Loss = eqx.field(kw_only=True)
@@ -236,7 +236,7 @@ class EinsteinDiffusion(Loss):
     """Diffusion constant from the slope of the mean squared displacement, length² per unit of time.
 
     A straight line is fitted to the displacements since step 0 of all frames, and D is a sixth of its slope.
-    Displacements are ballistic at first: look from a step on at which they no longer are.
+    Displacements are ballistic at first: set `first` to a step after the ballistic regime.
 
     Source: M. P. Allen, D. J. Tildesley, Computer Simulation of Liquids (2017), section 2.7.
     """
@@ -266,10 +266,10 @@ class EinsteinDiffusion(Loss):
 class GreenKuboDiffusion(Loss):
     """Diffusion constant as the integral of the velocity autocorrelation, length² per unit of time.
 
-    A third of the integral of v(0) · v(t), averaged over atoms, from step 0 to `until`, by the trapezoidal
-    rule over every n-th step.
+    D is a third of the integral of v(0) · v(t), averaged over atoms, from step 0 to `until`, by the
+    trapezoidal rule over every n-th step.
 
-    Error: of order (every × timestep)² in the correlation's slope at `until`; at 0 it has none.
+    Error: of order (every × timestep)² times the correlation's slope at `until`; at 0 the slope vanishes.
     Source: as for `EinsteinDiffusion`.
     """
 
@@ -305,10 +305,10 @@ class GreenKuboDiffusion(Loss):
 
 
 class RadialDistribution(Loss):
-    """A number made of g(r), the density of pairs against that of an ideal gas, averaged over frames.
+    """A number computed from g(r), the pair density relative to an ideal gas, averaged over frames.
 
-    Every distance is shared between the four nearest bins by cubic B-splines, which add up to one: g(r) has
-    two continuous derivatives by every position. A frame costs of the order of atoms² operations and of atoms
+    Cubic B-splines, which add up to one, share every distance among the four nearest bins: g(r) has two
+    continuous derivatives by every position. A frame costs of the order of atoms² operations and of atoms
     memory.
 
     Source: of the loss, J. P. Hansen, I. R. McDonald, Theory of Simple Liquids (2013), section 2.5.
@@ -352,7 +352,7 @@ class RadialDistribution(Loss):
         return (jnp.arange(self.bins, dtype=jnp.float64) + 0.5) * self.width
 
     def reason_unavailable(self, around: LossContext) -> str | None:
-        """Distances are those of nearest images."""
+        """Return why g(r) is not defined here; distances are those of nearest images."""
         if why := _bulk(around):
             return why
         half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2
@@ -384,7 +384,7 @@ class RadialDistribution(Loss):
         return counts * around.volume / (atoms * (atoms - 1) * shells)
 
     def curve(self, total, frames) -> Float[Array, "bins"]:
-        """g(r) at the centers of the bins, from the sum over frames."""
+        """Return g(r) at the centers of the bins, from the sum over frames."""
         return total / frames
 
     def value(self, total, frames):
@@ -395,7 +395,7 @@ class RadialDistribution(Loss):
 
 
 def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Array, "bins"]:
-    """Counts of bins with centers at (k + 1/2) width, each distance shared by a cubic B-spline."""
+    """Count distances in bins centered at (k + 1/2) width; a cubic B-spline shares each among bins."""
     u = r / width - 0.5
     left = lax.stop_gradient(jnp.floor(u))
     t = u - left
@@ -415,7 +415,7 @@ def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Ar
 
 
 def _bulk(around: LossContext) -> str | None:
-    """Why nothing is measured by the volume; else None."""
+    """Return a message if the box has no volume; otherwise None."""
     return None if float(around.volume) > 0 else "the box has no volume: it is not periodic everywhere"
 
 
@@ -439,13 +439,13 @@ for _loss in (
 
 
 def parse(text: str, simulation: Simulation, steps: int) -> Loss:
-    """The loss that a text names.
+    """Return the loss that a text describes.
 
     Args:
-        text: a name of `LOSSES`, with options behind a colon: "potential:every=10,first=500".
+        text: a name of `LOSSES`, optionally with options after a colon: "potential:every=10,first=500".
 
     Raises:
-        InputError: no such loss, or it has no such option.
+        InputError: the loss, or an option of the loss, does not exist.
     """
     name, _, rest = text.partition(":")
     name = name.strip()

@@ -1,4 +1,4 @@
-"""What a rollout can be differentiated by: where a parameter is in all that a rollout is made of.
+"""Parameters that a rollout can be differentiated by, and where each one enters the rollout.
 
 Names, values and units are those of `mdnum.systems.parameters`.
 """
@@ -49,7 +49,7 @@ class Cotangents:
 
 
 class Direction(NamedTuple):
-    """Derivatives of everything that a rollout is made of by one number, or by several along a first axis."""
+    """Derivatives of all inputs of a rollout by one number, or by several numbers along a first axis."""
 
     # x, v: of the positions and velocities of step 0, user's order
     x: Float[Array, "*columns 3 atoms"]
@@ -61,23 +61,23 @@ class Direction(NamedTuple):
 
 
 def quantities(force: PairForce | ManyBodyForce) -> Any:
-    """The parameters of a force that are quantities: a pytree of arrays.
+    """Return the differentiable quantities of a force, as a pytree of arrays.
 
-    Of a many-body potential they are its arrays and its constants, by name.
+    For a many-body potential they are its arrays and constants, by name.
     """
     return force.model if isinstance(force, PairForce) else manybody.quantities_of(force.potential)
 
 
 def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce | ManyBodyForce:
-    """The force with other quantities; inside jit too."""
+    """Return the force with other quantities; the function also works inside jit."""
     if isinstance(force, PairForce):
         return replace(force, model=values)
     return replace(force, potential=manybody.with_quantities(force.potential, values))
 
 
 def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Array, Array]:
-    """Derivatives by the integrator's numbers, first positions and velocities, from those of the extra state
-    that these begin with.
+    """Propagate cotangents of the initial extra state to the integrator's numbers and to the initial
+    positions and velocities.
 
     Args:
         start: the state of step 0.
@@ -92,7 +92,7 @@ def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Arr
 
 
 def names(simulation: Simulation) -> tuple[str, ...]:
-    """Parameters that a simulation can be differentiated by."""
+    """Return the names of all parameters that a simulation can be differentiated by."""
     # there is no derivative by a temperature of 0
     cold = () if value(simulation, "dynamics.temperature") else ("dynamics.temperature",)
     model = simulation.model
@@ -103,10 +103,10 @@ def names(simulation: Simulation) -> tuple[str, ...]:
 
 
 def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
-    """Full names of parameters, from full or short ones; a path to several, as "potential", means them all.
+    """Return full names of parameters given by full or short names; a path ("potential") means all below it.
 
     Raises:
-        InputError: no such parameter, or one that is no quantity.
+        InputError: a parameter does not exist, or is not a differentiable quantity.
     """
     known, out = names(simulation), []
     for word in words:
@@ -129,7 +129,7 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any], Any]]:
-    """Where a parameter is in what a rollout is made of, and how that moves with it (None: it is it)."""
+    """Return where a parameter enters a rollout, each place with its derivative (None for the identity)."""
     if name in ("initial.positions", "initial.velocities"):
         return [((lambda of: of.x) if name == "initial.positions" else (lambda of: of.v), None)]
     v = simulation.velocities.T
@@ -153,7 +153,7 @@ def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any
 
 
 def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.ndarray, "..."]:
-    """The derivative by a named parameter, of the shape of its value."""
+    """Return the derivative by a named parameter, in the shape of the parameter's value."""
     entry = parameters.entry(simulation, name)
     if name == "box.scale":
         return np.asarray(parts.scale)
@@ -172,7 +172,7 @@ def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.n
 
 
 def moved(simulation: Simulation, still: Direction, column: ParameterEntry) -> Direction:
-    """What moves with one number, per unit of it, where nothing else does."""
+    """Return the derivatives of all inputs by one number, per unit of it, with all other numbers fixed."""
     entry = parameters.entry(simulation, column.name)
     unit_entry = np.zeros(np.shape(value(simulation, entry.whole)))
     unit_entry[(*entry.index, *column.index)] = 1 / entry.factor
@@ -198,7 +198,7 @@ class ParameterEntry:
 
 
 def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterEntry, ...]:
-    """The numbers that some parameters consist of, in order."""
+    """Return the single numbers that some parameters consist of, in order."""
     return tuple(
         ParameterEntry(name, tuple(int(k) for k in index))
         for name in names
@@ -209,7 +209,7 @@ def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterE
 def gathered(
     simulation: Simulation, names: Sequence[str], values: Float[np.ndarray, "columns"]
 ) -> dict[str, Float[np.ndarray, "..."]]:
-    """A value for each column, put back into the shapes of the parameters."""
+    """Put one value per column back into the shapes of the parameters."""
     shapes = {name: value(simulation, name).shape for name in names}
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
     parts = np.split(np.asarray(values, np.float64), ends[:-1])
@@ -217,7 +217,7 @@ def gathered(
 
 
 def directions(simulation: Simulation, columns: Sequence[ParameterEntry]) -> Direction:
-    """What each column moves, stacked along a first axis; per unit of the parameter's own value."""
+    """Return the derivatives of all inputs by each column, stacked along a first axis, per parameter unit."""
     nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
     still = Direction(
         nothing,

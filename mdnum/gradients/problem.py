@@ -38,10 +38,10 @@ class Problem:
         >>> mdnum.Problem(mdnum.build("argon/crystal-108"), loss, steps=100)
 
     Attributes:
-        simulation: the system as objects, its start included.
-        loss: what is made of the trajectory.
+        simulation: the system as objects, including its start.
+        loss: the number that is computed from the trajectory.
         steps: last step.
-        parts: of a complex loss the problems of its real and imaginary parts; else empty.
+        parts: for a complex loss, the problems of its real and imaginary parts; otherwise empty.
     """
 
     simulation: Simulation
@@ -83,11 +83,11 @@ class Problem:
             object.__setattr__(self, "parts", tuple(replace(self, loss=one) for one in parts))
 
     def at(self, values: Values) -> Problem:
-        """The same loss for a rollout with other parameter values."""
+        """Return the problem with the same loss for a rollout with other parameter values."""
         return replace(self, simulation=parameters.with_values(self.simulation, values)) if values else self
 
     def value(self, values: Values | None = None) -> Any:
-        """The loss, of the run that the rollout makes: a float, or of a complex loss complex."""
+        """Run the rollout and return its loss: a float, or a complex number for a complex loss."""
         made = self.at(values or {})
         runs = (RunTape(one.simulation, one.loss, one.steps, budget=0) for one in made.parts or (made,))
         return sum(factor * run.value for factor, run in zip((1, 1j), runs, strict=False))
@@ -100,15 +100,16 @@ class Problem:
 
 @dataclass(frozen=True)
 class Gradient:
-    """A derivative of a loss, and which derivative it is.
+    """A derivative of a loss, with a description of which derivative it is.
 
     Attributes:
         method: name of the method. description: which derivative this is, one sentence.
         value: the loss of the program that was differentiated.
-        gradient: derivative by full name of the parameter, of the shape of its value; complex like the loss.
-        notes: what must be known about a parameter, by name: no dependence, a missing term.
+        gradient: derivatives by full name of the parameter, in the shape of its value; complex for a complex
+            loss.
+        notes: warnings about parameters, by name: no dependence, a missing term.
         details: plain values of the method: counts, errors, tables.
-        kind: what was differentiated. depends: whether the run used each parameter, where that is known.
+        kind: what was differentiated. depends: whether the run used each parameter, if known.
     """
 
     method: str
@@ -124,11 +125,12 @@ class Gradient:
 class Method:
     """A way to differentiate a rollout: a frozen dataclass of its options, in a file with a row in METHODS.
 
-    The contract of both worlds: `ball.BallMethod` is called with the problem of a ball.
+    This base class serves both molecular dynamics and the ball; `ball.BallMethod` takes the problem of a
+    ball.
 
     Attributes:
-        name: as the command line has it. description: which derivative it gives, one sentence.
-        kind: what it differentiates.
+        name: name on the command line. description: which derivative the method computes, one sentence.
+        kind: what is differentiated.
     """
 
     name: ClassVar[str]
@@ -136,14 +138,14 @@ class Method:
     kind: ClassVar[Kind] = "steps"
 
     def reason_unavailable(self, problem: Any, names: Sequence[str]) -> str | None:
-        """Why this derivative does not exist for this problem; None where it does."""
+        """Return why this derivative does not exist for a problem; None if it exists."""
         return None
 
     def __call__(self, problem: Any, names: Sequence[str], progress: Progress | None = None) -> Gradient:
-        """The derivative by the named parameters; a complex loss takes a run for each of its parts.
+        """Compute the derivative by the named parameters; a complex loss takes one run for each of its parts.
 
         Raises:
-            InputError: it does not exist for this problem, or there is no such parameter.
+            InputError: the derivative does not exist for this problem, or a parameter does not exist.
         """
         full = self.check(problem, names)
         if not getattr(problem, "parts", ()):
@@ -156,14 +158,14 @@ class Method:
         return replace(real, value=real.value + 1j * imag.value, gradient=gradient, **told)
 
     def known(self, problem: Any, names: Sequence[str]) -> tuple[str, ...]:
-        """Full names of the parameters, of which there is none of another name."""
+        """Return the full names of the parameters; an unknown name is an error."""
         return parameters.resolve(problem.simulation, names)
 
     def check(self, problem: Any, names: Sequence[str]) -> tuple[str, ...]:
-        """Full names of the parameters.
+        """Return the full names of the parameters, after checking that the method applies.
 
         Raises:
-            InputError: no such parameter, or the method does not apply.
+            InputError: a parameter does not exist, or the method does not apply.
         """
         full = self.known(problem, names)
         why = self.reason_unavailable(problem, full)
@@ -172,11 +174,11 @@ class Method:
         return full
 
     def differentiate(self, problem: Any, names: tuple[str, ...], progress: Progress | None) -> Gradient:
-        """The derivative, of names that were checked."""
+        """Compute the derivative, for names that were already checked."""
         raise NotImplementedError
 
     def result(self, value: float, gradient: dict[str, Any], notes=None, details=None) -> Gradient:
-        """A gradient of this method."""
+        """Create a `Gradient` with the name, description and kind of this method."""
         return Gradient(self.name, self.description, value, gradient, notes or {}, details or {}, self.kind)
 
 
@@ -197,19 +199,19 @@ _SPELLINGS = {"epochs": "unrolled", "recursive": "unrolled"}
 
 
 def method(name: str) -> Method:
-    """The method of a given name, with its default options.
+    """Return the gradient method of a given name, with its default options.
 
     Example:
         >>> mdnum.method("symmetric")
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such method.
     """
     return METHODS.parse(_SPELLINGS.get(name, name))
 
 
 def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: bool) -> dict[str, str]:
-    """Notes on parameters whose derivative is exactly zero, or misses what the flips add."""
+    """Return notes on parameters whose derivative is exactly zero or lacks the contribution of the flips."""
     notes = {}
     missing = problem.jumps and not saltation
     for name, value in gradient.items():
@@ -228,10 +230,10 @@ def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: boo
 
 
 def pairs_only(simulation: Simulation, *, any_step: bool = False) -> str | None:
-    """Reason why the reverse pass for pair potentials does not apply; None where it does.
+    """Return why the reverse pass for pair potentials does not apply; None if it applies.
 
     Args:
-        any_step: whether it is for any integrator.
+        any_step: whether every integrator is supported.
     """
     if not isinstance(simulation.force, PairForce):
         return "it is for pair potentials"
@@ -239,14 +241,14 @@ def pairs_only(simulation: Simulation, *, any_step: bool = False) -> str | None:
 
 
 def one_term(simulation: Simulation) -> str | None:
-    """Why what knows a single pair potential does not apply; None where it does."""
+    """Return why a method for a single pair potential does not apply; None if it applies."""
     if simulation.pairwise and "" not in simulation.model.terms:
         return f"it is for one pair potential, and {simulation.potential.name} are several terms"
     return pairs_only(simulation)
 
 
 def rounded(simulation: Simulation) -> str | None:
-    """Why forces have no derivative: one that is rounded after every operation has none."""
+    """Return why forces in a type below 32 bits have no derivative: every operation is rounded."""
     if simulation.policy.dtype("force").itemsize < 4:
         precision = simulation.policy.force
         return f"forces in {precision} are rounded after every operation, which has no derivative"
@@ -254,13 +256,13 @@ def rounded(simulation: Simulation) -> str | None:
 
 
 def scalars_only(problem: Problem, names: Sequence[str]) -> str | None:
-    """Why differences of values do not apply."""
+    """Return why finite differences do not apply: a parameter has several entries; None otherwise."""
     large = [name for name in names if np.ndim(parameters.value(problem.simulation, name))]
     return f"{', '.join(large)}: a value for each shift of each entry would be needed" if large else None
 
 
 def in_phase(progress: Progress | None, phase: str) -> Callable[[int, int], None] | None:
-    """A callback of steps alone, that names the phase too."""
+    """Return a callback of steps alone, which adds the name of the phase."""
     if progress is None:
         return None
     return lambda step, steps: progress(step, steps, phase)

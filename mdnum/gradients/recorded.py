@@ -1,7 +1,7 @@
-"""Methods at the recorded run: reverse by symmetric Jacobians, forward by tangents, with flips and without.
+"""Gradient methods at the recorded run: reverse by symmetric Jacobians, forward by tangents.
 
-The run is made first, by the program that makes every run; then it is linearized at the states and decisions
-that it recorded, or that come by where a fixed-point run is reversed.
+The program that makes every run makes the run first. Then the run is linearized at the states and decisions
+that were recorded, or that are recomputed when a fixed-point run is reversed.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ Watch = Callable[[TapeStretch, AdjointCarry], None]
 
 @dataclass(frozen=True)
 class ReversePass:
-    """A reverse pass that has been made."""
+    """Result of a reverse pass."""
 
     tape: RunTape  # the run
     parts: Cotangents  # derivatives by all that it is made of
@@ -73,13 +73,13 @@ def passed(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> ReversePass:
-    """Run a problem and its reverse pass, which several instruments may watch.
+    """Run a problem and its reverse pass, with callbacks that receive the cotangents of every stretch.
 
     Args:
-        names: full names of the parameters. saltation: whether flips count.
+        names: full names of the parameters. saltation: whether to include the contribution of flips.
         guard: as a share of the rms radial speed of a pair. budget: bytes of the recorded run that are kept.
-        tape: the run, where it has been made; with flips, if saltation is asked for. Without saltation these
-            graze, all of them: that is the program of event-aware, which need not be compiled twice.
+        tape: the run, if already made; with flips, if saltation is requested. Without saltation all its flips
+            count as grazing: this program is the one of event-aware, which need not be compiled twice.
 
     Raises:
         InputError: saltation without a pair potential. NumericalError: the run blew up, or second
@@ -109,7 +109,7 @@ def passed(
 
 
 def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progress | None = None) -> RunTape:
-    """The run of a problem."""
+    """Run a problem and return its tape."""
     return RunTape(
         problem.simulation, problem.loss, problem.steps, flips=flips, budget=budget,
         progress=in_phase(progress, "run"),
@@ -136,7 +136,7 @@ class Symmetric(Method):
         return self.of(problem, made)
 
     def of(self, problem: Problem, made: ReversePass) -> Gradient:
-        """The gradient, of a pass that was made."""
+        """Return the gradient from a completed reverse pass."""
         tape = made.tape
         details = {"stretches": len(tape), "run again": tape.replayed, "bytes kept": tape.held}
         notes = independent(problem, made.gradient, saltation=False)
@@ -145,7 +145,7 @@ class Symmetric(Method):
 
 @dataclass(frozen=True)
 class EventAware(Method):
-    """The derivative of the flow: that of the steps, and what the time of every flip adds."""
+    """The derivative of the flow: that of the steps, plus the contribution of the time of every flip."""
 
     # radial speed below which a crossing grazes and is left out, as a share of the rms radial speed of a
     # pair. Left in, single crossings would dominate: their terms go with one over that speed
@@ -169,7 +169,7 @@ class EventAware(Method):
         return self.of(problem, made)
 
     def of(self, problem: Problem, made: ReversePass) -> Gradient:
-        """The gradient, of a pass that was made."""
+        """Return the gradient from a completed reverse pass."""
         notes = independent(problem, made.gradient, saltation=True)
         unseen = any(made.tape.jumps_unseen)
         if unseen:
@@ -180,7 +180,7 @@ class EventAware(Method):
 
 @dataclass(frozen=True)
 class Forward(Method):
-    """The derivative of the steps that ran, by tangents that are carried along with them."""
+    """The derivative of the steps that ran, by tangents that are propagated along with the steps."""
 
     # whether every flip adds what moving its time does, as the method event-aware has it
     saltation: bool = False
@@ -229,12 +229,12 @@ class Forward(Method):
 
 @dataclass(frozen=True)
 class Reversible(Method):
-    """The derivative of the steps that ran, of a run with a fixed-point integer state that is reversed.
+    """The derivative of the steps that ran, for a run with a fixed-point integer state that is reversed.
 
-    The forward pass keeps its last state. Roundings to integers count as the identity.
+    The forward pass keeps only its last state. Rounding to integers is differentiated as the identity.
 
     Raises:
-        NumericalError: reversed, the run is not the one that was made.
+        NumericalError: the reversed run differs from the forward run.
     """
 
     name = "reversible"
@@ -265,7 +265,7 @@ class Reversible(Method):
 
 @dataclass(frozen=True)
 class Surrogate(Method):
-    """The gradient of a switched twin, another program, whose flips add nothing because no force jumps."""
+    """The gradient of a system with a switched cutoff: another program, whose force does not jump."""
 
     cutoff: str = "quintic"  # of the twin; one with an onset
     onset: float = ONSET_FRACTION  # where its switching begins, as a share of the cutoff
@@ -283,7 +283,7 @@ class Surrogate(Method):
         return self.method.reason_unavailable(self.twin(problem), names)
 
     def twin(self, problem: Problem) -> Problem:
-        """The problem that is differentiated."""
+        """Return the problem with the switched cutoff, which is differentiated in place of the given one."""
         made = problem.simulation.with_cutoff(self.cutoff)
         onset = parameters.value(made, "cutoff.radius") * self.onset
         return replace(problem, simulation=made).at({"cutoff.onset": onset})
@@ -296,7 +296,7 @@ class Surrogate(Method):
 
 
 def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
-    """Counts of the crossings, and those that weigh most."""
+    """Return counts of the crossings, and the crossings with the largest weights."""
     speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
     flips = {name: joined(crossings, name, ledger=True) for name in ("step", "i", "j", "entered")}
     key, heavy = -np.abs(weight), np.arange(len(weight))
@@ -318,18 +318,18 @@ def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
 
 
 def joined(crossings: Sequence[Crossings], name: str, *, ledger: bool = False) -> np.ndarray:
-    """A column of the crossings of several stretches, or of their ledgers."""
+    """Concatenate a column of the crossings of several stretches, or of their ledgers."""
     return np.concatenate([getattr(one.ledger if ledger else one, name) for one in crossings])
 
 
 def radial_speed(simulation: Simulation) -> float:
-    """Root mean square speed along the line between two atoms, length per internal time."""
+    """Return the root mean square speed along the line between two atoms, length per internal time."""
     speed2 = float(np.mean(np.sum(simulation.velocities**2, axis=1)))
     return float(np.sqrt(2 * speed2 / 3))
 
 
 def wanted(names: Sequence[str]) -> frozenset[str]:
-    """What the reverse pass has to work out for these parameters."""
+    """Return which derivatives the reverse pass has to compute for these parameters."""
     parts = {name: {MODEL} for name in ("potential", "cutoff", "terms")}
     parts |= {"dynamics": {FORCE}, "box": {SCALE}}
     return frozenset(

@@ -1,7 +1,7 @@
-"""The forward pass of derivatives: tangents of a few parameters along the run that was recorded.
+"""Forward-mode derivatives: tangents of a few parameters along the recorded run.
 
-A tangent is pushed through each step at the recorded state and decisions. It needs no memory beyond the
-run's, and costs a force evaluation for each parameter.
+A tangent is propagated through each step at the recorded state and decisions. This needs no memory beyond
+that of the run, and one force evaluation per step and parameter.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mdnum.rollout.epoch import over_rows
 
 
 class TangentCarry(NamedTuple):
-    """Tangents between two steps, user's order, one for each column."""
+    """Tangents carried between two steps, user's order, one for each column."""
 
     # of the positions as if the box had no faces, at the step that comes next
     x: Float[Array, "columns 3 atoms"]
@@ -72,21 +72,21 @@ def tangents(
     states: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[StretchTangents]:
-    """Tangents by named parameters along a recorded run, stretch by stretch, first one first.
+    """Yield tangents by named parameters along a recorded run, stretch by stretch, first stretch first.
 
-    With the weights of a reverse pass the sum of weight times (dr_cut - dr) over crossings is what the flips
-    add to the derivative by each column, of tangents that do not jump and event-aware weights.
+    For tangents that do not jump and weights of an event-aware reverse pass, the sum of weight times
+    (dr_cut - dr) over crossings is the contribution of the flips to the derivative by each column.
 
     Args:
-        tape: the run; made with flips where crossings are wanted. names: full names of parameters.
+        tape: the run; recorded with flips if crossings are needed. names: full names of parameters.
         saltation: whether the tangents jump at every crossing that does not graze.
         guard: radial speed, length per internal time, below which a crossing grazes.
-        states: whether to hand out the tangents of every step.
+        states: whether to return the tangents of every step.
 
     Raises:
-        InputError: saltation with a tape without flips, or an integrator that is no linear `KickDrift`.
+        InputError: saltation with a tape without flips, or an integrator that is not a linear `KickDrift`.
 
-    Error: a rounding error times the growth of the tangent; none of truncation, for the program as it ran.
+    Error: a rounding error times the growth of the tangent; no truncation error, for the program as it ran.
     """
     simulation = tape.simulation
     force = simulation.force
@@ -117,7 +117,7 @@ def tangents(
 
 
 def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
-    """The derivatives of the loss, from the tangents of its sums at the end."""
+    """Return the derivatives of the loss, from the tangents of its sums at the end."""
 
     def one(tangent):
         return jax.jvp(lambda total: tape.loss.value(total, tape.frames), (tape.total,), (tangent,))[1]
@@ -126,7 +126,7 @@ def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
 
 
 def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, told, values, matrix) -> Forces:
-    """Forces with other quantities in another box; which image is nearest does not move with the box."""
+    """Evaluate forces with other quantities in another box; the choice of nearest images does not change."""
     other: Any = with_quantities(force, values)
     other = replace(other, cell=replace(force.cell, matrix=matrix))
     if isinstance(force, PairForce):
@@ -187,7 +187,7 @@ def _stretch(
         return jax.tree.map(jnp.add, total, seen)
 
     def push(row, told, see, span, carry: TangentCarry, along: Direction):
-        """One column through one step."""
+        """Propagate the tangent of one column through one step."""
         number, x, v = row[0], row[1], row[2]
         dx, dv = carry.x, carry.v
         half, first = (0.5 * integrator.timestep).astype(dtype), number == 0
@@ -227,11 +227,11 @@ def _stretch(
 
 
 def _whole(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Lattice vectors with one of length 1 for an axis that has none."""
+    """Return the lattice vectors with a unit vector for each axis that has none."""
     missing = jnp.all(matrix == 0, axis=1)
     return jnp.where(missing[:, None], jnp.eye(3, dtype=matrix.dtype), matrix)
 
 
 def _still(integer: Array) -> Any:
-    """The tangent of what cannot move."""
+    """Return the zero tangent of an integer."""
     return np.zeros(jnp.shape(integer), jax.dtypes.float0)

@@ -1,9 +1,8 @@
-"""The forward run as a gradient needs it: every stretch of steps, last first, and the sums of the loss.
+"""The forward run of a gradient: all stretches of steps, also in reverse order, and the sums of the loss.
 
-Stretches are kept as they were recorded while memory lasts, and run again from their first states where it
-does not: the same compiled program from the same state with the same list has the same bits. A run with a
-fixed-point integer state need not be kept at all: it is reversed, step by step, and must arrive at its start
-bit for bit.
+Recorded stretches are kept as long as memory allows. The others are run again from their first states: the
+same compiled program from the same state with the same list gives the same bits. A run with a fixed-point
+integer state need not be kept at all: it is reversed step by step, and must return to its start bit for bit.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _FINGERPRINTS = 256
 
 @dataclass(frozen=True)
 class TapeStretch:
-    """Some steps of one list, in the order of its atoms."""
+    """Successive steps with one neighbor list, in the order of its atoms."""
 
     # first, rows: its first step and the number of rows in use; those beyond are void
     first: int
@@ -62,12 +61,12 @@ class TapeStretch:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the stretch occupies, bytes."""
+        """Memory used by the stretch, bytes."""
         kept = ([getattr(self, name) for name in _COLUMNS], self.x_before, self.table.index)
         return sum(array.nbytes for array in jax.tree.leaves(kept))
 
     def cut(self, room: int | None = None) -> TapeStretch:
-        """A copy with room for so many rows; default those in use."""
+        """Return a copy with room for `room` rows; by default only the rows in use."""
 
         def copied(rows: np.ndarray) -> np.ndarray:
             kept = np.zeros((room or self.rows, *rows.shape[1:]), rows.dtype)
@@ -77,7 +76,7 @@ class TapeStretch:
         return replace(self, **{name: jax.tree.map(copied, getattr(self, name)) for name in _COLUMNS})
 
     def roomy(self) -> TapeStretch:
-        """A copy with room for as many rows as other stretches have: not every length is compiled for."""
+        """Return a copy with a standard number of rows, so that not every length needs a compilation."""
         columns = jax.tree.leaves([getattr(self, name) for name in _COLUMNS])
         per_row = sum(column[0].nbytes for column in columns)
         return self.cut(room_for(self.rows - 1, per_row))
@@ -89,14 +88,14 @@ class TapeStretch:
 
     @property
     def columns(self):
-        """Columns as a loss needs them, step, x, v, images, potential, virial, cell; and the inputs."""
+        """Columns that a loss needs (step, x, v, images, potential, virial, cell), and the steps' inputs."""
         return (self.steps, *(getattr(self, name) for name in ("x", "v", "images", *_COLUMNS[4:])))
 
     def cell_of(self, row: int, cell: Cell) -> Cell:
-        """The box at a row, on the host; row -1 is the step before the first.
+        """Return the box at a row, on the host; row -1 is the step before the first.
 
         Args:
-            cell: that of a run whose box does not move.
+            cell: the box of a run whose box does not move.
         """
         if not self.cell.size:
             return cell
@@ -108,7 +107,7 @@ _COLUMNS = ("x", "v", "images", "bits", "potential", "virial", "cell", "inputs")
 
 
 def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) -> TapeStretch:
-    """A copy of what a segment recorded from a start; the segment's own record is used again."""
+    """Copy the recorded columns of a segment, because the segment's own record is reused."""
     columns: dict[str, Any] = {name: getattr(segment.record, name) for name in _COLUMNS}
     x_before = np.asarray(start.state.x_before)[:, segment.table.order]
     before = jax.tree.map(np.asarray, start.state.cells[len(start.state.cells) > 1])
@@ -126,15 +125,16 @@ class Pace(NamedTuple):
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Frames per time around a step: by how many of them a jump just before this step comes earlier when
-        it comes earlier by a time; on average, as a step decides when a frame is taken."""
+        """Return frames per time around a step: a jump just before the step that comes earlier by a time dt
+        changes dt times this number of frames, on average, because frames are taken at whole steps.
+        """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
         return jnp.where(within, 1 / time, 0.0)
 
 
 def pace_of(loss: Loss, steps: int) -> Pace:
-    """How often a loss looks at a run of this many steps."""
+    """Return how often a loss uses a frame in a run of this many steps."""
     seen = np.flatnonzero(loss.looks_at(np.arange(steps + 1), steps))
     spacings = np.unique(np.diff(seen))
     between = int(spacings[0]) if len(spacings) == 1 else 0
@@ -142,12 +142,12 @@ def pace_of(loss: Loss, steps: int) -> Pace:
 
 
 class RunTape:
-    """A run that has been made, and its loss.
+    """A completed run and its loss.
 
     Args:
         steps: last step. flips: whether to write the ledger too.
-        budget: bytes of recorded stretches that are kept; the rest is run again when it is asked for.
-        each: called with every stretch when it has been made.
+        budget: bytes of recorded stretches that are kept; the others are run again when needed.
+        each: called with every stretch when it is complete.
 
     Raises:
         NumericalError: the run blew up.
@@ -216,14 +216,15 @@ class RunTape:
 
     @property
     def replayed(self) -> int:
-        """Stretches that are run again in a reverse pass."""
+        """Number of stretches that are run again in a reverse pass."""
         return sum(isinstance(one, tuple) for one in self._made)
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
-        """Derivatives of the loss by an energy and a virial that jump with a flip, where it looks in single
-        frames: the loss jumps with them, and no slope has that. 0 in frames at equal times, where it is part
-        of the average."""
+        """Derivatives of the loss by the energy and by the virial, if these jump at a flip and the loss uses
+        single frames: such a jump of the loss has no slope. Both are 0 for frames at equal times, where
+        averages account for the jumps.
+        """
         if int(self.pace.between) > 0:
             return 0.0, 0.0
 
@@ -244,15 +245,15 @@ class RunTape:
         return stretch_of(self._engine.again(one[0]), *one) if isinstance(one, tuple) else one.roomy()
 
     def backward(self) -> Iterator[TapeStretch]:
-        """The stretches, last first."""
+        """Yield the stretches, last first."""
         return map(self._whole, reversed(self._made))
 
     def forward(self) -> Iterator[TapeStretch]:
-        """The stretches, first one first."""
+        """Yield the stretches, first one first."""
         return map(self._whole, self._made)
 
     def seen(self, stretch: TapeStretch) -> Bool[np.ndarray, "room"]:
-        """Rows that the loss looks at."""
+        """Return which rows the loss uses."""
         steps = stretch.steps
         return self.loss.looks_at(steps, self.steps) & (np.arange(len(steps)) < stretch.rows)
 
@@ -267,14 +268,14 @@ class RunTape:
 
 
 class ReversibleTape(RunTape):
-    """A run with a fixed-point integer state that has been made and is not kept, and its loss.
+    """A completed run with a fixed-point integer state that is reversed instead of kept, and its loss.
 
-    `backward` reverses the steps, with lists that it builds itself, and raises NumericalError where what
-    comes out is not the run that was made.
+    `backward` reverses the steps, with neighbor lists that it builds itself, and raises NumericalError if the
+    states differ from those of the forward run.
 
     Attributes:
-        baths: what a thermostat's friction forgot, by step: the one thing that grows with the run.
-        stretches: of the way back, so far.
+        baths: bits discarded by a thermostat's friction, by step: the only memory that grows with the run.
+        stretches: number of stretches reversed so far.
     """
 
     def _begin(self) -> None:
@@ -301,11 +302,11 @@ class ReversibleTape(RunTape):
 
     @property
     def nbytes(self) -> int:
-        """Memory that grows with the run: what friction forgot."""
+        """Memory that grows with the run: the bits discarded by friction, bytes."""
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:
-        """A run that is not kept is run again."""
+        """Run the steps again, because a reversible run is not kept."""
         return RunTape(self.simulation, self.loss, self.steps, flips=self.flips).forward()
 
     def backward(self) -> Iterator[TapeStretch]:
@@ -328,7 +329,7 @@ class ReversibleTape(RunTape):
                 self._astray(0, min(self._every, self.steps))
 
     def _compare(self, made: Stretched) -> None:
-        """Hold the states that came out against the fingerprints of the run."""
+        """Compare the reversed states with the fingerprints of the forward run."""
         for row in range(made.rows - 1, -1, -1):
             step, record = made.first + row, made.record
             if step % self._every:
@@ -347,7 +348,7 @@ class ReversibleTape(RunTape):
 
 
 def fingerprint(order, *parts) -> bytes:
-    """A digest of a state, in the user's order of atoms; a zero has no sign."""
+    """Return a digest of a state, in the user's order of atoms; the sign of a zero is ignored."""
     digest = hashlib.blake2b(digest_size=8)
     for part in map(np.asarray, parts):
         out = np.empty_like(part)
@@ -357,20 +358,20 @@ def fingerprint(order, *parts) -> bytes:
 
 
 def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The pairs of a list, each once: first and second atom in the list's order, and pair type."""
+    """Return the pairs of a list, each once: first and second atom in the list's order, and pair type."""
     first, second, i, j = table.listed(simulation.channels)
     return first, second, np.asarray(simulation.type_of(i, j), np.int64)
 
 
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:
-    """A row in the user's order, without the faces of the box, which has those lattice vectors."""
+    """Return a row as a frame, in the user's order, with positions unwrapped by the lattice vectors."""
     step, x, v, images, potential, virial = row[:6]
     whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(x.dtype)
     return LossFrame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
 
 
 def seen_in(row, order: Int[Array, "atoms"], origin: LossFrame, around: LossContext):
-    """What a loss observes of a row: frame, origin and the surroundings, with the box of the row."""
+    """Return the arguments of a loss for a row: frame, origin, and surroundings with the row's box."""
     around = in_box(around, row[6]) if row[6].size else around
     return frame_of(row, order, around.matrix), origin, around
 
@@ -390,13 +391,13 @@ def _summed(loss, total, rows, used, seen, origin, around, order):
 
 
 def in_box(around: LossContext, matrix: Float[Array, "3 3"]) -> LossContext:
-    """The surroundings with other lattice vectors."""
+    """Return the surroundings with other lattice vectors."""
     volume = jnp.abs(jnp.dot(matrix[0], jnp.cross(matrix[1], matrix[2])))
     return around._replace(matrix=matrix, volume=jnp.where(around.volume > 0, volume, 0.0))
 
 
 def surroundings(simulation: Simulation) -> LossContext:
-    """Masses and box of a simulation at its start."""
+    """Return the quantities besides frames that a loss may use, from a simulation at its start."""
     cell = simulation.cell
     volume = cell.volume if all(simulation.pbc) else 0.0
     parts = (
@@ -407,13 +408,13 @@ def surroundings(simulation: Simulation) -> LossContext:
 
 
 def no_sums(loss: Loss, origin: LossFrame, around: LossContext) -> Any:
-    """The sums of a loss before it has seen anything."""
+    """Return the sums of a loss before its first frame: zeros."""
     shapes = jax.eval_shape(loss.observe, origin, origin, around)
     return jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
 
 
 def frame_of_start(start: Start, simulation: Simulation) -> LossFrame:
-    """The frame of step 0; its energies are not known yet, and a loss has no use for them there."""
+    """Return the frame of step 0; its energies are not known yet, and losses do not use them."""
     state = start.state
     matrix = jnp.asarray(np.asarray(simulation.cell.matrix), jnp.float64)
     whole = state.x + (matrix.T @ state.images.astype(matrix.dtype)).astype(state.x.dtype)

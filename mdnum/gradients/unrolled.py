@@ -1,13 +1,13 @@
-"""Reverse mode by JAX itself, through the program's own steps: what `jax.grad` of a rollout gives.
+"""Reverse mode by JAX itself, through the program's own steps, like `jax.grad` of a rollout.
 
-A chunk is a fixed number of steps with one list, as a scan, so that reverse mode has a bound on what it
-keeps. What ends a list's life in a rollout ends the chunk early here: the rest of its steps do nothing. The
-host makes the next list at the positions that this program has reached. States between chunks are kept, every
-second of them where there are too many, and what lies between is run again.
+A chunk is a scan over a fixed number of steps with one neighbor list, which bounds the memory of reverse
+mode. When the list expires, the remaining steps of the chunk do nothing, and the host builds the next list
+at the positions that this program has reached. States between chunks are kept, every second one if they are
+too many, and the steps between kept states are run again.
 
-Decisions are made by the program that is differentiated. Reverse mode needs another forward pass than a run
-does, and a compiler is free to round it otherwise; where it does, the gradient belongs to a trajectory that
-nobody simulated, so every step's state and decisions are compared with those of the run.
+The differentiated program makes its own decisions. Reverse mode needs another forward pass than a run does,
+and a compiler may round it differently; the gradient then belongs to a trajectory that nobody simulated.
+Therefore every step's state and decisions are compared with those of the run.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _CHUNK_BYTES, _PER_SLOT = 2**28, 256
 
 
 class Inputs(NamedTuple):
-    """Everything that a rollout can be differentiated by."""
+    """All inputs that a rollout can be differentiated by."""
 
     model: Any  # the quantities of the force
     numbers: Any  # those of the integrator
@@ -56,8 +56,9 @@ class Inputs(NamedTuple):
 
 
 class StepEnds(NamedTuple):
-    """What one step hands to the next and a derivative goes through, user's order: wrapped positions,
-    half-kicked velocities, sums of the loss, what of the extra state is no integer, the box."""
+    """Differentiable results of one step and inputs of the next, user's order: wrapped positions, half-kicked
+    velocities, sums of the loss, the floating-point part of the extra state, and the box.
+    """
 
     x: Float[Array, "3 atoms"]
     v: Float[Array, "3 atoms"]
@@ -67,7 +68,7 @@ class StepEnds(NamedTuple):
 
 
 class RunConstants(NamedTuple):
-    """What does not change along a run and is not differentiated; quantities are those of the inputs."""
+    """Constants of a run, not differentiated; the quantities of the force are taken from `Inputs`."""
 
     force: Any
     integrator: Any
@@ -82,7 +83,7 @@ class RunConstants(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where the program can be continued, as far as that has no derivative, user's order."""
+    """Integer and list data needed to continue the program, which have no derivative, user's order."""
 
     step: Int[Array, ""]  # the step whose forces come next
     images: Int[Array, "3 atoms"]  # lattice vectors taken off so far
@@ -93,7 +94,7 @@ class Place(NamedTuple):
 
 
 class ChunkRecord(NamedTuple):
-    """What a chunk leaves beside its end."""
+    """Results of a chunk besides its end state."""
 
     place: Place  # where it ended
     rows: Int[Array, ""]  # steps done
@@ -115,10 +116,10 @@ def chunk(
     tables: Tables,
     rule: tuple[int, int, bool],
 ) -> tuple[StepEnds, ChunkRecord]:
-    """Some steps with one list; differentiable by its first two arguments.
+    """Run some steps with one neighbor list; differentiable by the first two arguments.
 
     Args:
-        limit: steps that may be done. seen: which of the chunk's steps the loss looks at.
+        limit: largest number of steps. seen: which of the chunk's steps the loss uses.
         rule: every, delay and check of the rebuild rule.
     """
     every, delay, check = rule
@@ -195,19 +196,19 @@ def chunk(
 
 @partial(jax.jit, static_argnames=("rule",))
 def keep(inputs, between, *rest, rule):
-    """A chunk, its reverse function with everything that it keeps, and its record."""
+    """Return a chunk's end, its reverse function with all that this function stores, and its record."""
     return jax.vjp(lambda *given: chunk(*given, *rest, rule), inputs, between, has_aux=True)
 
 
 @jax.jit
 def pull(back, onto_between: StepEnds, onto_inputs: Inputs) -> tuple[StepEnds, Inputs]:
-    """Cotangents through the reverse function of a chunk; those of the inputs are added up."""
+    """Apply the reverse function of a chunk to cotangents; those of the inputs are summed."""
     by_inputs, by_between = back(onto_between)
     return by_between, jax.tree.map(jnp.add, onto_inputs, by_inputs)
 
 
 class Snapshot(NamedTuple):
-    """A state between two chunks; `slots` is the capacity of its list, 0 lets the density decide."""
+    """A state between two chunks; `slots` is the capacity of its list; 0 means chosen from the density."""
 
     between: StepEnds
     place: Place
@@ -215,7 +216,7 @@ class Snapshot(NamedTuple):
 
 
 class ChunkedProgram:
-    """The program of a problem, chunk by chunk."""
+    """The program of a problem, run in chunks of steps."""
 
     def __init__(self, problem: Problem):
         simulation = problem.simulation
@@ -249,7 +250,7 @@ class ChunkedProgram:
         self.frames = int(looked.sum())
 
     def forward(self, at: Snapshot, rows: int | None = None) -> Snapshot:
-        """One chunk on, without a derivative; of at most `rows` steps."""
+        """Run one chunk of at most `rows` steps, without a derivative."""
         between, record = chunk(*self._arguments(at, rows), rule=self.rule)
         if not bool(record.finite):
             raise NumericalError(
@@ -259,12 +260,12 @@ class ChunkedProgram:
         return Snapshot(between, record.place, self.list_of(at)[0].slots)
 
     def keep(self, at: Snapshot, rows: int) -> tuple[ChunkRecord, Any]:
-        """One chunk's record and its reverse function."""
+        """Return one chunk's record and its reverse function."""
         _, back, record = keep(*self._arguments(at, rows), rule=self.rule)
         return record, back
 
     def list_of(self, at: Snapshot) -> tuple[PairTable, Tables]:
-        """The list that is in use at a snapshot."""
+        """Return the neighbor list in use at a snapshot."""
         key = (int(at.place.built), at.slots)
         if self._used is None or self._used[0] != key:
             self._verlet.slots = at.slots
@@ -276,7 +277,7 @@ class ChunkedProgram:
         return self._used[1]
 
     def cotangents(self, start: StepEnds, inputs: Inputs) -> Cotangents:
-        """Derivatives by what a rollout is made of, from those of the inputs and of the first positions."""
+        """Return the derivatives by all inputs, from those by `Inputs` and by the first positions."""
         numbers, x, v = onto_start(self.simulation, self.start.between, start.extra)
         inputs = inputs._replace(numbers=jax.tree.map(jnp.add, inputs.numbers, numbers))
         start = start._replace(x=start.x + x, v=start.v + v)
@@ -297,7 +298,7 @@ class ChunkedProgram:
 
 @dataclass(frozen=True)
 class Unrolled(Method):
-    """The derivative of the steps that ran, by JAX."""
+    """The derivative of the steps that ran, computed by JAX."""
 
     # bytes of states that are kept, evenly spread; those between two of them are made again
     budget: int = KEPT
@@ -365,7 +366,7 @@ Marks = dict[int, tuple[bytes, tuple[int, int]]]
 
 
 def marks(first: int, rows: range, x, v, bits, table: PairTable) -> Iterator[tuple[int, Any]]:
-    """Digests of some steps with one list, in whose order positions, velocities and decisions are."""
+    """Yield digests of steps with one list; positions, velocities and decisions are in its order."""
     x, v, bits = (np.asarray(part) for part in (x, v, bits))
     for row in rows:
         state = fingerprint(table.order, x[row], v[row])
@@ -373,7 +374,7 @@ def marks(first: int, rows: range, x, v, bits, table: PairTable) -> Iterator[tup
 
 
 def departure(run: Mapping[int, Any], other: Mapping[int, Any]) -> dict[str, int | None]:
-    """First steps at which another program has another bit in its state, and other pairs inside."""
+    """Return the first steps at which two programs differ in the bits of the state or in pairs inside."""
     both = sorted(run.keys() & other.keys())
     different = [[step for step in both if run[step][k] != other[step][k]] for k in (0, 1)]
     state, decision = (steps[0] if steps else None for steps in different)

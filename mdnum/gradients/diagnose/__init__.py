@@ -1,8 +1,8 @@
-"""Whether a gradient through a rollout can be trusted, how far, and what it is made of.
+"""Diagnosis of a gradient through a rollout: whether and how far it can be trusted, and its contributions.
 
-Methods answer different questions: the derivative of the steps that ran, the derivative of the flow with the
-times of its flips, the slope of the loss between shifted runs, the slope of an average, the derivative of
-another program. Two numbers that differ need not contradict one another: the agreement names which it is.
+Methods answer different questions: the derivative of the steps that ran, the derivative of the flow including
+the times of its flips, the slope of the loss between shifted runs, the slope of an average, the derivative of
+another program. Two derivatives that differ need not contradict one another: the agreement names the reason.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _ERRORS = 5.0
 
 @dataclass(frozen=True)
 class Opinion:
-    """The gradient that one method gives."""
+    """The gradient computed by one method."""
 
     method: str  # its name
     description: str  # which derivative it gives, one sentence
@@ -82,7 +82,7 @@ class GradientDifference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """All methods that apply, at one horizon."""
+    """Comparison of all methods that apply, at one horizon."""
 
     horizon: int  # steps
     reference: str  # name of the method that the others are compared with
@@ -91,7 +91,7 @@ class Agreement:
     comparisons: tuple[GradientDifference, ...]
 
     def gradient(self, method: str) -> Gradient | None:
-        """The gradient that a given method found."""
+        """Return the gradient computed by a given method."""
         return next((one.found for one in self.opinions if one.method == method), None)
 
 
@@ -104,16 +104,16 @@ def agreement(
     growth: float = 1.0,
     progress: Progress | None = None,
 ) -> Agreement:
-    """The gradient by several methods, and what their differences mean.
+    """Compute the gradient by several methods, and explain their differences.
 
     Args:
-        names: parameters; a method that cannot have some is asked for the others.
-        methods: names or methods; default all there are. One that does not apply is listed with the reason.
-        known: gradients that have been worked out already, by name of the method.
-        growth: how much the gradient by the state grew over the run (`GradientGrowth.gain`).
+        names: parameters; a method that does not support all of them is applied to the others.
+        methods: names or objects; all by default. A method that does not apply is listed with the reason.
+        known: gradients already computed, by name of the method.
+        growth: factor by which the gradient by the state grew over the run (`GradientGrowth.gain`).
 
     Raises:
-        InputError: no such parameter or method, or no method applies.
+        InputError: a parameter or method does not exist, or no method applies.
     """
     full = parameters.resolve(problem.simulation, names)
     known = dict(known or {})
@@ -143,7 +143,7 @@ def agreement(
 
 
 def _asked(method: Method, problem: Problem, names: Sequence[str], progress: Progress | None) -> Opinion:
-    """What a method gives, by all names or by those that it can have."""
+    """Compute the gradient of one method, by all parameters or by those that the method supports."""
     began = time.perf_counter()
 
     def report(done: int, steps: int, phase: str) -> None:
@@ -163,11 +163,11 @@ def _asked(method: Method, problem: Problem, names: Sequence[str], progress: Pro
 def compare(
     name: str, one: Gradient, reference: Gradient, unit: float, growth: float, *, jumps: bool
 ) -> GradientDifference:
-    """Two derivatives by one parameter, which both have.
+    """Compare two derivatives by one parameter, which both gradients contain.
 
     Args:
         unit: unit roundoff of the run's state or forces, whichever is coarser.
-        growth: how much the gradient by the state grew over the run; 1 where that is not known.
+        growth: factor by which the gradient by the state grew over the run; 1 if unknown.
         jumps: whether the force jumps at the cutoff.
     """
     a, b = (np.asarray(found.gradient[name], np.float64) for found in (one, reference))
@@ -188,7 +188,7 @@ def _meaning(
     name: str, one: Gradient, reference: Gradient, size: float, relative: float, rounding: float,
     grown: float, jumps: bool,
 ) -> tuple[str, dict[str, float] | None]:  # fmt: skip
-    """What a difference means, and the numbers that it rests on; None: what rounding explains."""
+    """Return the reason for a difference and the numbers that support it; None: what rounding explains."""
     kinds = {one.kind: one, reference.kind: reference}
     if not np.isfinite(relative):
         return "unexplained", {}
@@ -222,13 +222,15 @@ def _meaning(
 
 @result
 class GradientDiagnosis:
-    """Whether a gradient can be trusted, and how far. A part that was not asked for is None.
+    """Whether a gradient can be trusted, and how far. A part that was not requested is None.
 
     Attributes:
         horizon: steps. names: full names of the parameters. value: the loss.
-        agreement, growth, spectrum, trust, flips, detective, scaling: see there. edges: by parameter.
-        notes: what a reader must know about single parameters: no dependence, a missing term.
-        failed: parts that were asked for and are not available, with the reason.
+        agreement, growth, spectrum, trust, flips, detective, scaling: results of the functions of the same
+            name.
+        edges: boundaries of decisions, by parameter.
+        notes: warnings about single parameters: no dependence, a missing term.
+        failed: parts that were requested and are not available, with the reason.
     """
 
     horizon: int
@@ -259,21 +261,21 @@ def diagnose(
     format: str = "float16",
     progress: Progress | None = None,
 ) -> GradientDiagnosis:
-    """Whether a gradient can be trusted, how far, and what it is made of.
+    """Examine whether a gradient can be trusted, how far, and what contributes to it.
 
     Args:
-        names: parameters, full or short names. parts: which of PARTS.
-        methods: for the agreement; default all that apply. The other parts are read off the reverse pass of
-            event-aware, or of symmetric where only that applies or is asked for.
+        names: parameters, full or short names. parts: which of PARTS to compute.
+        methods: for the agreement; all that apply by default. The other parts use the reverse pass of
+            event-aware, or of symmetric if only this method applies or was requested.
         edges_of: parameters whose nearest boundaries of decisions are searched for.
         replicas, half_step, tolerance: as for `trust`.
         format: narrow type that the cotangents are compared with.
 
     Returns:
-        the parts that are available; `failed` has why others are not.
+        the parts that are available; `failed` holds the reasons for the others.
 
     Raises:
-        InputError: no such parameter, part or method. NumericalError: the run blew up.
+        InputError: a parameter, part or method does not exist. NumericalError: the run blew up.
     """
     full = parameters.resolve(problem.simulation, names)
     unknown = [part for part in parts if part not in PARTS]
@@ -359,7 +361,7 @@ def diagnose(
 
 
 def _methods(asked: Sequence[str | Method] | None) -> list[Method]:
-    """Methods by name or as they are; all of them where nothing was said."""
+    """Return the methods as objects; all methods if none were given."""
     return [by_name(one) if isinstance(one, str) else one for one in (METHODS if asked is None else asked)]
 
 

@@ -1,9 +1,9 @@
-"""Where a reverse pass stops being finite while the run it belongs to is fine, operation by operation.
+"""Search for the first operation of a reverse pass that is not finite although its run is finite.
 
-A force can be finite where its derivative is not, a loss can have a root at zero, a sum can leave the range
-of its format on the way back. The pass is repeated up to the step at which that happens, and that step is
-run operation by operation. An operation is at fault where its inputs are finite and its result is not, and
-where mending it mends the program's own result: a number that is masked away later does no harm.
+A force can be finite while its derivative is not, a loss can have a square root at zero, a sum can overflow
+its format in the reverse pass. The pass is repeated up to the step where this happens, and that step is run
+operation by operation. An operation is at fault if its inputs are finite and its result is not, and if
+repairing it repairs the program's result: a number that is masked away later does no harm.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _PARTS = (
 
 @dataclass(frozen=True)
 class NotFinite:
-    """Where a reverse pass stops being finite."""
+    """Location at which a reverse pass stops being finite."""
 
     found: bool = False  # whether it does at all
     forward: bool = True  # whether the forward run, its loss included, is finite
@@ -65,15 +65,16 @@ def detective(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> NotFinite:
-    """The first step and operation of the reverse pass that is not finite, and the pair at fault.
+    """Find the first step and operation of the reverse pass that is not finite, and the pair at fault.
 
     Args:
         problem: the loss of a rollout of a pair potential.
-        names: parameters, full or short names. saltation: whether flips count.
-        tape: the run, where it has been made (with flips, if saltation is asked for).
+        names: parameters, full or short names. saltation: whether to include the contribution of flips.
+        tape: the run, if already made (with flips, if saltation is requested).
 
     Raises:
-        InputError: no such parameter, or no pair potential. NumericalError: the run blew up.
+        InputError: a parameter does not exist, or the potential is no pair potential.
+        NumericalError: the run blew up.
     """
     simulation = problem.simulation
     full = parameters.resolve(simulation, names)
@@ -101,13 +102,13 @@ def detective(
 
 
 def _last_bad(trace: AdjointCarry, rows: int) -> int | None:
-    """The latest row whose carry is not finite."""
+    """Return the latest row whose cotangents are not finite; None if all are finite."""
     leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(trace) if is_inexact(leaf)]
     return next((row for row in reversed(range(rows)) if count_bad([leaf[row] for leaf in leaves])), None)
 
 
 def _in_forward(tape: RunTape) -> NotFinite:
-    """The run is finite, the loss is not: the first frame at which it is not."""
+    """Find the first frame at which the loss of a finite run is not finite."""
     for stretch in tape.forward():
         seen = tape.seen(stretch)
         for row in np.flatnonzero(seen[: stretch.rows]):
@@ -121,7 +122,7 @@ def _in_forward(tape: RunTape) -> NotFinite:
 
 
 def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFinite:
-    """The step of a row, operation by operation."""
+    """Run the step of a row operation by operation."""
     whole = back.arguments(stretch)
     loss, origin, *rest = whole[8]
     # the energy of the frame of step 0 is not known there, and nothing that is finite has used it
@@ -139,7 +140,7 @@ def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFi
 
 
 def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
-    """The arguments of a reverse pass over some of the rows."""
+    """Return the arguments of a reverse pass over some of the rows."""
     out = list(arguments)
     for k in (4, 5, 7):
         out[k] = jax.tree.map(lambda leaf: leaf[first:end], out[k])
@@ -153,7 +154,7 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 def _pair(
     back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
-    """Labels of the pair whose number it is, and its distance; -1, -1 and NaN where it is no pair's."""
+    """Return labels and distance of the pair that an operation's entry belongs to; -1, -1, NaN if none."""
     nowhere = (-1, -1, float("nan"))
     if made is None or not made.index:
         return nowhere

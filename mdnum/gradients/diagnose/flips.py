@@ -1,12 +1,13 @@
-"""What each flip on the way adds to a gradient, and its jump at the nearest boundaries of decisions.
+"""Contribution of each flip to a gradient, and the gradient's jump at the nearest boundaries of decisions.
 
-A crossing adds the derivative of the loss by its own cutoff, times how far the cutoff moves ahead of the
-pair. The first factor is a weight of the reverse pass, in which all later flips count; the second comes from
-tangents in which no earlier one does. So the terms of all flips sum to what the flips add, exactly.
+The contribution of a crossing is the derivative of the loss by its own cutoff, times the distance by which
+the cutoff moves ahead of the pair. The first factor is a weight of the reverse pass, which includes all later
+flips; the second comes from tangents that include no earlier flip. So the contributions of all flips sum
+exactly to the total contribution of flips.
 
-Between two boundaries every run decides alike, and loss and gradient are smooth functions of the parameter.
-At a boundary one pair is decided otherwise between two adjacent floats: a longer step of an optimizer crosses
-into another program, and what the gradient does there says what that is worth.
+Between two boundaries every run makes the same decisions, and loss and gradient are smooth functions of the
+parameter. At a boundary the decision on one pair differs between two adjacent floats: a longer step of an
+optimizer crosses into another program, and the gradients on both sides show how useful such a step is.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ _FIRST, _FACTOR = 1e-12, 8.0
 
 @dataclass(frozen=True)
 class FlipTerms:
-    """What each flip on the way adds to the gradient, heaviest first.
+    """Contribution of each flip to the gradient, largest first.
 
-    A number is a scalar parameter, or an entry of one that has several: "potential.sigma[1]".
+    A number is a scalar parameter, or an entry of an array parameter: "potential.sigma[1]".
     """
 
     # a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the decision,
@@ -67,15 +68,16 @@ def flips(
     made: ReversePass | None = None,
     progress: Progress | None = None,
 ) -> FlipTerms:
-    """Contributions of all flips, heaviest first.
+    """Compute the contributions of all flips, largest first.
 
     Args:
         problem: of a pair potential. names: parameters, full or short names.
         guard: radial speed below which a crossing grazes, as a share of the rms radial speed of a pair.
-        made: the event-aware reverse pass, where it has been made; its guard counts then.
+        made: the event-aware reverse pass, if already made; its guard is then used.
 
     Raises:
-        InputError: no such parameter, no pair potential, or only parameters of too many entries.
+        InputError: a parameter does not exist, the potential is no pair potential, or all parameters have too
+            many entries.
 
     Error: that of the event-aware gradient.
     """
@@ -168,20 +170,20 @@ class DecisionEdges:
 def edges(
     problem: Problem, name: str, *, reach: float = REACH, progress: Progress | None = None
 ) -> DecisionEdges:
-    """The nearest boundary below and above a parameter, and the gradients across them.
+    """Find the nearest boundaries below and above a parameter, and compute the gradients across them.
 
-    Where a pair first crosses otherwise is forecast with tangents; then runs are compared, on either side,
-    until two adjacent floats differ.
+    Tangents predict where a pair first crosses differently; then runs on either side are compared, until two
+    adjacent floats differ.
 
     Args:
         problem: of a pair potential. name: a parameter of one entry.
-        reach: how far to look, as a share of the parameter's value.
+        reach: search range, as a share of the parameter's value.
 
     Raises:
-        InputError: no such parameter, several entries, or a value of 0. NumericalError: the run blew up.
+        InputError: a parameter does not exist, has several entries, or is 0. NumericalError: the run blew up.
 
-    Error: none in a boundary. That no other one lies between it and the parameter is as sure as the forecast:
-    pairs of boundaries that undo one another can hide between two runs that decide alike.
+    Error: none in a boundary. The absence of another boundary in between is as certain as the prediction:
+    pairs of boundaries that cancel can be hidden between two runs with the same decisions.
     """
     (full,) = parameters.resolve(problem.simulation, [name])
     here = parameters.value(problem.simulation, full)
@@ -209,7 +211,7 @@ def edges(
 
 
 def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[int, float]:
-    """Shifts of the parameter, by sign, at which tangents see the first pair cross; infinite where none."""
+    """Predict the parameter shifts, by sign, at which the first pair crosses; infinite if none does."""
     if name == "box.scale":
         # the images move too, which these differences of positions leave out
         return {-1: np.inf, 1: np.inf}
@@ -283,7 +285,7 @@ def _edge(
 
 
 def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:
-    """Loss and derivatives by one parameter of another simulation."""
+    """Return the loss of another simulation and its derivatives by one parameter, by method."""
     there = Problem(simulation, problem.loss, problem.steps)
     tape = tape_of(there, True)
     found = {

@@ -1,13 +1,13 @@
-"""How a gradient grows with the horizon, whether it would fit a narrow type, and how changes stretch.
+"""Growth of a gradient with the horizon, its fit into a narrow type, and the growth of perturbations.
 
 The cotangent of the state h steps before the end is the gradient of a run of h steps that starts there. So
-one reverse pass over T steps holds a gradient for every horizon up to T, each of another start of the same
-motion. Cotangents of a chaotic run span many powers of two: one loss scale helps where they are small
-everywhere, and cannot help where they span more than the narrow format does.
+one reverse pass over T steps holds a gradient for every horizon up to T, each with a different start on the
+same trajectory. Cotangents of a chaotic run span many powers of two: one loss scale helps if they are small
+everywhere, but not if they span more powers than the narrow format.
 
 The largest singular values of a run's Jacobian bound every gradient of a loss of the last state. They come
-from subspace iteration with a random block (Halko, Martinsson and Tropp 2011), made orthonormal again after
-every stretch, so that neither does a length overflow nor do all vectors turn into one.
+from subspace iteration with a random block (Halko, Martinsson and Tropp 2011), orthonormalized after every
+stretch, so that lengths do not overflow and the vectors do not become parallel.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _RANGE = 30.0
 
 @dataclass(frozen=True)
 class GradientGrowth:
-    """How the gradient grows with the horizon, from one reverse pass."""
+    """Growth of the gradient with the horizon, from one reverse pass."""
 
     # a row for each horizon 0, 1, ..., T, of the state that many steps before the end: `horizon`, `step`,
     # `onto_positions` and `onto_velocities` (norms of the derivatives by all of them), `size` (norm of both,
@@ -71,7 +71,7 @@ class GradientGrowth:
 
 
 class GrowthWatch:
-    """Collects what `GradientGrowth` shows, by full names of parameters, while a reverse pass goes on."""
+    """Collector of the data of `GradientGrowth` during a reverse pass, by full names of parameters."""
 
     def __init__(self, simulation: Simulation, names: Sequence[str], steps: int):
         self.simulation, self.names, self.steps = simulation, tuple(names), steps
@@ -81,7 +81,7 @@ class GrowthWatch:
         self._scalars = [name for name in self.names if not name.startswith("initial.")]
 
     def __call__(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """One stretch of the reverse pass."""
+        """Process one stretch of the reverse pass."""
         rows, first = stretch.rows, stretch.first
         onto_x, onto_v = (np.asarray(part, np.float64)[:rows] for part in (trace.x, trace.v))
         v = stretch.v[:rows].astype(np.float64)
@@ -107,8 +107,9 @@ class GrowthWatch:
                 self.gradient[name][first + row] = value
 
     def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> GradientGrowth:
-        """The growth; its last row is the gradient of the whole run, since a loss may compare with the start,
-        and that is no part of what is carried from step to step."""
+        """Return the growth. The last row is the gradient of the whole run, because a loss may compare with
+        the start, and this comparison is not in the cotangents carried from step to step.
+        """
         units = self.simulation.units
         timestep = float(self.simulation.integrator.timestep)
         clock, backward = CLOCK_STEPS * timestep, self.norms[::-1]
@@ -138,7 +139,7 @@ class GrowthWatch:
 
 
 def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
-    """One of WORDS; a run is bounded where its rms speeds stay within a factor of the usual one."""
+    """Return one of WORDS; a run is bounded if its rms speeds stay within a factor of the median."""
     usual = float(np.median(speed))
     if usual > 0 and not (np.isfinite(speed).all() and speed.max() <= _WILD * usual):
         return WORDS[2]
@@ -148,10 +149,11 @@ def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
 def growth(
     problem: Problem, names: Sequence[str], *, saltation: bool = True, progress: Progress | None = None
 ) -> GradientGrowth:
-    """The gradient against the horizon, from one reverse pass.
+    """Compute the gradient for every horizon, from one reverse pass.
 
     Raises:
-        InputError: no such parameter, or flips of no pair potential. NumericalError: the run blew up.
+        InputError: a parameter does not exist, or flips are not of a pair potential.
+        NumericalError: the run blew up.
 
     Error: that of the reverse pass; horizons below T belong to later starts of the same run.
     """
@@ -181,7 +183,7 @@ class Scaling:
 
 
 class ScalingWatch:
-    """Counts what would overflow and underflow while a reverse pass goes on."""
+    """Collector of overflow and underflow counts during a reverse pass."""
 
     def __init__(self, steps: int, format: str = "float16"):
         self.format = formats.format_of(format)
@@ -192,13 +194,13 @@ class ScalingWatch:
         self.exponents = np.zeros((steps + 1, _HIGHEST - _LOWEST + 1), np.int32)
 
     def __call__(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """One stretch of the reverse pass."""
+        """Process one stretch of the reverse pass."""
         for row in range(stretch.rows):
             both = (np.asarray(part[row], np.float64).ravel() for part in (trace.x, trace.v))
             self.put(stretch.first + row, np.concatenate(list(both)))
 
     def put(self, step: int, values: Float[np.ndarray, "numbers"]) -> None:
-        """The cotangents of one step."""
+        """Count the cotangents of one step."""
         form, size, table = self.format, np.abs(values), self.table
         self.numbers = len(values)
         there = size[np.isfinite(size) & (size > 0)]
@@ -215,7 +217,7 @@ class ScalingWatch:
             table["largest"][step] = np.inf
 
     def result(self) -> Scaling:
-        """The counts, with and without the best scale; exact but for numbers on an edge of a power of two."""
+        """Return the counts, with and without the best scale; exact except for numbers at a power of two."""
         form = self.format
         largest = float(self.table["largest"].max())
         there = self.exponents.sum(axis=1, dtype=np.int64)
@@ -246,9 +248,9 @@ class ScalingWatch:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """How small changes of the start stretch: singular values of the product of all step Jacobians.
+    """Growth of small perturbations of the start: singular values of the product of all step Jacobians.
 
-    Lengths of changes are those of positions, and of velocities times `clock`.
+    The norm of a perturbation combines positions, and velocities times `clock`.
     """
 
     steps: int  # of the run
@@ -269,7 +271,7 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class TangentImage:
-    """Where a block of orthonormal vectors went: basis @ exp(log_scale) mixing."""
+    """Image of a block of orthonormal vectors: basis @ exp(log_scale) mixing."""
 
     basis: Float[np.ndarray, "coordinates vectors"]  # orthonormal, shape (coordinates, vectors)
     mixing: Float[np.ndarray, "vectors vectors"]  # upper triangular, of size one, shape (vectors, vectors)
@@ -280,12 +282,12 @@ class TangentImage:
 
 
 class Jacobian:
-    """The derivative of the state at the last step by that at step 0, decisions held fixed.
+    """The derivative of the last state by the state of step 0, at fixed decisions.
 
-    A state is positions and velocities times `clock`, an internal time, flat.
+    A state is a flat vector of positions and velocities times `clock`, an internal time.
 
     Raises:
-        InputError: a many-body potential, or an integrator that is no linear `KickDrift`.
+        InputError: a many-body potential, or an integrator that is not a linear `KickDrift`.
     """
 
     def __init__(self, tape: RunTape, clock: float):
@@ -299,7 +301,7 @@ class Jacobian:
         self.coordinates = 6 * tape.simulation.atoms
 
     def image(self, block: Float[np.ndarray, "coordinates vectors"], backward: bool = False) -> TangentImage:
-        """The image of an orthonormal block, or under the transpose."""
+        """Return the image of an orthonormal block under the Jacobian (its transpose if `backward`)."""
         stretches = self.tape.backward() if backward else self.tape.forward()
         vectors, steps = block.shape[1], self.tape.steps
         mixing, log_scale = np.eye(vectors), 0.0
@@ -336,7 +338,7 @@ class Jacobian:
 
 
 def _orthonormal(block):
-    """Its QR factors, with a diagonal that is not negative."""
+    """Return the QR factors of a block, with a diagonal that is not negative."""
     q, r = np.linalg.qr(block)
     signs = np.where(np.diag(r) < 0, -1.0, 1.0)
     return q * signs, signs[:, None] * r
@@ -393,19 +395,19 @@ def spectrum(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> Spectrum:
-    """Singular values and finite-time Lyapunov exponents of the product of all step Jacobians.
+    """Compute singular values and finite-time Lyapunov exponents of the product of all step Jacobians.
 
-    Decisions are held fixed: what flips do to a change is not in it.
+    Decisions are held fixed: the effect of flips on a perturbation is not included.
 
     Args:
-        values: how many singular values. extra: vectors that are carried along for faster convergence.
+        values: number of singular values. extra: additional vectors, for faster convergence.
         rounds: forward and backward passes of the block. seed: of the random block.
-        tape: the run, where it has been made.
+        tape: the run, if already made.
 
     Raises:
         InputError: no pair potential, or fewer coordinates than values. NumericalError: the run blew up.
 
-    Error: within `residual` of each there is a singular value, relatively.
+    Error: a true singular value lies within the relative distance `residual` of each.
     """
     simulation = problem.simulation
     if tape is None:
@@ -448,7 +450,7 @@ def spectrum(
 
 
 def _defect(start, there: TangentImage, back: TangentImage) -> float:
-    """Of Q' (Phi q) = (Phi' Q)' q, relative."""
+    """Return the relative defect of Q' (Phi q) = (Phi' Q)' q."""
     forward = there.mixing
     factor = np.exp(np.clip(back.log_scale - there.log_scale, -600, 600))
     backward = factor * (back.basis @ back.mixing).T @ start
@@ -456,7 +458,7 @@ def _defect(start, there: TangentImage, back: TangentImage) -> float:
 
 
 def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Log of the singular values of the map on the block, and both sets of vectors in its bases."""
+    """Return the logarithms of the singular values on the block, and both sets of vectors in its bases."""
     diagonal = image.stretches[-1]
     if diagonal.max() - diagonal.min() > _RANGE:
         # rounding has eaten the small ones in the product; the block is aligned, so its diagonal has them
@@ -468,7 +470,7 @@ def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _residual(jacobian: Jacobian, left, right, log_s) -> np.ndarray:
-    """|Phi' u - s v| / s of each pair of singular vectors."""
+    """Return |Phi' u - s v| / s of each pair of singular vectors."""
     back = jacobian.image(left, backward=True)
     with np.errstate(over="ignore"):
         image = (back.basis @ back.mixing) * np.exp(back.log_scale - log_s)

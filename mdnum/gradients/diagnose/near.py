@@ -1,13 +1,13 @@
-"""Pairs that turn around near their cutoff: what the flips that did not happen would have added.
+"""Pairs that turn around near their cutoff: contributions of flips that almost happened.
 
-Where a pair turns back just outside its cutoff it leaves no flip; had it come a little further it would have
-entered and left, at a radial speed near zero, and both crossings would have added terms that go with one
-over that speed. So every turning point within reach of the cutoff counts, on either side of it and between
-two steps too: those beyond the cutoff have their term in the gradient, and would lose it.
+A pair that turns back just outside its cutoff leaves no flip; had it come a little further, it would have
+entered and left at a radial speed near zero, and both crossings would have contributed terms proportional to
+one over this speed. So every turning point within reach of the cutoff counts, on either side of the cutoff
+and also between two steps: pairs beyond the cutoff have their term in the gradient, and could lose it.
 
-Near the turning point r(t) = r_m + a (t - t_m)² / 2. A pair that comes a depth d beyond the cutoff crosses it
-twice with the speed sqrt(2 a d), and the two crossings add 2 w / sqrt(2 a d), where w is what a crossing adds
-at unit speed.
+Near the turning point r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth d crosses it
+twice with the speed sqrt(2 a d), and the two crossings contribute 2 w / sqrt(2 a d), where w is the
+contribution of one crossing at unit speed.
 """
 
 from __future__ import annotations
@@ -52,20 +52,21 @@ class Turns:
     """Turning points of pairs near their cutoff.
 
     Attributes:
-        table: a row for each, in the order of steps:
-            step: it lies between this step and the one before. row: of that step in its stretch.
+        table: one row per turning point, in the order of steps:
+            step: the step after the turning point. row: row of that step in its stretch.
             i, j: the pair, i < j. a, b: the same in the order of the stretch's list. kind: pair type.
-            gap: how far it is short of the cutoff, length; negative where the pair is beyond it for a while.
-            side: 1 where the distance is smallest there, -1 where it is largest.
+            gap: distance left to the cutoff, length; negative while the pair is beyond the cutoff.
+            side: 1 if the distance has a minimum there, -1 if it has a maximum.
             bend: magnitude of the second derivative of the distance there, length per internal time².
-            unseen: whether it is beyond the cutoff between two steps alone, which decided that it is not.
+            unseen: whether the pair is beyond the cutoff only between two steps, so that no decision shows
+                it.
             weight: derivative of the loss by the cutoff of one crossing there, times its radial speed.
-            moved: how far the cutoff moves ahead of the pair, by number that is differentiated by; NaN before
-            the tangents have been there.
-            shift: how far the distance is from that of other runs (another time step, another rounding), the
-            largest of them, length; 0 before any. finer: how much longer it is in the shorter steps.
+            moved: distance by which the cutoff moves ahead of the pair, per unit of each number; NaN before
+            the tangents have been computed.
+            shift: largest difference of the distance from other runs (another time step, another rounding),
+            length; 0 before any. finer: how much larger the distance is with the shorter steps.
             normal: from a to b. images: lattice vectors from the wrapped to the nearest image of b.
-            part: where between the two steps, 0 to 1. before, after: distances at the two steps.
+            part: time between the two steps, 0 to 1. before, after: distances at the two steps.
     """
 
     table: dict[str, np.ndarray]
@@ -75,12 +76,12 @@ class Turns:
 
     @property
     def gap(self) -> Float[np.ndarray, "turns"]:
-        """How far it is short of the cutoff in the shorter steps; negative where the pair is beyond it."""
+        """Distance left to the cutoff with the shorter steps; negative if the pair is beyond the cutoff."""
         return self.table["gap"] + self.table["side"] * self.table["finer"]
 
     @property
     def reach(self) -> Float[np.ndarray, "turns"]:
-        """How far the distance may move: from its own shift and from those of the turning points around."""
+        """Range of uncertainty of the distance, from its own shift and those of adjacent turning points."""
         if not len(self):
             return np.zeros(0)
         shift = self.table["shift"]
@@ -92,13 +93,14 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """Which of them may be on the other side of their cutoff, or are and left no flip."""
+        """Whether each pair may be on the other side of its cutoff, or is there without a recorded flip."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """What the two crossings add, magnitude: where they are shallow, one in a hundred within reach; of
-        those out of reach the difference between what they add in the run and in the shorter steps."""
+        """Magnitude of the contribution of the two crossings. Within reach, the depth is taken as 1 % of the
+        reach (one crossing in a hundred is shallower); out of reach, run and shorter steps are subtracted.
+        """
         bend, reach = self.table["bend"], self.reach
 
         def added(gap):
@@ -114,10 +116,10 @@ class Turns:
     def heaviest(
         self, words: tuple[str, ...], named: Callable[[Any], dict[str, Any]], most: int = 10
     ) -> list[dict[str, Any]]:
-        """Those with a term as plain rows, terms by word, those with the largest first.
+        """Return turning points with a contribution as plain rows, largest first, with terms by number.
 
         Args:
-            named: gives what else is said of a kind of decisions.
+            named: returns further columns for a kind of decision.
         """
         kept = np.flatnonzero(self.term.any(axis=1))
         term, reach, table, gap = self.term, self.reach, self.table, self.gap
@@ -135,7 +137,7 @@ class Turns:
 
 @dataclass
 class Near:
-    """Collects turning points while a reverse pass, tangents and other runs go by."""
+    """Collector of turning points during a reverse pass, tangents and other runs."""
 
     simulation: Simulation
     pace: Pace  # how often the loss looks
@@ -147,11 +149,11 @@ class Near:
 
     @property
     def jumps(self) -> bool:
-        """Whether a crossing adds anything at all: force or energy of a pair jump."""
+        """Whether a crossing contributes at all: the force or the energy of a pair jumps."""
         return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
 
     def reverse(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """One stretch of the event-aware reverse pass, last first: its turning points and their weights."""
+        """Process one stretch of the event-aware reverse pass, last first: turning points and weights."""
         if not self.jumps:
             return
         simulation = self.simulation
@@ -177,7 +179,7 @@ class Near:
         found["weight"] = force * along + seen
 
     def tangents(self, part: StretchTangents) -> None:
-        """One stretch of the tangents: how far each distance moves."""
+        """Process one stretch of the tangents: how far each distance moves."""
         simulation, stretch = self.simulation, part.stretch
         if part.dr is not None and part.dr_cut is not None:
             self.moved.append(part.dr_cut - part.dr)
@@ -201,7 +203,7 @@ class Near:
         found["moved"] = np.asarray(along.r_cut).T[found["kind"]] - dr
 
     def compared(self, stretch: TapeStretch, per: int) -> None:
-        """One stretch of another run, which makes `per` steps where this one makes one."""
+        """Process one stretch of another run, which makes `per` steps for one step of this run."""
         cell, place = HostCell(self.simulation.cell), stretch.table.place
         for found in self._found.values():
             for earlier, name in ((1, "before"), (0, "after")):
@@ -220,7 +222,7 @@ class Near:
                     found["finer"][here] += (1 - part if earlier else part) * further
 
     def turns(self, columns: int) -> Turns:
-        """All of them, in the order of their steps."""
+        """Return all turning points, in the order of their steps."""
         rows = [
             # where no tangents have been, how far the cutoff moves is not known
             found | {"moved": found.get("moved", np.full((len(found["step"]), columns), np.nan))}
@@ -232,7 +234,7 @@ class Near:
 
 
 def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, np.ndarray]:
-    """Tables under one another; without any, one without rows."""
+    """Concatenate tables; without any tables, return a table without rows."""
     empty = {name: np.zeros(0, np.int64) for name in _WHOLE}
     empty |= {name: np.zeros((0, 3)) for name in _VECTORS} | {name: np.zeros(0) for name in _NUMBERS}
     empty |= more
@@ -243,13 +245,13 @@ def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, 
 def hermite(
     r0: np.ndarray, s0: np.ndarray, r1: np.ndarray, s1: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the cubic through two distances with their rates turns, between rates of unlike signs.
+    """Find where the cubic through two distances with their rates turns, between rates of unlike signs.
 
     Args:
-        r0, s0, r1, s1: distance and its rate at the two ends. time: between them.
+        r0, s0, r1, s1: distance and its rate at the two ends. time: between the ends.
 
     Returns:
-        where between the ends (0 to 1), the distance there, and its second derivative by time.
+        the position between the ends (0 to 1), the distance there, and its second derivative by time.
 
     Error: of the distance, r'''' time⁴ / 384.
     """
@@ -264,10 +266,10 @@ def hermite(
 
 
 def turning(simulation: Simulation, stretch: TapeStretch) -> dict[str, np.ndarray]:
-    """The turning points of pairs near their cutoff within a stretch, from distances and their rates.
+    """Find the turning points of pairs near their cutoff within a stretch, from distances and their rates.
 
     Returns:
-        the table of `Turns`, its weights and shifts still 0, and without what moves.
+        the table of `Turns`, with weights and shifts still 0, and without the column `moved`.
     """
     order = stretch.table.order
     i, j, kind = listed(simulation, stretch.table)

@@ -1,11 +1,11 @@
 """The longest horizon at which a gradient can be trusted, and what limits the horizon.
 
-Five things do: the rounding errors of the run have grown until another precision gives another gradient;
-half the time step gives another gradient; a pair turned around so near its cutoff that another time step
-would make it flip, or not, and its term weighs; a decision was so close to its threshold that rounding made
-it; the gradients of other starts of the same system scatter by more than their mean. Each is a limit by
-itself, and one that was not examined leaves the verdict undecided: no flip shows what did not flip, and no
-rounding the time step.
+Five limits are examined: the run's rounding errors have grown until another precision gives another gradient;
+half the time step gives another gradient; a pair turned around so close to its cutoff that another time step
+could add or remove a flip with a relevant contribution; a decision was so close to its threshold that
+rounding determined it; the gradients of other starts of the same system scatter by more than their mean. Each
+limit is independent, and an unexamined one leaves the verdict undecided: recorded flips do not show which
+flips almost happened, and rounding errors do not show the error of the time step.
 
 The gradients of all shorter runs come from one run and one pass of tangents.
 """
@@ -60,7 +60,7 @@ TRUSTED, LIMITED, UNDECIDED = "trusted", "limited", "undecided"
 
 
 class Shorter(Loss):
-    """One loss for several runs that are the first steps of one run: its sums have an axis of horizons."""
+    """One loss for several runs that are the first steps of one run; its sums have an axis of horizons."""
 
     name = "shorter"
     inner: Loss = eqx.field(kw_only=True)  # the loss
@@ -88,20 +88,20 @@ class Shorter(Loss):
         return jax.tree.map(spread, seen)
 
     def value(self, total, frames):
-        """That of the longest."""
+        """Return the loss of the longest horizon."""
         return self.of(total, self.table.shape[1] - 1)
 
     def of(self, total: Any, k: int) -> Float[Array, ""]:
-        """The loss of one horizon."""
+        """Return the loss of one horizon."""
         frames = int(np.asarray(self.table)[:, k].sum())
         return self.inner.value(jax.tree.map(lambda leaf: leaf[k], total), frames)
 
 
 def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Problem:
-    """The loss of every shorter run over the same times, from `per` steps where the run makes one.
+    """Return a problem whose loss covers every shorter run, with `per` steps for one step of the run.
 
     Args:
-        at: horizons, rising; the last one is how far it is run.
+        at: horizons, rising; the last horizon is the length of the run.
     """
     rows = np.arange(int(at[-1]) + 1)
     table = np.stack([problem.loss.looks_at(rows, int(h)) & (rows <= h) for h in at], axis=1)
@@ -124,7 +124,7 @@ class Horizons:
     flips: Int[np.ndarray, "flips 4"]  # step, pair and whether it entered, of each flip of the run, in order
 
     def by_name(self) -> dict[str, Float[np.ndarray, "points entries"]]:
-        """The gradient by parameter."""
+        """Return the gradient by parameter."""
         names = [column.name for column in self.columns]
         return {
             name: self.gradient[:, [k for k, one in enumerate(names) if one == name]]
@@ -133,7 +133,7 @@ class Horizons:
 
 
 def spread(problem: Problem, points: int) -> Int[np.ndarray, "points"]:
-    """Horizons at which the loss of a run this long looks at something, evenly spread, T the last."""
+    """Return evenly spread horizons at which the loss of a run of this length uses a frame; T is the last."""
     steps = np.unique(np.round(np.linspace(0, problem.steps, points + 1)).astype(np.int64))[1:]
 
     def looks(h: int) -> bool:
@@ -157,15 +157,15 @@ def horizons(
     watch: Callable[[StretchTangents], None] | None = None,
     progress: Progress | None = None,
 ) -> Horizons:
-    """The gradient of the loss of every shorter run from the same start.
+    """Compute the gradient of the loss of every shorter run from the same start.
 
     Args:
-        problem: of a pair potential. names: full names of the parameters; each entry is a tangent.
-        at: horizons, rising; the last one is how far it is run. saltation: whether flips count.
-        per: steps that are made where the run makes one. By the time step the gradient is that of all of
-            them together.
-        each: called with every stretch when it has been made.
-        watch: called with the tangents of every stretch, those of each step among them.
+        problem: of a pair potential. names: full names of the parameters; each entry takes one tangent.
+        at: horizons, rising; the last horizon is the length of the run. saltation: whether flips count.
+        per: number of steps that replace one step of the run. The derivative by the time step is that by the
+            length of all of them together.
+        each: called with every stretch when it is complete.
+        watch: called with the tangents of every stretch, including those of each step.
 
     Raises:
         InputError: no pair potential. NumericalError: the run blew up.
@@ -199,7 +199,7 @@ def horizons(
 
 
 def first_difference(a: Horizons, b: Horizons) -> int | None:
-    """The first step at which two runs flip differently; None where they do not."""
+    """Return the first step at which the flips of two runs differ; None if they are equal."""
     common = min(len(a.flips), len(b.flips))
     differ = np.flatnonzero((a.flips[:common] != b.flips[:common]).any(axis=1))
     k = int(differ[0]) if len(differ) else common
@@ -220,7 +220,7 @@ class Limit:
 
 @dataclass(frozen=True)
 class Judgment:
-    """The trustworthy horizon of derivatives, with respect to one parameter or to all of them together."""
+    """The trust horizon of the derivatives by one parameter, or by all parameters together."""
 
     # "trusted" where every limit was examined and none was met, "limited" where one was met, else "undecided"
     verdict: str
@@ -232,7 +232,7 @@ class Judgment:
 
 @dataclass(frozen=True)
 class Trust(Judgment):
-    """How far a gradient can be trusted: its own verdict is that of all parameters together."""
+    """How far a gradient can be trusted; the verdict of this object covers all parameters together."""
 
     by: dict[str, Judgment]  # of each parameter, by full name
     tolerance: float  # relative difference above which two precisions, or two time steps, disagree
@@ -246,11 +246,11 @@ class Trust(Judgment):
 
 
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
-    """The run that a run is compared with, and the formats that are narrower than float64.
+    """Return a comparison run, and the formats of the given run that are narrower than float64.
 
-    Where any role of a number is narrower, all roles are float64. There is no wider hardware format than
-    float64: such a run is compared with one whose start is moved by a rounding, which shows how much of its
-    gradient is made of roundings, up to a factor of order one.
+    If any role of a number is narrower, the comparison run uses float64 for all roles. No hardware format is
+    wider than float64: such a run is compared with one whose start is shifted by one rounding, which shows
+    the contribution of rounding to its gradient, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -274,23 +274,24 @@ def trust(
     growth: GradientGrowth | None = None,
     progress: Progress | None = None,
 ) -> Trust:
-    """The horizon up to which a gradient means something, and what limits it.
+    """Determine the horizon up to which a gradient can be trusted, and what limits the horizon.
 
     Args:
         problem: the loss of a rollout of a pair potential.
         names: parameters; those of many entries (the start) are left out.
-        tolerance: relative difference of two precisions, or of a time step and its half, that is acceptable.
-        saltation: whether flips count. points: horizons that are compared, evenly spread.
+        tolerance: acceptable relative difference between two precisions, or between a time step and its half.
+        saltation: whether flips count. points: number of horizons that are compared, evenly spread.
         replicas: starts for the standard error, each a run and a pass of tangents; 0 leaves it out.
-        half_step: make the run and its gradient at half the time step too; else nothing is called trusted.
+        half_step: whether to repeat run and gradient at half the time step; otherwise nothing is called
+            trusted.
         made, near, growth: the event-aware reverse pass with its turning points, and the growth of the
-            gradient, where they have been made.
+            gradient, if already computed.
 
     Raises:
-        InputError: no such parameter, no pair potential, or no parameter of few entries.
+        InputError: a parameter does not exist, all parameters have many entries, or no pair potential.
         NumericalError: the run blew up.
 
-    Error: horizons are resolved to the spacing of the points. Where a pair turns around is the cubic through
+    Error: horizons are resolved to the spacing of the points. Turning points are located on the cubic through
     two steps' distances and rates. Terms of near misses are those of the whole run.
     """
     simulation = problem.simulation
@@ -354,7 +355,7 @@ def trust(
     moved, ambiguous, chaotic = near and near.moved, ambiguity(problem), grew(growth)
 
     def judged(*chosen: str) -> Judgment:
-        """By these parameters: what weighs in the derivative by one need not weigh in that by another."""
+        """Judge the derivatives by these parameters; a term may matter for one and not for another."""
         apart, halved, scattered = (
             {name: one[name] for name in chosen if name in one} for one in (differing, steps, scatter)
         )
@@ -386,7 +387,7 @@ def trust(
 
 
 def grew(growth: GradientGrowth) -> bool:
-    """Whether a gradient grew so much that it is one of a start among many."""
+    """Return whether a gradient grew so much that it is specific to this start."""
     # over the first horizons all of them grow: velocities turn into lengths, and averages gain frames
     size = growth.table["size"][min(CLOCK_STEPS, len(growth.table["size"]) - 1) :]
     there = size[np.isfinite(size) & (size > 0)]
@@ -395,14 +396,14 @@ def grew(growth: GradientGrowth) -> bool:
 
 
 def no_half_step(simulation: Simulation) -> bool:
-    """Whether a run cannot be compared with one at half the time step: a thermostat's noise is another."""
+    """Return whether half the time step is no comparison, because the noise of a thermostat would differ."""
     return simulation.integrator.random is not None
 
 
 def verdict_of(
     limits: Sequence[Limit], steps: int, chaotic: bool, skipped: bool
 ) -> tuple[str, int, str, tuple[str, ...]]:
-    """The verdict, how far no limit was met, which limit was met first, and what is not known."""
+    """Return the verdict, the horizon up to which no limit was met, the first limit, and unknowns."""
     examined = [one for one in limits if one.horizon is not None]
     horizon = min((one.horizon or 0 for one in examined), default=0)
     met = [one.what for one in examined if one.reached and one.horizon == horizon]
@@ -417,11 +418,11 @@ def verdict_of(
 
 
 def _unseen(part: StretchTangents) -> None:
-    """What is done with tangents of steps that nobody asks for."""
+    """Ignore the tangents of a stretch."""
 
 
 def _digits(*relative: float) -> int:
-    """Digits that two derivatives share, by the larger of their relative differences."""
+    """Return the number of digits that two derivatives share, by the larger of their relative differences."""
     worst = max(relative)
     if not np.isfinite(worst):
         return 0
@@ -439,7 +440,7 @@ def _missed(
     problem: Problem, own: Horizons, turns: Turns | None, unseen, made: ReversePass, moved, tolerance: float,
     saltation: bool, names: Sequence[str],
 ) -> Limit:  # fmt: skip
-    """Where something that is left out, or a turning point near the cutoff, weighs by these parameters."""
+    """Find where omitted terms or turning points near the cutoff matter for these derivatives."""
     if not np.any(np.asarray(problem.simulation.jumps())):
         return Limit(NEAR, problem.steps, False, "no jump")
     if not saltation:
@@ -474,7 +475,7 @@ def _missed(
 
 
 def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
-    """Terms as shares of the derivatives, and those of all terms up to each, of either sign by chance."""
+    """Return terms as shares of the derivatives, and cumulative shares with terms added in quadrature."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
         share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))
@@ -485,7 +486,7 @@ def _left_out(
     made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
     tolerance: float,
 ) -> Limit | None:  # fmt: skip
-    """Jumps of a loss of single frames, at their mean rate, or flips slower than the guard, that weigh."""
+    """Return a limit if jumps of a loss of single frames, at their mean rate, or grazing flips matter."""
     tape, met = made.tape, made.crossings[::-1]
     energy, virial, speed, weight, slow = (
         joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")
@@ -503,7 +504,7 @@ def _left_out(
 
 
 def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]:
-    """Norm of the difference over the larger norm, by parameter and horizon; 0 where both are 0."""
+    """Return the norm of the difference over the larger norm, by parameter and horizon; 0 if both are 0."""
     out = {}
     second = b.by_name()
     for name, first in a.by_name().items():
@@ -514,7 +515,7 @@ def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]
 
 
 def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "points"]]:
-    """Standard error over the size of the mean, by parameter and horizon."""
+    """Return the standard error over the size of the mean, by parameter and horizon."""
     out = {}
     for name in made[0].by_name():
         each = np.stack([one.by_name()[name] for one in made])
@@ -527,10 +528,10 @@ def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "poi
 def last_below(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """The longest horizon up to which no value passes a limit for good, and whether one does.
+    """Return the longest horizon before values exceed a limit for good, and whether they do.
 
-    A single point beyond the limit does not end it: a gradient that changes its sign is small there, and any
-    error large beside it.
+    A single point beyond the limit does not count: a gradient that changes sign is small there, so that any
+    error is large in comparison.
     """
     beyond = ~(np.max(np.stack(list(values.values())), axis=0) <= limit)
     lasting = beyond & np.append(beyond[1:], True)
@@ -543,10 +544,10 @@ def last_below(
 def last_agreeing(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """The longest horizon at which no value passes a limit, and whether it is short of the last one.
+    """Return the longest horizon at which no value exceeds a limit, and whether it is short of the last one.
 
-    Shorter horizons count for nothing: the error of a time step does not only grow, and what few flips add is
-    coarse where there is little else. A horizon alone among others beyond the limit agrees by chance.
+    Shorter horizons do not matter: the error of a time step does not only grow, and the contribution of few
+    flips is coarse if there is little else. A single horizon among others beyond the limit agrees by chance.
     """
     within = np.max(np.stack(list(values.values())), axis=0) <= limit
     if len(within) > 1:
@@ -556,7 +557,7 @@ def last_agreeing(
 
 
 def ambiguity(problem: Problem) -> Limit:
-    """The first decision of the run that another legitimate rounding could have made otherwise."""
+    """Find the first decision of the run that another legitimate rounding could have changed."""
     recorder = PairRecorder(problem.simulation)
     for segment in Engine(problem.simulation, problem.steps).segments():
         close = recorder.doubtful(segment)
