@@ -1,4 +1,4 @@
-"""Dtypes by role, rounding bounds, sums; and thresholds, decisions, their ledger and verdicts."""
+"""Precision (dtypes by role, rounding bounds, sums) and events (thresholds, decisions, ledger, verdicts)."""
 
 from __future__ import annotations
 

@@ -1,14 +1,15 @@
-"""Elementary functions in operations that IEEE 754 defines: the same bits wherever nothing is contracted.
+"""Elementary functions in IEEE 754 operations: the same bits wherever no multiply and add are fused.
 
-A library's own differ from another's, and a compiler's between instruction sets. These have no branch, no
-table and no fused multiply-add: only sums, products, quotients, roots, comparisons, selections, and the bits
-of numbers. jax traces them, and whoever interprets the trace operation by operation (the compiled loop,
-fixed-point runs, numpy in the tests) gets the same number.
+The functions of libraries differ from one another, and those of compilers differ between instruction sets.
+The functions here have no branch, no table and no fused multiply-add: only sums, products, quotients, roots,
+comparisons, selections, and bit operations. jax traces them, and every interpreter that runs the trace
+operation by operation (the compiled loop, fixed-point runs, numpy in the tests) obtains the same number.
 
 Arguments and results are float64. Subnormal arguments count as 0, as in XLA's threads. Results below
-2.2261e-308 are 0, and those of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps, the
-spacing of the floats at the result. That of the exponential is bounded by counting roundings; the others are
-at least 1.3 times the largest of 100,000 (error functions) and ten million arguments (docs/compiled-loop.md).
+2.2261e-308 are 0, and results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps,
+the spacing of the floats at the result. The bound of the exponential comes from counting roundings; the other
+bounds are at least 1.3 times the largest error in 100,000 (error functions) or ten million arguments
+(docs/compiled-loop.md).
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def _number(bits: Any) -> Any:
 
 
 def _short(x: Any) -> Any:
-    """The first 26 binary digits: a product of two such numbers is exact."""
+    """Return the first 26 binary digits: a product of two such numbers is exact."""
     return _number(_bits(x) & -(1 << 27))
 
 
@@ -57,7 +58,7 @@ def _with_sign(of: Any, x: Any) -> Any:
 
 
 def polynomial(coefficients: Sequence[float], x: Any) -> Any:
-    """Horner's rule, highest coefficient first."""
+    """Evaluate a polynomial by Horner's rule, highest coefficient first."""
     total = coefficients[0] * x + coefficients[1]
     for c in coefficients[2:]:
         total = total * x + c
@@ -65,7 +66,7 @@ def polynomial(coefficients: Sequence[float], x: Any) -> Any:
 
 
 def _halved(coefficients: Sequence[Any], x: Any) -> Any:
-    """Estrin's scheme, lowest coefficient first: a short chain of operations that wait for one another."""
+    """Evaluate a polynomial by Estrin's scheme, lowest coefficient first: short chains of operations."""
     if len(coefficients) == 1:
         return coefficients[0]
     pairs = [a + b * x for a, b in zip(coefficients[::2], coefficients[1::2], strict=False)]
@@ -81,7 +82,7 @@ _EXP = (
 
 
 def _reduced(x: Any, low: Any = None) -> tuple[Any, Any]:
-    """exp(x + low) = (1 + p) 2^n: p, and a number whose last bits are n."""
+    """Return p, and a number whose last bits are n, with exp(x + low) = (1 + p) 2^n."""
     shifted = x * (1 / math.log(2)) + _ROUND
     n = shifted - _ROUND
     r = (x - n * _LN2[0]) - n * _LN2[1]
@@ -90,18 +91,18 @@ def _reduced(x: Any, low: Any = None) -> tuple[Any, Any]:
 
 
 def _scaled(x: Any, p: Any, n: Any) -> Any:
-    """(1 + p) 2^n, the exponential of x."""
+    """Return (1 + p) 2^n, the exponential of x."""
     value = _number(_bits(1.0 + p) + (n << _EXPONENT))
     return jnp.where(x < _LEAST, 0.0, jnp.where(x <= _GREATEST, value, x + math.inf))
 
 
 def exp(x: Any, low: Any = None) -> Any:
-    """The exponential; of x + low, where the argument has a second part. Error: below 1.5 ulp."""
+    """Return the exponential of x, or of x + low for an argument in two parts. Error: below 1.5 ulp."""
     return _scaled(x if low is None else x + low, *_reduced(x, low))
 
 
 def expm1(x: Any) -> Any:
-    """exp(x) - 1. Error: below 4 ulp."""
+    """Return exp(x) - 1. Error: below 4 ulp."""
     p, n = _reduced(x)
     power = _number((n << _EXPONENT) + _ONE)
     near = power * p + (power - 1.0)
@@ -109,12 +110,12 @@ def expm1(x: Any) -> Any:
 
 
 def logistic(x: Any) -> Any:
-    """1 / (1 + exp(-x)). Error: below 4 ulp."""
+    """Return 1 / (1 + exp(-x)). Error: below 4 ulp."""
     return 1.0 / (1.0 + exp(-x))
 
 
 def tanh(x: Any) -> Any:
-    """The hyperbolic tangent. Error: below 4 ulp."""
+    """Return the hyperbolic tangent. Error: below 4 ulp."""
     size = jnp.abs(x)
     e = expm1(2 * jnp.where(size > 20, 20.0, size))
     return _with_sign(x, e / (e + 2))
@@ -125,7 +126,7 @@ _LOG = [2 / (2 * k + 1) for k in range(11, 0, -1)]
 
 
 def _split(x: Any) -> tuple[Any, Any]:
-    """x = m 2^n with m between the root of 1/2 and that of 2, for positive normal numbers."""
+    """Return n and m with x = m 2^n and m between √(1/2) and √2, for positive normal numbers."""
     bits = _bits(x)
     exponent = _number(lax.shift_right_logical(bits, np.int64(_EXPONENT)) | _COUNT) - (2.0**52 + 1023)
     m = _number((bits & _MANTISSA) | _ONE)
@@ -134,7 +135,7 @@ def _split(x: Any) -> tuple[Any, Any]:
 
 
 def log(x: Any) -> Any:
-    """The natural logarithm. Error: below 3 ulp."""
+    """Return the natural logarithm. Error: below 3 ulp."""
     n, m = _split(x)
     s = (m - 1) / (m + 1)
     square = s * s
@@ -145,7 +146,7 @@ def log(x: Any) -> Any:
 
 
 def log1p(x: Any) -> Any:
-    """log(1 + x). Error: below 4 ulp."""
+    """Return log(1 + x). Error: below 4 ulp."""
     u = 1.0 + x
     # what the sum has lost
     rest = jnp.where((x > -1) & (x < 2.0**53), (x - (u - 1.0)) / u, 0.0)
@@ -153,7 +154,7 @@ def log1p(x: Any) -> Any:
 
 
 def power(x: Any, y: Any) -> Any:
-    """x to the power y; of a negative x for whole y only. Error: below 1.5 + |y|/40 ulp."""
+    """Return x to the power y; for negative x, y must be whole. Error: below 1.5 + |y|/40 ulp."""
     size, huge = jnp.abs(x), 2.0**1000
     n, m = _split(size)
     # the logarithm in two parts: s and the sum that divides it lose what the second one has
@@ -183,7 +184,7 @@ _SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1)]
 
 
 def cos_sin(x: Any) -> tuple[Any, Any]:
-    """Cosine and sine, up to 8e5; NaN beyond. Error: absolute, below 2.5e-16."""
+    """Return cosine and sine for |x| up to 8e5, NaN beyond. Error: absolute, below 2.5e-16."""
     n = jnp.round(x * (2 / math.pi))
     r = (x - n * _HALF_PI[0]) - n * _HALF_PI[1]
     square = r * r
@@ -216,7 +217,7 @@ _ERF = (
 
 
 def _complement(z: Any) -> Any:
-    """erfc of numbers that are not negative."""
+    """Return erfc of numbers that are not negative."""
     z = jnp.where(z > 28, 28.0, z)
     short = _short(z)
     inverse = 1 / (_K + z)
@@ -225,13 +226,13 @@ def _complement(z: Any) -> Any:
 
 
 def erfc(x: Any) -> Any:
-    """The complementary error function. Error: below 12 ulp."""
+    """Return the complementary error function. Error: below 12 ulp."""
     value = _complement(jnp.abs(x))
     return jnp.where(x < 0, 2.0 - value, value)
 
 
 def erf(x: Any) -> Any:
-    """The error function. Error: below 6 ulp."""
+    """Return the error function. Error: below 6 ulp."""
     size = jnp.abs(x)
     return jnp.where(size < 0.5, x * polynomial(_ERF, x * x), _with_sign(x, 1.0 - _complement(size)))
 
@@ -254,5 +255,5 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 
 
 def program(name: str, *shapes: tuple[int, ...]) -> ClosedJaxpr:
-    """The function of jax's name in operations, of arguments of given shapes."""
+    """Return the jaxpr of the function with a given jax name, for arguments of given shapes."""
     return jax.make_jaxpr(FUNCTIONS[name])(*(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes))

@@ -1,4 +1,4 @@
-"""The event model: threshold, margin, decision; the ledger of their flips."""
+"""The event model: thresholds, margins, decisions, and the ledger of flips."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ INCLUSIVE = {"<": False, "<=": True}
 
 @dataclass(frozen=True)
 class Threshold:
-    """A number that a computed quantity is compared with, and the comparison that is used.
+    """A number that a computed quantity is compared with, and the comparison operator.
 
-    The comparison is part of the physics: codes that agree on a cutoff still disagree on `<` against `<=`
-    and on comparing r or r², and then on pairs that sit at the cutoff.
+    The comparison is part of the physics: codes with the same cutoff may still differ in `<` against `<=` and
+    in comparing r or r², and then they differ for pairs exactly at the cutoff.
     """
 
     # the threshold in the quantity's own space, exactly as the program compares it: a number, or an array
@@ -32,15 +32,15 @@ class Threshold:
             raise InputError(f"unknown comparison {self.comparison!r}; known are {', '.join(INCLUSIVE)}")
 
     def margin(self, quantity):
-        """threshold - quantity: positive means yes.
+        """Return threshold - quantity: positive means yes.
 
-        Error: exact when the quantity is within a factor two of the threshold (Sterbenz' lemma), and of the
-        right sign always, because IEEE subtraction of unequal numbers never gives zero (gradual underflow).
+        Error: exact if the quantity is within a factor two of the threshold (Sterbenz' lemma); the sign is
+        always right, because IEEE subtraction of unequal numbers never gives zero (gradual underflow).
         """
         return self.value - quantity
 
     def decide(self, quantity):
-        """The decision itself, of the shape of the quantity; NaN decides no."""
+        """Return the decision, in the shape of the quantity; NaN gives no."""
         return quantity <= self.value if INCLUSIVE[self.comparison] else quantity < self.value
 
 
@@ -48,9 +48,9 @@ class Threshold:
 class Hysteresis:
     """A decision that turns yes at one threshold and no at another (a Schmitt trigger).
 
-    A quantity that wavers about one threshold flips its decision each time. With a gap between the two it
-    flips once; the gap is to be wider than the noise. A Verlet list does the same with its skin: it is
-    built when the skin is used up, not whenever an atom moves.
+    A quantity that fluctuates about one threshold flips its decision each time. With a gap between two
+    thresholds it flips once; choose a gap wider than the noise. The skin of a Verlet list is such a gap: the
+    list is built when the skin is used up, not whenever an atom moves.
     """
 
     enter: Threshold  # where a no turns yes
@@ -72,16 +72,16 @@ class Hysteresis:
             )
 
     def margin(self, quantity, before):
-        """Signed distance to the threshold that holds now: positive means yes.
+        """Return the signed distance to the threshold that currently applies: positive means yes.
 
         Args:
             quantity: computed value(s).
-            before: the decision(s) of the step before.
+            before: the decision(s) of the previous step.
         """
         return _where(before, self.leave.margin(quantity), self.enter.margin(quantity))
 
     def decide(self, quantity, before):
-        """The decision, given the one before."""
+        """Return the decision, given the previous one."""
         return _where(before, self.leave.decide(quantity), self.enter.decide(quantity))
 
 
@@ -96,9 +96,9 @@ def _where(condition, yes, no):
 
 @dataclass(frozen=True)
 class Ledger:
-    """The flips of one channel in time; row order is step, then subject.
+    """The flips of one channel in time, in the order of steps, then subjects.
 
-    Step s means that the decision at s differs from the one at s - 1.
+    A flip at step s means that the decision at s differs from the decision at s - 1.
 
     Attributes:
         channel: name of the stream of decisions, for example "pair".
@@ -107,7 +107,7 @@ class Ledger:
         entered: True where the decision turned yes.
         margin: signed distance to the threshold at the step of the flip, in the quantity's space.
         bound: rounding bound on the quantity, in the same space.
-        jump: what the flip does to the conserved quantity (energy), signed.
+        jump: change of the conserved quantity (energy) by the flip, signed.
         extra: further columns by name, each of shape (flips,).
     """
 
@@ -125,16 +125,16 @@ class Ledger:
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "flips"]:
-        """Whether another valid rounding could change the step of each flip: |margin| within the bound."""
+        """Whether another valid rounding could change the step of each flip: |margin| is within the bound."""
         return np.abs(self.margin) <= self.bound
 
     def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:
-        """Number of decisions that turned yes, and that turned no, at each step 0..steps."""
+        """Return the numbers of decisions that turned yes and that turned no, at each step 0..steps."""
         entered = np.bincount(self.step[self.entered], minlength=steps + 1)
         left = np.bincount(self.step[~self.entered], minlength=steps + 1)
         return entered, left
 
     def jumps(self, steps: int) -> Float[np.ndarray, "steps"]:
-        """Sum of the jumps of the flips of each step 0..steps."""
+        """Return the sum of the jumps of all flips at each step 0..steps."""
         # bincount of nothing is a row of integers, whatever its weights
         return np.bincount(self.step, weights=self.jump, minlength=steps + 1).astype(np.float64)

@@ -1,10 +1,9 @@
 """Arithmetic inside jit that has the same bits everywhere.
 
-XLA on a CPU contracts a*b + c into a fused multiply-add, so the same expression has other bits in
-another fusion, another instruction set, or in numpy. A decision must not depend on that: it is written
-with the products fenced, and then the host reproduces it bit for bit. A formula that is written as any
-other is run operation by operation instead: rounded behind each, enclosed by intervals, or with the bits of
-every processor.
+XLA on a CPU contracts a*b + c into a fused multiply-add, so the same expression has different bits in another
+fusion, another instruction set, or in numpy. A decision must not depend on the compiler: its products are
+protected by fences, and the host reproduces it bit for bit. Any other formula is run operation by operation
+instead: with a rounding after each, with enclosing intervals, or with the same bits on every processor.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from mdnum.numerics import elementary
 
 
 def integer_of(dtype):
-    """The signed integer type as wide as a float dtype."""
+    """Return the signed integer type as wide as a float dtype."""
     return jnp.dtype(f"int{8 * np.dtype(dtype).itemsize}")
 
 
 def zero_bits(dtype) -> jax.Array:
-    """An integer zero of the width of dtype; pass it into jit as an argument, so that XLA cannot fold it."""
+    """Return an integer zero as wide as dtype; pass it into jit as an argument, so that XLA cannot fold it."""
     return jax.device_put(np.zeros((), integer_of(dtype)))
 
 
@@ -40,10 +39,10 @@ def _through_integers(x, zero):
 
 @jax.custom_jvp
 def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
-    """x, protected from contraction into a fused multiply-add: XLA sees an exclusive-or with a runtime zero.
+    """Return x, protected from contraction into a fused multiply-add by an exclusive-or with a runtime zero.
 
-    It also forces the rounding to float16 and bfloat16: XLA may keep the float32 in which it computed (a
-    bfloat16 product that is widened at once is never rounded on a CPU), but an integer needs the bits.
+    The fence also forces the rounding to float16 and bfloat16: XLA may keep the float32 in which it computed
+    (a bfloat16 product that is widened at once is never rounded on a CPU), but an integer needs the bits.
 
     Source: optimization_barrier and reduce_precision do not stop the contraction on CPU
     (openxla/xla#41579); the exclusive-or with a runtime integer does.
@@ -58,7 +57,7 @@ def _fence_jvp(primals, tangents):
 
 
 def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
-    """dx² + dy² + dz², rounded after every operation: the bits of numpy's `dx*dx + dy*dy + dz*dz`.
+    """Return Return dx² + dy² + dz², rounded after every operation: the bits of numpy's `dx*dx + dy*dy + dz*dz`.
 
     Error: at most gamma_3 * r² for exact components (Higham 2002, 3.1).
     """
@@ -66,11 +65,11 @@ def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -
 
 
 def root(x: jax.Array) -> jax.Array:
-    """The square root, correctly rounded on every device.
+    """Return the square root, correctly rounded on every device.
 
-    A GPU's own in float32 is off by an ulp in one number of six (XLA, H200). One in float64, rounded once
-    more, is right, since 53 bits are more than twice 24 and two (Figueroa 1995, "When is double rounding
-    innocuous?").
+    The float32 square root of a GPU has an error of one ulp for one number in six (XLA, H200). A float64 root
+    that is then rounded to float32 is correct, since 53 bits are more than twice 24 and two (Figueroa 1995,
+    "When is double rounding innocuous?").
     """
     if x.dtype != jnp.float32 or jax.default_backend() == "cpu":
         return jnp.sqrt(x)
@@ -97,13 +96,13 @@ def stepwise(
     enter: Callable[[Any], Any] = _same,
     leave: Callable[[Any], jax.Array] = _same,
 ) -> Callable[..., Any]:
-    """The function of arrays, traced where it is called, whose operations a rule computes one by one.
+    """Return a function of arrays that is traced at each call and computed operation by operation by a rule.
 
     Args:
         function: may close over other arrays.
-        rule: of an equation of jax's program and its inputs: its outputs.
-        enter: makes what the rule works on of an argument, a constant, and what enters or leaves a call.
-        leave: makes an array of a result of the rule.
+        rule: maps an equation of jax's program and its inputs to its outputs.
+        enter: converts arguments, constants, and inputs and outputs of calls to the values of the rule.
+        leave: converts a result of the rule to an array.
     """
 
     def run(*args: Any) -> Any:
@@ -120,7 +119,7 @@ def stepwise(
 def interpreted(
     program: Any, arguments: Sequence[Any], rule: Rule, enter: Callable[[Any], Any] = _same
 ) -> list[Any]:
-    """The results of a program (see `stepwise`), closed or without constants."""
+    """Return the results of a program (see `stepwise`), closed or without constants."""
     jaxpr, constants = (program.jaxpr, program.consts) if isinstance(program, ClosedJaxpr) else (program, ())
     known = dict(zip(jaxpr.constvars, map(enter, constants), strict=True))
     known.update(zip(jaxpr.invars, map(enter, arguments), strict=True))
@@ -140,16 +139,16 @@ def interpreted(
 
 
 def inlined(equation: Any) -> Any:
-    """The program that an operation calls once, such as a function with derivatives of its own, or None."""
+    """Return the program that an operation calls once (a function with custom derivatives), or None."""
     programs = (equation.params.get(key) for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"))
     return next(filter(None, programs), None) if equation.primitive.name in _CALLED else None
 
 
 def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
-    """What jax itself makes of an equation's inputs.
+    """Return jax's own results for an equation and its inputs.
 
     Raises:
-        TypeError: it is a program of its own, such as a loop.
+        TypeError: the equation contains a program of its own, such as a loop.
     """
     if any(isinstance(param, Jaxpr | ClosedJaxpr) for param in equation.params.values()):
         raise TypeError(f"{equation.primitive.name} cannot be evaluated operation by operation")
@@ -158,15 +157,15 @@ def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
 
 
 def rounded(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
-    """The function with every sixteen-bit result rounded, one operation after the other.
+    """Return the function with every sixteen-bit result rounded, one operation after the other.
 
-    XLA on a CPU computes in float32 what is written in float16 or bfloat16, and may leave out the roundings
-    between two operations. Here a fence stands behind each: numpy with ml_dtypes then gives the same bits,
-    for + - * / and sqrt (exp and cos are float32's, which libraries round differently). Results of other
-    dtypes are left alone.
+    XLA on a CPU computes float16 and bfloat16 expressions in float32, and may omit the roundings between two
+    operations. Here a fence follows each operation: numpy with ml_dtypes then gives the same bits for + - * /
+    and sqrt (exp and cos are float32's, which libraries round differently). Results of other dtypes do not
+    change.
 
     Args:
-        function: of arrays; it may close over others.
+        function: function of arrays; it may close over others.
         zero: an integer zero that XLA must not know (`zero_bits`).
     """
 
@@ -182,17 +181,17 @@ def _is_short(dtype: Any) -> bool:
 
 
 def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list[Any]]:
-    """A function of float64 numbers in ball arithmetic: every number an interval that holds the exact one.
+    """Return a float64 function in ball arithmetic: each number is an interval that contains the exact value.
 
-    Constants of the formula are the doubles that they are. A `where` whose condition holds for a part of a
-    ball only gives the union of both of its values; at most one of them may be the wrong branch.
+    Constants of the formula are taken as exact doubles. If the condition of a `where` holds for only part of
+    a ball, the result is the union of both values; at most one of them may be the wrong branch.
 
     Args:
-        function: of scalars; jax traces it once.
-        arguments: how many; numbers of flint, as the results are.
+        function: function of scalars; jax traces it once.
+        arguments: number of arguments; arguments and results are flint numbers.
 
     Raises:
-        TypeError: by the function, for an operation that has no counterpart here.
+        TypeError: on calling the function, for an operation without a counterpart here.
     """
     from flint import arb
 
@@ -298,7 +297,7 @@ _FAR = (
 
 
 def normal_quantile(u: jax.Array, zero: jax.Array) -> jax.Array:
-    """The normal deviate of a number between -1 and 1: sqrt(2) erf⁻¹(u), float64.
+    """Return the normal deviate of a number u between -1 and 1: sqrt(2) erf⁻¹(u), float64.
 
     Error: relative, about 1e-15.
     """
@@ -326,7 +325,7 @@ _SAFE = (
 
 @dataclass
 class _Held:
-    """A number of a program that is run: may it be added as it is, do all entries share it?"""
+    """A number of an interpreted program, with marks: safe to add unfenced, shared by all entries."""
 
     value: Any
     safe: bool = True
@@ -335,10 +334,10 @@ class _Held:
 
 
 def reproducible(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
-    """The function in float64, with results that do not depend on how it is compiled.
+    """Return the float64 function with results that do not depend on how it is compiled.
 
     Args:
-        function: of arrays; it may close over others.
+        function: function of arrays; it may close over others.
         zero: an integer zero that XLA must not know (`mdnum.numerics.exact.zero_bits`).
     """
 

@@ -13,7 +13,7 @@ _forked = False
 
 
 def check_not_forked() -> None:
-    """Check that this process may use jax; to be called before the first use of jax.
+    """Check that this process may use jax; call this function before the first use of jax.
 
     Raises:
         InputError: this process is a fork of one in which jax had been used.

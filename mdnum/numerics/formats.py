@@ -1,7 +1,7 @@
-"""Formats of numbers, emulated: rounding to any of them, products of matrices in them, loss scaling.
+"""Emulated number formats: rounding to a format, matrix products in it, loss scaling.
 
-Which numbers a format has is what decides here; its speed is not emulated. TF32 is what some devices do to
-float32 matrix products unless told otherwise: the inputs keep 10 of 23 fraction bits, the sums are float32.
+The emulation reproduces the numbers of a format, not its speed. Some devices use TF32 for float32 matrix
+products by default: the inputs keep 10 of 23 fraction bits, the sums are float32.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mdnum.errors import InputError
 
 @dataclass(frozen=True)
 class FloatFormat:
-    """A binary floating-point format with subnormals and infinities, as IEEE 754 arranges them."""
+    """A binary floating-point format with subnormals and infinities, as IEEE 754 defines them."""
 
     name: str  # such as "tf32"
     bits: int  # width in memory (TF32 lives in 32)
@@ -50,12 +50,12 @@ class FloatFormat:
 
     @property
     def smallest_normal(self) -> float:
-        """The smallest number with all its digits."""
+        """The smallest number with full precision."""
         return 2.0**self.emin
 
     @property
     def smallest_subnormal(self) -> float:
-        """The smallest positive number, and the spacing below the smallest normal one."""
+        """The smallest positive number, which is also the spacing below the smallest normal number."""
         return 2.0 ** (self.emin + 1 - self.significand)
 
     @property
@@ -77,10 +77,10 @@ FORMATS: Mapping[str, FloatFormat] = {
 
 
 def format_of(name: str) -> FloatFormat:
-    """The floating-point format of a given name.
+    """Return the floating-point format of a given name.
 
     Raises:
-        InputError: no format is called that.
+        InputError: no format has this name.
     """
     if name not in FORMATS:
         raise InputError(f"unknown format {name!r}; known are {', '.join(FORMATS)}")
@@ -88,7 +88,7 @@ def format_of(name: str) -> FloatFormat:
 
 
 def _spacing(x: Float[Array, "..."], form: FloatFormat) -> Float[Array, "..."]:
-    """Distance of the numbers of a format around x, a power of two; x is float64."""
+    """Return the spacing of the numbers of a format around x, a power of two; x is float64."""
     # jnp.frexp has no derivative rule for its exponent; the bits say the same
     field = (lax.bitcast_convert_type(x, jnp.int64) >> 52) & 0x7FF
     exponent = jnp.maximum(field - 1023, form.emin) + 1 - form.significand
@@ -107,7 +107,7 @@ def _identity_slope_jvp(primals, tangents):
 
 
 def _rounded(x: Float[Array, "..."], name: str, whole: Callable[[Array], Array]) -> Float[Array, "..."]:
-    """x in the numbers of a format, of which it is so many spacings from 0 as `whole` says."""
+    """Round x to a format: `whole` maps x in units of the local spacing to a whole number of spacings."""
     form = format_of(name)
     if form.significand >= 53:
         return x
@@ -119,14 +119,15 @@ def _rounded(x: Float[Array, "..."], name: str, whole: Callable[[Array], Array])
 
 
 def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
-    """x rounded to the nearest number of a format, ties to even, in the dtype of x.
+    """Round x to the nearest number of a format, ties to even, in the dtype of x.
 
-    Subnormals of the format are kept and what is too large becomes infinite (`lax.reduce_precision` flushes
-    the former). One rounding from up to float64, where a cast may round twice. Its derivative is 1.
+    Subnormals of the format are kept (`lax.reduce_precision` flushes them), and numbers beyond the largest
+    become infinite. The function rounds once from up to float64, where a cast may round twice. Its derivative
+    is 1.
 
     Args:
         x: float64 or narrower.
-        name: of the format; one with more digits or range than the dtype of x leaves x as it is.
+        name: of the format; a format with more digits or range than the dtype of x leaves x unchanged.
     """
     return _rounded(x, name, jnp.rint)
 
@@ -134,13 +135,13 @@ def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
 def matmul(
     a: Float[Array, "... m k"], b: Float[Array, "... k n"], name: str = "float32"
 ) -> Float[Array, "... m n"]:
-    """A matrix product as a device makes it: inputs in a format, products and sums in a wider one.
+    """Emulate a device's matrix product: inputs in one format, products and sums in a wider one.
 
     "float64": all in float64. "float32": all in float32. "tf32", "bfloat16" and "float16": inputs rounded to
     the format, exact products, sums in float32. The result has the dtype of a.
 
-    Error: at most (2u + gamma_k) |a| |b| with the format's u and float32's gamma. The order of the sums is
-    that of the CPU's own product, not of a device.
+    Error: at most (2u + gamma_k) |a| |b| with the format's u and float32's gamma. The sums use the order of
+    the CPU's own product, which differs from that of a device.
     """
     format_of(name)
     if name == "float64":
@@ -150,12 +151,12 @@ def matmul(
 
 
 def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Array, "..."]:
-    """x rounded up or down to a neighbor in a format with probabilities that keep its mean.
+    """Round x up or down to a neighbor in a format, with probabilities that preserve the mean.
 
-    In the dtype of x; a number of the format stays as it is. Unbiased: the expectation is x (for |x| up to
-    the largest number), with a standard deviation of at most half the spacing; so a long sum of small terms
-    does not stand still. The uniform numbers have 53 bits. Its derivative is 1. Source: Croci et al., R. Soc.
-    Open Sci. 9, 211631 (2022).
+    The result has the dtype of x; numbers of the format are unchanged. Unbiased: the expectation is x (for
+    |x| up to the largest number), with a standard deviation of at most half the spacing; so a long sum of
+    small terms does not stagnate. The uniform numbers have 53 bits. The derivative is 1. Source: Croci et
+    al., R. Soc. Open Sci. 9, 211631 (2022).
     """
 
     def up_or_down(places: Array) -> Array:
@@ -173,9 +174,9 @@ def quantize(
     lowest: Float[Array, ""],
     highest: Float[Array, ""],
 ) -> Float[Array, "..."]:
-    """The multiple of scale nearest to x, from lowest * scale to highest * scale; all may be traced.
+    """Return the multiple of scale nearest to x, from lowest * scale to highest * scale; all may be traced.
 
-    Derivative 1 inside, 0 where clamped. Error: at most scale/2 inside, plus one rounding.
+    The derivative is 1 inside, 0 where clamped. Error: at most scale/2 inside, plus one rounding.
     """
     return jnp.clip(jnp.rint(x / jnp.broadcast_to(scale, x.shape)), lowest, highest) * scale
 
@@ -204,11 +205,11 @@ class ScaledGradient(NamedTuple):
 
 
 def scaled_gradient(function: Callable[..., Any], scale: float | Array, *args: Any) -> ScaledGradient:
-    """The loss `function(*args)` and its gradient by the first argument.
+    """Compute the loss `function(*args)` and its gradient by the first argument.
 
     Args:
-        function: of arrays; returns a scalar.
-        scale: a power of two (`check_scale`); too small and gradients vanish, too large and they overflow.
+        function: function of arrays that returns a scalar.
+        scale: a power of two (`check_scale`); if too small, gradients vanish, if too large, they overflow.
     """
     scale = jnp.asarray(scale, jnp.float64)
     value, pullback = jax.vjp(lambda first: function(first, *args[1:]), args[0])
@@ -222,7 +223,7 @@ def check_scale(scale: float) -> None:
     """Check that scaling by this factor is exact.
 
     Raises:
-        InputError: it is no power of two.
+        InputError: the factor is not a power of two.
     """
     if not (scale > 0 and math.frexp(scale)[0] == 0.5):
         raise InputError(

@@ -1,7 +1,8 @@
-"""What jax traces, evaluated by numpy and scipy operation by operation: another program, and no compiler.
+"""Evaluation of jax traces by numpy and scipy, operation by operation: an independent program, uncompiled.
 
-It is what a judge is made of: the formula is the same, its elementary functions and loops are not. Nothing is
-compiled, which of a formula's operations one by one takes longer than all the rest of a short run.
+This evaluation serves as a reference: the formula is the same, but the elementary functions and loops are
+independent. Nothing is compiled, because compiling a formula's operations one by one would take longer than
+the rest of a short run.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _NAMES = {
 
 
 def by_numpy(function: Callable[..., Any], *arguments: np.ndarray) -> list[np.ndarray]:
-    """The results of a function of arrays; operations that are not known here are jax's own.
+    """Return the results of a function of arrays; operations without a counterpart here are computed by jax.
 
     Error: that of numpy's and scipy's functions, some ulp each.
     """

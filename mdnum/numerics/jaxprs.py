@@ -1,4 +1,4 @@
-"""Arithmetic of a traced program: its single-precision operations, and where numbers become infinite."""
+"""Analysis of traced programs: single-precision operations, and the origin of non-finite numbers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DIGITS = 6
 
 
 def _programs(closed: Any) -> Iterator[Any]:
-    """A program and all that it calls."""
+    """Yield a program and all programs that it calls."""
     yield closed
     for equation in closed.eqns:
         for inner in jax.tree.leaves(
@@ -31,7 +31,7 @@ def _programs(closed: Any) -> Iterator[Any]:
 
 
 def narrows(closed: Any) -> bool:
-    """Whether a program rounds numbers in double precision to single precision."""
+    """Return whether a program rounds numbers from double to single precision."""
     both = {np.dtype(np.float64)}, {np.dtype(np.float32)}
     return any(
         ({one.aval.dtype for one in equation.invars}, {one.aval.dtype for one in equation.outvars}) == both
@@ -41,15 +41,15 @@ def narrows(closed: Any) -> bool:
 
 
 def held_numbers(closed: Any, least: int = 10) -> int:
-    """Number of entries in a program's large constant arrays, such as weights that a function closed over."""
+    """Count the entries in a program's large constant arrays, such as weights that a function closed over."""
     consts = [one for program in _programs(closed) for one in getattr(program, "consts", ())]
     return sum({id(one): one.size for one in consts if is_inexact(one) and one.size >= least}.values())
 
 
 def single_numbers(closed: Any) -> list[str]:
-    """Constants of a program that were rounded to single precision, as they were most likely written.
+    """Return constants of a program that were rounded to single precision, as they were most likely written.
 
-    One that was widened again has a value of single precision, and needs no more digits than that.
+    A constant that was widened again has a single-precision value, and needs only that many digits.
     """
     numbers: dict[str, None] = {}
     for program in _programs(closed):
@@ -82,10 +82,10 @@ class Operation:
 
 
 def first_not_finite(function: Callable[..., Any], *args: Any) -> Operation | None:
-    """The operation that makes the result of a function of arrays not finite; it is not compiled.
+    """Find the operation that makes the result of a function of arrays not finite, without compiling.
 
     Returns:
-        None where every number of the result is finite, or one of the arguments is not.
+        None if every number of the result is finite, or if an argument is not.
     """
     leaves, tree = jax.tree.flatten(args)
     if count_bad(leaves):
@@ -109,19 +109,19 @@ def first_not_finite(function: Callable[..., Any], *args: Any) -> Operation | No
 
 
 def count_bad(tree: Any) -> int:
-    """How many numbers are not finite."""
+    """Count the numbers that are not finite."""
     leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(tree) if is_inexact(leaf)]
     return sum(int((~np.isfinite(leaf)).sum()) for leaf in leaves)
 
 
 def is_inexact(leaf: Any) -> bool:
-    """Whether a leaf is an array of floats; ml_dtypes' narrow ones are."""
+    """Return whether a leaf is an array of floats, including the narrow types of ml_dtypes."""
     return jnp.issubdtype(getattr(leaf, "dtype", np.int64), jnp.floating)
 
 
 @dataclass
 class _Interpreter:
-    """One run of a program, operation by operation, up to and including its end."""
+    """Interpreter of one run of a program, operation by operation, to its end."""
 
     mended: list[int]  # numbers of operations whose results are made finite
     found: Operation | None = None  # the first operation at fault
@@ -129,7 +129,7 @@ class _Interpreter:
     rounds: list[int] = field(default_factory=list)  # of the loops that it is in
 
     def closed(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
-        """The results of a program."""
+        """Return the results of a program."""
         return interpreted(program, inputs, self._equation)
 
     def _equation(self, equation: Any, inputs: list[Any]) -> list[Any]:
@@ -198,7 +198,7 @@ class _Interpreter:
 
 
 def _written(equation: Any) -> tuple[str, tuple[str, ...]]:
-    """Where an operation was written, and the functions on the way there, outermost first."""
+    """Return where an operation was written, and the functions on the way there, outermost first."""
     traceback, inside = equation.source_info.traceback, f"{Path(jax.__file__).parent}/"
     frames = [
         one

@@ -1,8 +1,8 @@
-"""Sums of integers, which are the same in every order; segments; and every reduction by its name.
+"""Sums of integers, which do not depend on the order; segment sums; and all reductions by name.
 
 A finite float is an integer multiple of its format's smallest subnormal. The exact sum adds those integers
-in a number wide enough for all of them (Kulisch & Miranker 1986), held as limbs of 32 bits in int64, and
-rounds once. The fixed-point sum rounds every term to a coarser unit first and then needs one int64.
+in a number wide enough for all of them (Kulisch & Miranker 1986), stored as limbs of 32 bits in int64, and
+rounds once. The fixed-point sum first rounds every term to a coarser unit and then needs only one int64.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MASK = 2**_LIMB - 1
 
 
 def _parts(terms: Float[Array, "n columns"], form: FloatFormat) -> tuple[jax.Array, list[jax.Array]]:
-    """Every term as signed pieces of 32 bits: the limb of the lowest piece, and the pieces."""
+    """Return every term as signed pieces of 32 bits: the limb of the lowest piece, and the pieces."""
     bits = lax.bitcast_convert_type(terms, integer_of(terms.dtype)).astype(jnp.int64)
     magnitude = bits & ((1 << (8 * terms.dtype.itemsize - 1)) - 1)
     exponent, fraction = magnitude >> (form.significand - 1), magnitude & ((1 << (form.significand - 1)) - 1)
@@ -56,7 +56,7 @@ def _parts(terms: Float[Array, "n columns"], form: FloatFormat) -> tuple[jax.Arr
 
 
 def _carried(limbs: Int[Array, "limbs columns"]) -> tuple[Int[Array, "columns"], Int[Array, "limbs columns"]]:
-    """What is carried out at the top, -1 where the number is negative, and limbs from 0 to 2^32 - 1."""
+    """Return the carry out of the top (-1 for a negative number), and limbs from 0 to 2^32 - 1."""
 
     def step(carry, limb):
         value = limb + carry
@@ -66,7 +66,7 @@ def _carried(limbs: Int[Array, "limbs columns"]) -> tuple[Int[Array, "columns"],
 
 
 def _rounded(limbs: Int[Array, "limbs columns"], form: FloatFormat) -> UInt64[Array, "columns"]:
-    """Bits of the float nearest to a non-negative number, ties to even."""
+    """Return the bits of the float nearest to a non-negative number, ties to even."""
     count = limbs.shape[0]
     filled = limbs != 0
     place = count - 1 - jnp.argmax(filled[::-1], axis=0)
@@ -100,12 +100,12 @@ def _rounded(limbs: Int[Array, "limbs columns"], form: FloatFormat) -> UInt64[Ar
 class Exact(Reduction):
     """The exact sum, rounded once to nearest: the same bits in every order.
 
-    Error: half an ulp of the result; no overflow on the way; up to 2^31 terms. An infinity or a NaN among
-    the terms gives what IEEE addition gives.
+    Error: half an ulp of the result; no intermediate overflow; up to 2^31 terms. Infinite or NaN terms give
+    the result of IEEE addition.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Integer additions only."""
+        """Return the sum, computed with integer additions only."""
         dtype, shape = terms.dtype, terms.shape[1:]
         form = format_of(np.dtype(dtype).name)
         flat = terms.reshape(terms.shape[0], -1)
@@ -126,7 +126,7 @@ class Exact(Reduction):
         return jnp.where(special, jnp.sum(flat, axis=0), total).reshape(shape)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """u |sum|, where |sum| is itself bounded, since the host adds in float64."""
+        """Return the bound u |sum|, where |sum| itself is bounded, because the host adds in float64."""
         wide = terms.astype(np.float64)
         total = np.abs(wide.sum(axis=0)) + gamma(len(terms)) * np.abs(wide).sum(axis=0)
         return np.asarray(unit_roundoff(terms.dtype) * total)
@@ -134,11 +134,11 @@ class Exact(Reduction):
 
 @dataclass(frozen=True)
 class FixedPoint(Reduction):
-    """A sum of integers: every term is rounded to a multiple of 2^-bits first.
+    """A sum of integers: every term is first rounded to a multiple of 2^-bits.
 
-    The same bits in every order, at the cost of one rounding per term. Error: at most n * 2^(-bits - 1)
-    plus the rounding of the result. A term beyond 2^(62 - bits) / n could overflow the sum: the answer is
-    then NaN, never a wrapped number.
+    The result has the same bits in every order, at the cost of one rounding per term. Error: at most
+    n * 2^(-bits - 1) plus the rounding of the result. If a term beyond 2^(62 - bits) / n could overflow the
+    sum, the result is NaN, never a wrapped number.
     """
 
     bits: int = 40  # binary digits after the point, from -1000 to 1000
@@ -150,7 +150,7 @@ class FixedPoint(Reduction):
             )
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """One int64 per sum."""
+        """Return the sum, computed in one int64 per sum."""
         scaled = terms.astype(jnp.float64) * 2.0**self.bits
         fits = jnp.all(jnp.abs(scaled) <= 2.0**62 / terms.shape[0], axis=0)
         total = jnp.sum(jnp.rint(jnp.where(fits, scaled, 0.0)).astype(jnp.int64), axis=0)
@@ -158,7 +158,7 @@ class FixedPoint(Reduction):
         return jnp.where(fits, value, jnp.nan).astype(terms.dtype)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """Half a unit for each term, and one rounding of the result."""
+        """Return half a unit for each term, plus one rounding of the result."""
         size = np.abs(terms.astype(np.float64)).sum(axis=0)
         return np.asarray(len(terms) * 2.0 ** (-self.bits - 1) + 2 * unit_roundoff(terms.dtype) * size)
 
@@ -167,7 +167,7 @@ class FixedPoint(Reduction):
 
 
 def _numbered(reduction: Callable[[int], Reduction], default: int) -> Callable[..., Reduction]:
-    """A reduction from the text of its number."""
+    """Return a constructor of a reduction from the text of its number."""
 
     def make(number: str | None = None) -> Reduction:
         try:
@@ -209,12 +209,12 @@ def segment_sum(
     reduction: Reduction = Sequential(),
     zero: Int[Array, ""] | None = None,
 ) -> Float[Array, "segments ..."]:
-    """The sum of each segment in the order of a reduction, rounded after every addition.
+    """Sum each segment in the order of a reduction, rounding after every addition.
 
     Args:
         values: the entries.
         index: segment of each entry, known (not traced), not necessarily sorted.
-        segments: how many segments there are.
+        segments: number of segments.
         reduction: applied to each segment's entries in storage order.
         zero: see `Reduction`.
 
@@ -237,12 +237,12 @@ def segment_sum(
 def scatter_add(
     values: Float[Array, "entries ..."], index: Int[Array, "entries"], segments: int
 ) -> Float[Array, "segments ..."]:
-    """The sum of each segment as XLA's scatter makes it: in storage order on a CPU, in any on a device."""
+    """Sum each segment by XLA's scatter: in storage order on a CPU, in any order on a device."""
     return jnp.zeros((segments, *values.shape[1:]), values.dtype).at[index].add(values)
 
 
 def orders(entries: int, count: int, seed: int = 0) -> list[Int[np.ndarray, "entries"]]:
-    """Storage orders to try: as given, reversed, and random ones up to `count`."""
+    """Return storage orders to test: as given, reversed, and random orders up to `count` in total."""
     rng = np.random.default_rng(seed)
     given = np.arange(entries)
     return [given, given[::-1], *(rng.permutation(entries) for _ in range(count - 2))][:count]

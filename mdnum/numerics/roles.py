@@ -1,4 +1,4 @@
-"""Precision by role: which dtype the state, the arithmetic, the decision and the sums are kept in."""
+"""Precision by role: the dtypes of the state, the arithmetic, the decisions and the sums."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _TOO_SHORT: Mapping[str, str] = {
 
 
 def carrier(name: str) -> np.dtype:
-    """The dtype of the arrays that hold numbers of a policy's word: fixed-point ones are doubles."""
+    """Return the dtype of the arrays for a name in a policy; fixed-point numbers are stored as doubles."""
     return ALL["float64" if name == FIXED_POINT else name]
 
 
@@ -38,10 +38,10 @@ def _refuse_unknown(role: str, word: str, known: Mapping[str, object], noun: str
 
 
 def check_role(role: str, dtype: str) -> None:
-    """Refuse a dtype that a role of molecular dynamics cannot have.
+    """Reject a dtype that is not allowed for a role of molecular dynamics.
 
     Raises:
-        InputError: no dtype is called that, or it has sixteen bits and the role needs more.
+        InputError: the dtype does not exist, or has sixteen bits and the role needs more.
     """
     known = ALL if role == "force" else WIDE
     if role == "state" and dtype == FIXED_POINT:
@@ -57,7 +57,7 @@ def check_role(role: str, dtype: str) -> None:
 
 @dataclass(frozen=True)
 class PrecisionPolicy:
-    """The dtype of each role of a number in a rollout of molecular dynamics.
+    """The dtype of each role of numbers in a molecular-dynamics rollout.
 
     Example:
         >>> mdnum.PrecisionPolicy(force="float32")
@@ -76,22 +76,22 @@ class PrecisionPolicy:
             check_role(role, getattr(self, role))
 
     def dtype(self, role: str) -> np.dtype:
-        """The numpy dtype of a role ("state", "force", "decision" or "accumulate")."""
+        """Return the numpy dtype of a role ("state", "force", "decision" or "accumulate")."""
         return carrier(getattr(self, role))
 
     @property
     def geometry(self) -> np.dtype:
-        """The dtype of the displacements that forces are made from.
+        """The dtype of the displacements from which forces are computed.
 
-        That of the force; of a force in sixteen bits that of the decision, because a difference of two such
-        coordinates has no digits left.
+        For forces in 32 or 64 bits this is the force dtype; for forces in sixteen bits it is the decision
+        dtype, because the difference of two sixteen-bit coordinates has no digits left.
         """
         return self.dtype("force") if self.force in WIDE else self.dtype("decision")
 
 
 @dataclass(frozen=True)
 class RolePrecision:
-    """The dtype of each role of a number in a small world, where sixteen bits are allowed too."""
+    """The dtype of each role of numbers in a small world (the ball), where sixteen bits are allowed too."""
 
     state: str = "float64"  # what is carried from step to step
     arithmetic: str = "float64"  # the operations between one state and the next
@@ -111,10 +111,10 @@ class RolePrecision:
             raise InputError(f"{self.seed} is negative", remedy="Give 0 or more.", where="precision.seed")
 
     def dtype(self, role: str) -> np.dtype:
-        """The numpy dtype of a role ("state", "arithmetic", "decision", "accumulate" or "loss")."""
+        """Return the numpy dtype of a role ("state", "arithmetic", "decision", "accumulate" or "loss")."""
         return ALL[getattr(self, role)]
 
     @classmethod
     def all(cls, name: str) -> RolePrecision:
-        """Every role in one dtype."""
+        """Return a policy with every role in one dtype."""
         return cls(name, name, name, name, name)

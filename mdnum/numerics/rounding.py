@@ -1,8 +1,8 @@
 """Floats as integers, and bounds on the rounding error of distances computed from positions.
 
-A displacement is x_j - x_i, less a lattice vector or none along each periodic axis, with a rounding after
-every subtraction; squares are added in a row. What each rounding can lose goes by the size of the result
-that is rounded: `Reach` says how large those can be in a box, whatever the positions.
+A displacement is x_j - x_i, less at most one lattice vector along each periodic axis, with a rounding after
+every subtraction; squares are added in a row. The error of each rounding is proportional to the size of the
+rounded result: `Reach` bounds these sizes for a box, whatever the positions.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import DTypeLike
 
 
 def unit_roundoff(dtype: DTypeLike) -> float:
-    """Half the spacing of the floats at 1: the largest relative error of one rounding (Higham 2002, 2.1)."""
+    """Return half the spacing of floats at 1, the largest relative error of a rounding (Higham 2002, 2.1)."""
     # ml_dtypes' finfo knows bfloat16 too
     return float(ml_dtypes.finfo(np.dtype(dtype)).eps) / 2
 
@@ -26,7 +26,7 @@ def _signed(dtype: np.dtype) -> np.dtype:
 
 
 def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
-    """Position of x among all floats of its dtype, as a signed integer; -0 and +0 share 0.
+    """Return the position of x among all floats of its dtype, as a signed integer; -0 and +0 share 0.
 
     Adjacent finite floats have adjacent ordinals, so differences count ulps. NaN has no meaningful ordinal.
     """
@@ -38,9 +38,9 @@ def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
 
 
 def ulp_distance(a, b, dtype: DTypeLike = np.float64) -> Int[np.ndarray, "..."]:
-    """How many floats of dtype lie from a to b, with sign (b above a is positive).
+    """Return the number of floats of dtype from a to b, with sign (b above a is positive).
 
-    Error: exact up to 2^62; further apart (floats of opposite sign) the answer is ±2^62.
+    Error: exact up to 2^62; for larger distances (floats of opposite sign) the result is ±2^62.
     """
     start, end = ordinal(np.asarray(a, dtype)), ordinal(np.asarray(b, dtype))
     limit = np.int64(2**62)
@@ -51,7 +51,7 @@ def ulp_distance(a, b, dtype: DTypeLike = np.float64) -> Int[np.ndarray, "..."]:
 
 
 def neighbor(x, ulps: int, dtype: DTypeLike = np.float64):
-    """The float that lies the given number of ulps above x (below, where negative)."""
+    """Return the float that lies the given number of ulps above x (below for a negative number)."""
     x = np.asarray(x, dtype)
     integer = _signed(x.dtype)
     place = ordinal(x) + ulps
@@ -66,7 +66,7 @@ _SECOND_ORDER = 1.001
 
 
 def gamma(n: int, dtype: DTypeLike = np.float64) -> float:
-    """n*u / (1 - n*u): bounds the relative error of n roundings in a row (Higham 2002, lemma 3.1)."""
+    """Return n*u / (1 - n*u), which bounds the relative error of n roundings (Higham 2002, lemma 3.1)."""
     nu = n * unit_roundoff(dtype)
     return nu / (1.0 - nu)
 
@@ -84,14 +84,14 @@ class Reach:
 
     @classmethod
     def of(cls, lattice: Float[np.ndarray, "vectors 3"], coordinate: Float[np.ndarray, "3"]) -> Reach:
-        """The reach of a box, from arrays."""
+        """Create the reach of a box from arrays."""
         return cls(tuple(_three(row) for row in lattice), _three(coordinate))
 
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
-        """Sizes of the results that are rounded, added up, beyond that of the displacement; and how many.
+        """Return the summed sizes of the rounded results, beyond that of the displacement, and their number.
 
-        A component is d + n_1 a_1 + n_2 a_2 + n_3 a_3 after the first subtraction, with each n in {-1, 0, 1},
-        and loses one term with each that follows. What is left is d, which is one part of all of them.
+        After the first subtraction a component is d + n_1 a_1 + n_2 a_2 + n_3 a_3, with each n in {-1, 0, 1};
+        each following subtraction removes one term. The final d is contained in each of these results.
         """
         sizes, most = np.zeros(3), 1
         for axis in range(3):
@@ -102,7 +102,7 @@ class Reach:
         return sizes, most
 
     def narrowed(self, dtype: DTypeLike) -> Float[np.ndarray, "3"]:
-        """By how much lattice vectors in dtype are off those of the system, per axis, added up, length."""
+        """Return the error of lattice vectors stored in dtype, per axis, summed over vectors, length."""
         lattice = np.array(self.lattice, np.float64).reshape(-1, 3)
         return np.abs(lattice.astype(dtype).astype(np.float64) - lattice).sum(axis=0)
 
@@ -115,12 +115,12 @@ def _three(values) -> Vector:
 def displacement_bound(
     r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None
 ):
-    """Bound on the length of the error of a computed displacement.
+    """Bound the length of the error of a computed displacement.
 
-    Half an ulp, at most u times its size, for each result that is rounded. Where the state has more digits
-    than dtype both positions are rounded first, and where a double has, the box is: the exact displacement
-    is that of the positions of the state in the box of the system file. The image that is nearest in dtype
-    is taken to be the nearest one: r_cut is below half the width of the box by more than rounding.
+    Each rounded result contributes half an ulp, at most u times its size. If the state has more digits than
+    dtype, both positions are rounded first; if a double has more digits, the box is rounded too: the exact
+    displacement uses the positions of the state and the box of the system file. The nearest image in dtype is
+    assumed to be the true nearest image: r_cut is below half the box width by more than rounding.
 
     Args:
         r: length(s) of the displacement.
@@ -146,12 +146,12 @@ def displacement_bound(
 def squared_distance_bound(
     r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None
 ):
-    """Bound on |computed r² - exact r²|: the displacement's error, and gamma_3 for squares and sums.
+    """Bound |computed r² - exact r²|: the displacement's error, plus gamma_3 for squares and sums.
 
     Args: as `displacement_bound`.
 
     Returns:
-        The bound, length squared, shaped likewise.
+        The bound, length squared, of the same shape.
     """
     r = np.asarray(r, np.float64)
     error = displacement_bound(r, reach, dtype, state, seen)
@@ -159,15 +159,15 @@ def squared_distance_bound(
 
 
 def distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None):
-    """Bound on |computed r - exact r|, r = sqrt(r²) with a correctly rounded square root.
+    """Bound |computed r - exact r|, where r = sqrt(r²) with a correctly rounded square root.
 
-    A length is off by no more than its vector; the square root halves the relative error of r² and adds one
-    rounding.
+    The error of a length is at most that of its vector; the square root halves the relative error of r² and
+    adds one rounding.
 
     Args: as `displacement_bound`.
 
     Returns:
-        The bound, length, shaped likewise.
+        The bound, length, of the same shape.
     """
     r = np.asarray(r, np.float64)
     error = displacement_bound(r, reach, dtype, state, seen)

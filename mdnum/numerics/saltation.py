@@ -1,10 +1,10 @@
-"""Saltation: what an event does to a perturbation that is carried through it.
+"""Saltation: the effect of an event on a perturbation that is carried through it.
 
-A perturbed trajectory meets a threshold at another time, and between the two times one of them already
-flows by the new law. To first order this moves the tangent by a rank-one term that differentiating the
-steps of a program never sees, because the steps do not move with the event.
+A perturbed trajectory reaches a threshold at a different time, and between the two times only one of the
+trajectories follows the new law. To first order this changes the tangent by a rank-one term, which is absent
+from derivatives of a program's steps, because the steps do not move with the event.
 
-Works on numpy and on jax arrays alike, with any number of leading batch axes, and inside jit.
+The functions take numpy and jax arrays, with any number of leading batch axes, and work inside jit.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ GRAZING = 1e-8
 def grazing(
     flow: Float[Any, "*batch state"], normal: Float[Any, "*batch state"], limit: float = GRAZING
 ) -> Bool[Any, "*batch"]:
-    """Whether the trajectory only touches the threshold: n · F- vanishes, and the saltation term with it
-    ceases to exist.
+    """Return whether the trajectory only touches the threshold: n · F- is 0, and no saltation term exists.
 
-    Also where the flow or the normal is zero or not finite. Safe inside jit.
+    An event also grazes if the flow or the normal is zero or not finite. The function is safe inside jit.
     """
     xp = normal.__array_namespace__()
     speed = xp.abs((normal * flow).sum(-1))
@@ -37,17 +36,17 @@ def time_shift(
     normal: Float[Any, "*batch state"],
     threshold_rate: Any = 0.0,
 ) -> Float[Any, "*batch"]:
-    """Derivative of the time of the event along the tangent: -(n · dx + dc) / (n · F-).
+    """Return the derivative of the event time along the tangent: -(n · dx + dc) / (n · F-).
 
     Args:
         tangent: dx, the perturbation just before the event.
-        flow_before: F-, the time derivative of the state just before it.
-        normal: n, gradient of the event function c(x) that changes sign there.
+        flow_before: F-, the time derivative of the state just before the event.
+        normal: n, gradient of the event function c(x) that changes sign at the event.
         threshold_rate: dc, derivative of the event function at fixed x (a threshold that is itself the
             parameter: -1 for c = r - r_cut and the parameter r_cut).
 
     Returns:
-        The shift; 0 where the event grazes.
+        The shift; 0 if the event grazes.
     """
     xp = normal.__array_namespace__()
     touch = grazing(flow_before, normal)
@@ -65,20 +64,20 @@ def carry(
     reset_rate: Any = 0.0,
     threshold_rate: Any = 0.0,
 ) -> Float[Any, "*batch state"]:
-    """A tangent through an event: DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
+    """Propagate a tangent through an event: DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
 
-    That is the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-) times dx, which is never formed, so
-    this also serves systems of many atoms. For a ball of restitution e that meets the floor with velocity v
-    it is [[-e, 0], [-(1 + e) g / v, -e]]; for a force that jumps from a to b at a distance crossed with
-    speed v, [[1, 0], [(b - a) / v, 1]].
+    The result is the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-) times dx. The matrix is never
+    formed, so the function also handles systems of many atoms. For a ball of restitution e that hits the
+    floor with velocity v, Xi is [[-e, 0], [-(1 + e) g / v, -e]]; for a force that jumps from a to b at a
+    distance crossed with speed v, Xi is [[1, 0], [(b - a) / v, 1]].
 
     Args:
-        reset: DR, Jacobian of the state after in the state before; None for the identity (a force jump).
+        reset: DR, Jacobian of the state after by the state before; None for the identity (a force jump).
         flow_before, flow_after: F- and F+, time derivatives of the state just before and just after.
         reset_rate: dR, derivative of the reset at fixed state (the restitution as a parameter).
 
     Returns:
-        The tangent just after the event, without the saltation term where the event grazes.
+        The tangent just after the event, without the saltation term if the event grazes.
 
     Error: a few ulps of the largest term, times |n| |F-| / |n · F-|.
 

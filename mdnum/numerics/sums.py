@@ -1,13 +1,13 @@
-"""The order in which a sum is made, as an object; and its history, addition by addition.
+"""Summation orders as objects, and the history of a sum, addition by addition.
 
-A reduction serves two callers. The force loop of molecular dynamics hands it blocks of terms (leading
-axis: the slots of the block) and keeps a carry, so that the terms of a whole neighbor list never exist at
-once; a reduction that needs all terms stacks them and sums at the end. Everything else hands it a whole
-array and gets the sum over the leading axis, rounded after every addition in the dtype of the terms: what
-a numpy loop in that dtype gives, bit for bit. `jnp.sum` is none of these: it adds sixteen-bit terms in
-float32 and in an order of its own, which hides what a narrow accumulator does.
+A reduction is used in two ways. The force loop of molecular dynamics passes blocks of terms (leading axis:
+the slots of the block) and keeps a carry, so that the terms of a whole neighbor list never exist at once; a
+reduction that needs all terms stacks them and sums at the end. All other callers pass a whole array and get
+the sum over the leading axis, rounded after every addition in the dtype of the terms: bit for bit the result
+of a numpy loop in that dtype. `jnp.sum` differs from all reductions: it adds sixteen-bit terms in float32 and
+in an order of its own, which hides the effect of a narrow accumulator.
 
-The derivative of every reduction is that of the sum: rounding and order have none.
+The derivative of every reduction is that of the exact sum: rounding and order have none.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _compiled = partial(jax.jit, static_argnums=0)(_summed)
 
 
 def _data_zero(terms: jax.Array) -> jax.Array:
-    """A zero that XLA does not see through: the sign bit of an absolute value."""
+    """Return a zero that XLA cannot fold: the sign bit of an absolute value."""
     integer = integer_of(terms.dtype)
     bits = lax.bitcast_convert_type(jnp.abs(terms.reshape(-1)[0]), integer)
     return lax.shift_right_logical(bits, jnp.asarray(8 * terms.dtype.itemsize - 1, integer))
@@ -63,27 +63,27 @@ def _data_zero(terms: jax.Array) -> jax.Array:
 class Reduction:
     """Order of a sum, over slots that arrive in blocks or over the leading axis of an array.
 
-    A subclass says how a whole array is summed; its blocks are stacked and summed at the end.
+    A subclass defines the sum of a whole array; its blocks are stacked and summed at the end.
     """
 
     def within(self, total: jax.Array, terms: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array | None]:
-        """Take one block; returns the carried total and, if it is to be summed later, the block's own sum."""
+        """Process one block; return the carried total and, if summed later, the block's own sum."""
         return total, jnp.stack(list(terms))
 
     def finish(self, total: jax.Array, blocks: jax.Array | None) -> jax.Array:
-        """The sum, from the carried total and the stacked block sums (leading axis: blocks)."""
+        """Return the sum, from the carried total and the stacked block sums (leading axis: blocks)."""
         assert blocks is not None
         return self(blocks.reshape(-1, *blocks.shape[2:]))
 
     def __call__(
         self, terms: Float[Array, "n ..."], zero: Int[Array, ""] | None = None
     ) -> Float[Array, "..."]:
-        """The sum over the leading axis, rounded after every addition in the dtype of the terms.
+        """Return the sum over the leading axis, rounded after every addition in the dtype of the terms.
 
         Args:
-            terms: what is summed.
-            zero: an integer zero that XLA must not know (`exact.zero_bits`), for the fences. Without one,
-                sixteen-bit sums take one from the data; then products that were not fenced by the caller
+            terms: the terms of the sum.
+            zero: an integer zero that XLA must not know (`exact.zero_bits`), for the fences. Without it,
+                sixteen-bit sums take a zero from the data; then products that were not fenced by the caller
                 may still be contracted into the sum.
         """
         if terms.size == 0:
@@ -91,26 +91,27 @@ class Reduction:
         return _compiled(self, terms, zero)
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """The sum of at least one term; `add` adds two and rounds."""
+        """Return the sum of at least one term; `add` adds two numbers and rounds."""
         raise NotImplementedError(type(self).__name__)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """How far the computed sum can be from the exact one, on the host, in float64.
+        """Bound the difference between the computed and the exact sum, on the host, in float64.
 
-        Holds as long as no sum overflows or is subnormal (XLA on a CPU flushes subnormals of every dtype but
-        float16 to zero).
+        The bound holds if no sum overflows or is subnormal (XLA on a CPU flushes subnormals of every dtype
+        but float16 to zero).
         """
         factor = gamma(self.depth(len(terms)), terms.dtype)
         return np.asarray((factor if factor >= 0 else np.inf) * np.abs(terms.astype(np.float64)).sum(axis=0))
 
     def depth(self, n: int) -> int:
-        """The largest number of additions that one of n terms passes through."""
+        """Return the largest number of additions that any of n terms passes through."""
         return max(n - 1, 0)
 
 
 def in_order(terms, add, start=None):
-    """((0 + t0) + t1) + ..., or from another start: a scan, which XLA does not reorder. Unrolled, since a
-    step of a loop costs more than an addition."""
+    """Return ((0 + t0) + t1) + ..., or from another start, by a scan, which XLA does not reorder; the scan is
+    unrolled, since a step of a loop costs more than an addition.
+    """
     total, _ = lax.scan(
         lambda total, term: (add(total, term), None),
         jnp.zeros(terms.shape[1:], terms.dtype) if start is None else start,
@@ -121,22 +122,22 @@ def in_order(terms, add, start=None):
 
 
 class Serial(Reduction):
-    """A reduction that adds term after term onto one number."""
+    """A reduction that adds term after term to one accumulator."""
 
     def places(self, terms: np.ndarray) -> list[int]:
-        """Indices of terms, shape (n,), in the order in which they are added, on the host."""
+        """Return the indices of terms, shape (n,), in the order in which they are added, on the host."""
         raise NotImplementedError(type(self).__name__)
 
 
 @dataclass(frozen=True)
 class Sequential(Serial):
-    """Term after term. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4)."""
+    """A sum term after term. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4)."""
 
     # "forward" (left to right, as a loop does) or "reversed"
     order: Literal["forward", "reversed"] = "forward"
 
     def within(self, total, terms):
-        """Forward: add the slots to the carry; reversed: keep them."""
+        """Add the slots to the carry if the order is forward; keep the slots if it is reversed."""
         if self.order == "reversed":
             return super().within(total, terms)
         for term in terms:
@@ -144,15 +145,15 @@ class Sequential(Serial):
         return total, None
 
     def finish(self, total, blocks):
-        """Forward: the carry."""
+        """Return the carry if the order is forward; sum the kept slots if it is reversed."""
         return total if self.order == "forward" else super().finish(total, blocks)
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """From zero, one after the other."""
+        """Add the terms one after the other, starting from zero."""
         return in_order(terms[::-1] if self.order == "reversed" else terms, add)
 
     def places(self, terms: np.ndarray) -> list[int]:
-        """One after the other."""
+        """Return the indices in ascending or, if reversed, descending order."""
         return list(range(len(terms)))[:: -1 if self.order == "reversed" else 1]
 
 
@@ -164,7 +165,7 @@ def _tree(terms: list[jax.Array]) -> jax.Array:
 
 
 def _levels(terms, add, width: int):
-    """A tree whose nodes add `width` neighbors left to right, until one node is left."""
+    """Sum in a tree whose nodes add `width` neighbors left to right, until one node is left."""
     while terms.shape[0] > 1:
         count = terms.shape[0]
         groups = -(-count // width)
@@ -184,10 +185,10 @@ def _levels(terms, add, width: int):
 
 @dataclass(frozen=True)
 class Blocked(Reduction):
-    """A tree of a given width: each node adds that many neighbors left to right, as a device's blocks do.
+    """A summation tree: each node adds `width` neighbors left to right, like the blocks of a device.
 
-    Error: at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 is the balanced tree, a width of at
-    least the number of terms the loop.
+    Error: at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 is the balanced tree; a width of at
+    least the number of terms is the loop.
     """
 
     width: int = 32  # children of a node, at least 2
@@ -197,11 +198,11 @@ class Blocked(Reduction):
             raise InputError(f"a summation tree of width {self.width} adds nothing", remedy="Give 2 or more.")
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Level by level."""
+        """Sum the terms level by level."""
         return _levels(terms, add, self.width)
 
     def depth(self, n: int) -> int:
-        """Width - 1 additions on every level."""
+        """Return (width - 1) additions times the number of levels."""
         levels = 0
         while n > 1:
             n, levels = -(-n // self.width), levels + 1
@@ -210,89 +211,89 @@ class Blocked(Reduction):
 
 @dataclass(frozen=True)
 class Pairwise(Blocked):
-    """A balanced tree. Error: at most gamma_{log2 n} * sum |terms| (Higham 2002, 4.6)."""
+    """A balanced summation tree. Error: at most gamma_{log2 n} * sum |terms| (Higham 2002, 4.6)."""
 
     width: int = field(default=2, init=False)
 
     def within(self, total, terms):
-        """The tree of the block."""
+        """Sum one block by a balanced tree."""
         return total, _tree(list(terms))
 
     def finish(self, total, blocks):
-        """The tree of the blocks' trees."""
+        """Sum the block sums by a balanced tree."""
         return _tree(list(jnp.asarray(blocks)))
 
 
 @dataclass(frozen=True)
 class Permuted(Serial):
-    """A loop over the terms in a random order: what atomic additions on a device do, made repeatable."""
+    """A loop over the terms in random order: a repeatable model of atomic additions on a device."""
 
     seed: int = 0  # of the order; the same for every sum of as many terms
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """In the order drawn for this many terms."""
+        """Add the terms in the order drawn for this number of terms."""
         return in_order(terms[np.array(self.places(terms))], add)
 
     def places(self, terms: Any) -> list[int]:
-        """Drawn for this many terms."""
+        """Draw the order for this number of terms."""
         return np.random.default_rng(self.seed).permutation(len(terms)).tolist()
 
 
 @dataclass(frozen=True)
 class Halves(Reduction):
-    """Two loops side by side, over the first half of the terms and over the second, added at the end.
+    """Two loops over the first and the second half of the terms, whose results are added at the end.
 
-    What two scatters do, one for each end of a pair, where each pair is held once. Error: at most
+    Two scatters give this order, one for each end of a pair, if each pair is stored once. Error: at most
     gamma_{n/2} * sum |terms|.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """An odd term is in the second half."""
+        """Add the sums of both halves; the middle term of an odd number belongs to the second half."""
         half = terms.shape[0] // 2
         if half == 0:
             return in_order(terms, add)
         return add(in_order(terms[:half], add), in_order(terms[half:], add))
 
     def depth(self, n: int) -> int:
-        """The longer loop, and the last addition."""
+        """Count the additions of the longer loop, and the last addition."""
         return n - n // 2 if n > 1 else 0
 
 
 @dataclass(frozen=True)
 class Twice(Reduction):
-    """Every term twice, halved: a loop, and the same loop once more onto its result.
+    """A sum of every term twice, halved: a loop, and the same loop again starting from its result.
 
-    What a scatter onto the sums of a dense list does, where each pair is held from both ends. Error: at most
-    gamma_{2n} * sum |terms|, where no half of a term is subnormal.
+    A scatter onto the sums of a dense list gives this order, if each pair is stored from both ends. Error: at
+    most gamma_{2n} * sum |terms|, if no half of a term is subnormal.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Halving is exact."""
+        """Sum the halved terms twice; halving is exact."""
         halves = terms * jnp.asarray(0.5, terms.dtype)
         return in_order(halves, add, in_order(halves, add))
 
     def depth(self, n: int) -> int:
-        """Both loops."""
+        """Count the additions of both loops."""
         return max(2 * n - 1, 0)
 
 
 @dataclass(frozen=True)
 class Sorted(Serial):
-    """A loop over the terms by magnitude; equal magnitudes by sign, so no order of arrival matters.
+    """A loop over the terms by magnitude; equal magnitudes by sign, so the order of arrival does not matter.
 
-    Smallest first loses least where all terms have one sign (Higham 2002, 4.2), largest first where they
-    cancel.
+    The smallest term first loses least if all terms have one sign (Higham 2002, 4.2), the largest first if
+    terms cancel.
     """
 
     order: Literal["ascending", "descending"] = "ascending"  # of magnitudes, "ascending" or "descending"
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Sorted along the leading axis, each column by itself."""
+        """Sort each column along the leading axis, and add its terms in this order."""
         _, terms = lax.sort((jnp.abs(terms), terms), dimension=0, num_keys=2)
         return in_order(terms if self.order == "ascending" else terms[::-1], add)
 
     def places(self, terms: np.ndarray) -> list[int]:
-        """By magnitude."""
+        """Return the indices sorted by magnitude."""
         wide = terms.astype(np.float64)
         order = np.lexsort((wide, np.abs(wide))).tolist()
         return order if self.order == "ascending" else order[::-1]
@@ -308,7 +309,7 @@ def _start(terms: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 class _Compensated(Reduction):
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """(2u + 8(n u)²) * sum |terms|: independent of n until n is near 1/u (Higham 2002, 4.3)."""
+        """Return (2u + 8(n u)²) * sum |terms|: independent of n until n is near 1/u (Higham 2002, 4.3)."""
         u, n = unit_roundoff(terms.dtype), len(terms)
         factor = 2 * u + 8 * (n * u) ** 2 if n * u < 0.1 else np.inf
         return np.asarray(factor * np.abs(terms.astype(np.float64)).sum(axis=0))
@@ -316,13 +317,14 @@ class _Compensated(Reduction):
 
 @dataclass(frozen=True)
 class Kahan(_Compensated):
-    """A loop that subtracts from the next term what the last addition lost (Kahan, CACM 8, 40 (1965)).
+    """A loop that subtracts from each term the error of the previous addition (Kahan, CACM 8, 40 (1965)).
 
-    Error: at most (2u + O(n u²)) * sum |terms|; a term much larger than the sum so far defeats it.
+    Error: at most (2u + O(n u²)) * sum |terms|; the compensation fails for a term much larger than the sum so
+    far.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Four additions per term."""
+        """Sum with four additions per term."""
 
         def step(carry, term):
             total, lost = carry
@@ -336,13 +338,13 @@ class Kahan(_Compensated):
 
 @dataclass(frozen=True)
 class Neumaier(_Compensated):
-    """Kahan's sum for terms of any size: the losses are summed apart and added at the end.
+    """Kahan's sum for terms of any size: the rounding errors are summed separately and added at the end.
 
     Error: at most u |sum| + O(n² u²) * sum |terms|. Source: Neumaier, ZAMM 54, 39 (1974).
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Four additions per term and one at the end."""
+        """Sum with four additions per term and one at the end."""
 
         def step(carry, term):
             total, lost = carry
@@ -367,7 +369,7 @@ class Neumaier(_Compensated):
 
 @dataclass(frozen=True)
 class Addition:
-    """One addition."""
+    """One addition in the history of a sum."""
 
     term: str  # index of the term that was added
     addend: float  # what was added to the accumulator
@@ -391,18 +393,18 @@ class RunningSum:
 
     @property
     def error(self) -> float:
-        """Result minus exact sum, to float64."""
+        """Result minus exact sum, rounded to float64."""
         return float(Fraction(self.result) - self.exact)
 
     @property
     def bits_lost(self) -> int:
-        """Over all additions."""
+        """Number of bits lost in all additions."""
         return sum(row.bits_lost for row in self.rows)
 
     columns = ("term", "addend", "running sum", "exact sum", "bits lost")
 
     def table(self) -> tuple[tuple[Any, ...], ...]:
-        """Plain rows under `columns`, floats as the shortest decimals that give the same float64."""
+        """Return plain rows under `columns`, with floats as the shortest decimals that give the same float64."""
         return tuple(
             (row.term, row.addend, row.running, float(row.exact), row.bits_lost) for row in self.rows
         )
@@ -411,15 +413,15 @@ class RunningSum:
 def running_sum_table(
     terms: Any, reduction: Reduction = Sequential(), dtype: DTypeLike | None = None
 ) -> RunningSum:
-    """The history of a sum in the order of a reduction.
+    """Return the history of a sum in the order of a reduction.
 
     Args:
         terms: the numbers, shape (n,).
         reduction: a loop: sequential, reversed, permuted or sorted.
-        dtype: terms are rounded to it first; that of the terms where None.
+        dtype: terms are rounded to this dtype first; None keeps the dtype of the terms.
 
     Raises:
-        InputError: no terms, a number that is not finite, or a reduction that is no loop.
+        InputError: there are no terms, a number is not finite, or the reduction is no loop.
     """
     terms = np.asarray(terms)
     terms = terms.astype(np.dtype(dtype) if dtype is not None else terms.dtype)
@@ -440,14 +442,14 @@ def running_sum_table(
 
 
 def _place(x: Any) -> int:
-    """Exponent of the last place of a float: x is a multiple of 2^place."""
+    """Return the exponent of the last place of a float: x is a multiple of 2^place."""
     info = ml_dtypes.finfo(x.dtype)
     exponent = math.frexp(float(x))[1] - 1 if x else info.minexp
     return max(exponent, int(info.minexp)) - info.nmant
 
 
 def _lowest(value: Fraction) -> int:
-    """Exponent of the lowest binary digit of a dyadic rational."""
+    """Return the exponent of the lowest binary digit of a dyadic rational."""
     numerator, denominator = abs(value.numerator), value.denominator
     return (numerator & -numerator).bit_length() - denominator.bit_length()
 

@@ -1,12 +1,12 @@
 """Two runs that differ in one choice: when and how fast they diverge, and whether flips are the cause.
 
-The verdict compares two separations from the first run: of the second run, and of the second run's
-arithmetic under the first run's decisions. Only the latter can tell whether the flips did it. Where it splits
-as well, repeats of the pair tell whether the flips accelerated it or only came along, by a sequential sign
-test: where half of such pairs or fewer are delayed by more than a given delay, k or more of n are with the
-probability of k heads or more in n tosses at most, however the delays are distributed. "Such pairs" are those
-of one displacement of their starts, and at another one the majority may be another: where it is, there is no
-word. docs/verdict-calibration.md has how often it is wrong.
+The verdict compares two separations from the first run: that of the second run, and that of the second run's
+arithmetic under the first run's decisions. Only the latter shows whether the flips are the cause. If it
+splits as well, repeats of the pair decide whether the flips accelerated the split or are bystanders, by a
+sequential sign test: if at most half of such pairs are delayed by more than a given delay, the probability of
+k or more delayed pairs among n is at most that of k heads or more in n tosses, whatever the distribution of
+the delays. "Such pairs" have the same displacement of their starts. At another displacement the majority may
+differ; the verdict is then left open. docs/verdict-calibration.md has the error rates.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _ALIKE = 4
 
 @dataclass(frozen=True)
 class Delay:
-    """The steps at which one pair of runs splits, free and under the first run's decisions."""
+    """The steps at which one pair of runs splits, left alone and under the first run's decisions."""
 
     # free, imposed: steps of the two splits; None for one that was not seen
     free: int | None
@@ -43,12 +43,12 @@ class Delay:
 
     @classmethod
     def of(cls, free: Float[np.ndarray, "steps"], imposed: Float[np.ndarray, "steps"], tolerance: float):
-        """From separations at each step, length; NaN after a run was ended."""
+        """Create the delay from separations at each step, length; NaN after a run ended."""
         splits = (split_of(run, tolerance) for run in (free, imposed))
         return cls(*splits, free_until=_last_seen(free), imposed_until=_last_seen(imposed))
 
     def beyond(self, steps: float) -> bool | None:
-        """Whether the split comes more than so many steps later without the flips; None if not seen."""
+        """Return whether the split comes more than `steps` later without the flips; None if unknown."""
         if self.free is not None and self.imposed is not None:
             return self.imposed - self.free > steps
         if self.free is not None:
@@ -60,14 +60,14 @@ class Delay:
 
 @cache
 def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
-    """Numbers of pairs after which the test is evaluated, and how many must agree: (pairs, agreeing) of each.
+    """Return the stages of the sign test: at each, the number of pairs and the number that must agree.
 
-    The error is spent in proportion to the pairs (Lan and DeMets, Biometrika 70, 659, 1983): up to each look
-    the exact probability that fair coins have stopped on one given side is at most that share of it.
+    The error is spent in proportion to the pairs (Lan and DeMets, Biometrika 70, 659, 1983): up to each stage
+    the exact probability that fair coins have stopped on one given side is at most that share of the error.
 
     Args:
-        pairs: at most.
-        error: chance of either word where each pair is as likely delayed as not.
+        pairs: largest number of pairs.
+        error: probability of either verdict if each pair is as likely delayed as not.
     """
     ends = [*range(1 + LOOK, pairs, LOOK), pairs]
     going, before, spent, found = {0: 1.0}, 0, 0.0, []
@@ -106,12 +106,12 @@ class Count:
 
     @property
     def needed(self) -> tuple[int, int] | None:
-        """The look these pairs are at, or the next: pairs, and how many must agree; None for none."""
+        """The current or next stage of the test: pairs, and how many must agree; None if there is none."""
         return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
 
     @property
     def delayed(self) -> bool | None:
-        """Whether most pairs are delayed; None if these pairs do not decide it."""
+        """Whether most pairs are delayed; None if these pairs do not decide the question."""
         need = dict(looks(self.most)).get(self.pairs)
         if need is None:
             return None
@@ -119,14 +119,14 @@ class Count:
 
     @property
     def majority(self) -> bool | None:
-        """What all of the first few pairs do, or more than half of all; None where that is not known."""
+        """Whether all of the first pairs, or more than half of all pairs, are delayed; None if unknown."""
         if self.later > self.most / 2 or self.later == self.pairs >= _ALIKE:
             return True
         return False if self.not_later > self.most / 2 or self.not_later == self.pairs >= _ALIKE else None
 
     @property
     def wanted_for_majority(self) -> int:
-        """Pairs that would settle the majority if all did the same; 0 where it is known or cannot be."""
+        """Pairs that would settle the majority if all agreed; 0 if it is known or cannot be settled."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -134,19 +134,19 @@ class Count:
 
     @property
     def wanted(self) -> int:
-        """Pairs to be run before the next look; 0 where there is no further one or the word is clear."""
+        """Pairs to run before the next stage of the test; 0 if there is none or the result is clear."""
         if self.delayed is not None:
             return 0
         return next((end - self.pairs for end, _ in looks(self.most) if end > self.pairs), 0)
 
 
 def count(delays: tuple[Delay, ...], steps: float, most: int) -> Count:
-    """Counts the pairs that split more than so many steps later without the flips.
+    """Count the pairs that split later without the flips by more than a number of steps.
 
     Args:
         delays: of the pair itself and its repeats.
-        steps: that count as a delay.
-        most: pairs at most.
+        steps: number of steps beyond which a pair counts as delayed.
+        most: largest number of pairs.
     """
     found = [delay.beyond(steps) for delay in delays]
     return Count(len(found), found.count(True), found.count(False), most)
@@ -181,7 +181,7 @@ _HALF = 3.0
 
 @dataclass(frozen=True)
 class Dates:
-    """The steps at which two runs diverge; None where they do not within the horizon."""
+    """The steps at which two runs diverge; None for an event that does not happen within the horizon."""
 
     first_bit: int | None  # first step whose state bits differ
     fork: int | None  # first step whose decisions differ
@@ -200,21 +200,21 @@ class Growth:
 
     @property
     def plain(self) -> bool:
-        """Whether something grows at all, rather than a line through noise."""
+        """Whether the separation really grows, so that the fit is not a line through noise."""
         return bool(np.isfinite(self.rate) and self.rate > 0 and self.r_squared > FITS)
 
     def steps_to(self, start: float, end: float) -> float | None:
-        """Steps in which a separation grows from one size to another; None where it does not grow."""
+        """Return the steps in which a separation grows from one size to another; None without growth."""
         if not (np.isfinite(self.rate) and self.rate > 0 and start > 0):
             return None
         return max(0.0, float(np.log(end / start) / self.rate))
 
 
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
-    """Growth of a logarithm per row, its standard error, and whether it is more than linear growth gives.
+    """Return a logarithm's growth per row, its standard error, and whether it exceeds that of linear growth.
 
-    From the later part of the rows, in blocks. NaN and no where there are too few rows, or they are not
-    finite.
+    The estimate uses blocks of the later rows. The result is NaN, NaN, False if there are too few rows or if
+    they are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
@@ -232,25 +232,25 @@ def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
 
 
 def split_of(separation: Float[np.ndarray, "steps"], tolerance: float) -> int | None:
-    """The first step at which a separation passes the tolerance; None where it does not."""
+    """Return the first step at which a separation exceeds the tolerance; None if there is none."""
     beyond = separation > tolerance
     return int(beyond.argmax()) if beyond.any() else None
 
 
 def _last_seen(separation: Float[np.ndarray, "steps"]) -> int:
-    """The last step at which a separation is known; -1 where it never is."""
+    """Return the last step at which a separation is known; -1 if there is none."""
     seen = np.flatnonzero(np.isfinite(separation))
     return int(seen[-1]) if len(seen) else -1
 
 
 def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
-    """The rate at which a separation grows before it saturates.
+    """Fit the rate at which a separation grows before saturation.
 
-    The fit takes the rows up to the split whose separation lies between 1e-12 and a tenth of the tolerance,
-    from the last time on that it was below the lower end. A slope through noise has a low r_squared.
+    The fit uses the rows up to the split whose separation lies between 1e-12 and a tenth of the tolerance,
+    after the last row below the lower end. A slope through noise has a low r_squared.
 
     Args:
-        separation: of each step, length; NaN where a run had ended.
+        separation: of each step, length; NaN after a run ended.
         tolerance: of the split, length.
     """
     end = split_of(separation, tolerance)
@@ -267,7 +267,7 @@ def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope of a straight line and its r²."""
+    """Return the slope of a fitted straight line and its r²."""
     slope, base = np.polyfit(x, y, 1)
     spread = float(np.sum((y - y.mean()) ** 2))
     return float(slope), 1.0 - float(np.sum((y - slope * x - base) ** 2)) / spread if spread > 0 else 0.0
@@ -276,15 +276,15 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 def expected(
     separation: Float[np.ndarray, "steps"], tolerance: float, exponent: float | None = None
 ) -> float | None:
-    """Steps after the last one at which runs that have not split are expected to; None where nothing tells.
+    """Predict how many steps after the last one runs that have not split will split; None if unpredictable.
 
-    Their own growth predicts only where it outlasts the first steps: its later half must be several
-    e-foldings, at a rate within a factor of 2 of the whole.
+    The growth of the separation has predictive value only if it outlasts the first steps: its later half must
+    be several e-foldings, at a rate within a factor of 2 of the whole.
 
     Args:
-        separation: of each step, length; NaN where a run had ended.
+        separation: of each step, length; NaN after a run ended.
         tolerance: of the split, length.
-        exponent: the Lyapunov exponent per step, where it is known: it needs no fit.
+        exponent: the Lyapunov exponent per step, if known; no fit is then needed.
     """
     seen = _last_seen(separation)
     if seen < 0 or not separation[seen] > 0:
@@ -331,7 +331,7 @@ class ForkVerdict:
 
     @property
     def wanted(self) -> int:
-        """Further repeats to be run before the next look, those of `other` where there is one; 0 for none."""
+        """Further repeats to run before the next stage, of `other` if present; 0 if none are needed."""
         if self.other is not None:
             return self.other.wanted_for_majority
         return self.count.wanted if self.count is not None else 0
@@ -348,18 +348,18 @@ def judge(
     other: Sequence[Delay] = (),
     ended: Mapping[str, Any] | None = None,
 ) -> ForkVerdict:
-    """The verdict on a pair of runs.
+    """Return the verdict on a pair of runs.
 
     Args:
         dates: of the pair.
         free: separation of the two free runs at each step, length.
-        imposed: separation of the counterfactual from the first run, length; NaN after it was ended. None
-            where there is no counterfactual.
+        imposed: separation of the counterfactual from the first run, length; NaN after it ended. None if
+            there is no counterfactual.
         tolerance: of the split, length.
-        repeats: of the pair, the start perturbed by as much as the choice does.
-        most: repeats that may be run; at the other displacement one more, as the pair is not counted there.
-        other: repeats of the pair, the start perturbed by another displacement.
-        ended: where the fork is that one run ended and the other did not: values that say which and how.
+        repeats: of the pair, with the start perturbed by as much as the choice perturbs it.
+        most: largest number of repeats; at the other displacement one more, as the pair is not counted there.
+        other: repeats of the pair, with the start perturbed by another displacement.
+        ended: if the fork is that only one run ended: values that describe which run and how.
     """
     last = len(free) - 1
     if ended is not None:
@@ -397,9 +397,9 @@ def _counted(
     gained: float,
     reasons: tuple[Reason, ...],
 ) -> ForkVerdict:
-    """The verdict where the runs split either way: how many of the pair and its repeats split later.
+    """Return the verdict if the runs also split under the first run's decisions, by counting later splits.
 
-    The count at the other displacement can only take the word back, so that it spends no error.
+    The count at the other displacement can only withdraw a verdict, so that it spends no error.
     """
     pair = delays[0][0]
     threshold = 0.0 if rate is None else E_FOLDINGS / rate
@@ -434,7 +434,7 @@ def _kept(
     most: int,
     rate: float | None,
 ) -> ForkVerdict:
-    """The verdict where the runs do not split under the first run's decisions."""
+    """Return the verdict if the runs do not split under the first run's decisions."""
     seen = max(0, _last_seen(imposed))
     reach = float(np.nanmax(imposed, initial=0.0))
     below = float(np.log(tolerance / reach)) if reach > 0 else float("inf")
@@ -452,7 +452,7 @@ def _kept(
 
 
 def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason, ...]:
-    """How the separation stands at the end of a horizon without a split, and what is to be expected."""
+    """Return the separation at the end of a horizon without a split, and its expected growth, as reasons."""
     seen = float(free[np.isfinite(free)][-1])
     now: Reason = ("outlook", {"steps": len(free) - 1, "separation": seen, "tolerance": tolerance})
     more = expected(free, tolerance)
@@ -462,7 +462,7 @@ def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason
 
 
 def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:
-    """The step at which a counterfactual may split, if it grows at all; None where it does not."""
+    """Predict the step at which a counterfactual may split; None if its separation does not grow."""
     fit = growth(separation[: seen + 1], tolerance)
     now = float(separation[seen])
     if not (fit.plain and now > 0):
@@ -517,10 +517,10 @@ class Share:
 
 
 def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:
-    """Splits of all runs from A, then from B: (A, A), (B, B), (B, A) and (A, B), those that were run.
+    """Return the splits from A, then from B, of the runs (A, A), (B, B), (B, A) and (A, B) that were made.
 
     Args:
-        series: separations at each step, length: "B", and those of SERIES; NaN after a run was ended.
+        series: separations at each step, length: "B", and those of SERIES; NaN after a run ended.
         tolerance: of the split, length.
     """
     names: tuple[Name, ...] = ("A", "B")
@@ -542,11 +542,11 @@ def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -
 
 
 def shares(cells: tuple[SplitCell, ...], rate: float) -> tuple[Share, ...]:
-    """What the decisions and the arithmetic contribute, each as seen from A and from B.
+    """Return the contributions of the decisions and of the arithmetic, relative to A and to B.
 
     Args:
         cells: of `table`.
-        rate: at which the free runs part, per step; NaN where it is not known.
+        rate: growth rate of the free runs' separation, per step; NaN if unknown.
     """
     free = next((cell.split for cell in cells if cell.arithmetic == cell.decisions != cell.reference), None)
     if free is None:
