@@ -1,12 +1,12 @@
-"""Reverse-mode derivatives of a rollout, stretch by stretch, at the recorded states and decisions.
+"""Reverse-mode derivatives of a rollout at its recorded states and decisions.
 
 Inside jax.value_and_grad a compiler makes another forward pass, which rounds differently and, after some
-thousand steps, decides differently. Here the program that makes every run makes this run first.
+thousand steps, decides differently. Here the run is made first, by the same program as every other run.
 
-A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals
-J times that vector. For a pair potential this product is a tangent evaluation, pair by pair, gathered like
-the forces: no scatter is needed. For any other energy it is one tangent through one gradient of the energy.
-No tape of operations is kept.
+A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
+times that vector. For a pair potential this product is a tangent evaluation, pair by pair, gathered like the
+forces: no scatter is needed. For any other energy the product is one tangent through one gradient of the
+energy. No tape of operations is kept.
 """
 
 from __future__ import annotations
@@ -110,15 +110,15 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return r2, jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
 
     def virials(d, r2):
-        """Return the virial's cotangent V contracted with the pair vector: d·V·d, and V·d for a tensor."""
+        """Return the virial's cotangent V contracted with the pair vector d: d·V·d, and V·d for a tensor."""
         if not virial.ndim:
             return virial * r2, None
         turned = [reduce(add, (virial[a, b] * d[b] for b in range(3))) for a in range(3)]
         return reduce(add, (d[a] * turned[a] for a in range(3))), turned
 
     def through(r2, along, inside, types, weights):
-        """Return energy and slope as a function of r², slot parameters (with cutoff values) and shared ones;
-        the slot parameters; and the cotangents of energy and slope.
+        """Return energy and slope as a function of r², slot parameters (with cutoff values) and shared
+        parameters; the values of the slot parameters; and the cotangents of energy and slope.
         """
         # each slot has parameters of its own, so that no sum over slots stands inside the loop
         slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
@@ -132,8 +132,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return ended, slots, onto
 
     def with_shared(r2, along, inside, types, weights):
-        """Compute each slot's slope, the cotangents of its r², own parameters and cutoff values, and the
-        cotangents of the shared parameters; for a network, one reverse pass is cheaper than two.
+        """Compute the slope of each slot and the cotangents of r², of its own parameters and of shared
+        parameters; one reverse pass for all of them is cheaper than two for a neural network.
         """
         ended, slots, onto = through(r2, along, inside, types, weights)
 
@@ -147,14 +147,14 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return slope, *back(onto)
 
     def onto_weights(r2, along, inside, types, weights, others):
-        """Compute each slot's contribution to its atom; the pair also occupies a slot of the other atom."""
+        """Compute the terms of each neighbor slot for its atom; every pair occupies a slot of both atoms."""
         onto = jnp.where(inside, energy, 0), -2 * jnp.where(inside, along, 0)
         by = jax.vjp(lambda *weights: model.evaluate(r2, types, at, *weights), *weights)[1](onto)
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
     def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
-        """Return a slot's contributions to positions, then forces, scale and the wanted parameters, and the
-        contribution of a block of slots to the parameters that all pairs share.
+        """Return the terms of a neighbor slot for positions, forces, scale and wanted parameters, in this
+        order, and the terms of a block of slots for the parameters that all pairs share.
         """
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
@@ -228,8 +228,8 @@ def _differences(cell, own, other):
 
 
 def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
-    """Sum each atom's slot terms, computed from differences of two vectors; also sum the terms that are
-    common to all slots, if there are any.
+    """Sum the terms of each atom's neighbor slots, which depend on differences between the two atoms; also
+    sum the terms that belong to all slots together.
     """
 
     def pair(own, other, types, inside):
@@ -258,7 +258,7 @@ def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
 
 
 def _added(totals: tuple[Array, ...], terms: list[Array]) -> tuple[Array, ...]:
-    """Add the terms of four slots in a fixed order, so that the compiler vectorizes over atoms."""
+    """Add the terms of four neighbor slots in a fixed order, so that the compiler vectorizes over atoms."""
     out = []
     for total, term in zip(totals, terms, strict=True):
         for k in range(term.shape[0]):
@@ -305,9 +305,9 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
 class AdjointCarry(NamedTuple):
     """Cotangents that the reverse pass carries from step to step.
 
-    In the trace of a stretch, row k belongs to the state (x, half-kicked v) at the beginning of step first +
-    k, before the crossings that lead there are transposed, in the order of the stretch's list; rows beyond
-    the used ones are undefined, and the origin is omitted.
+    Row k of a trace holds the cotangents of the state (x, half-kicked v) at the beginning of step first + k,
+    before the reverse pass transposes the crossings that lead to this state, with atoms in the order of the
+    neighbor list; rows beyond the used ones are undefined, and the origin is omitted.
     """
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
@@ -334,7 +334,7 @@ def reverse(
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[TapeStretch, AdjointCarry], None] | None = None,
 ) -> tuple[Cotangents, list[Crossings]]:
-    """Compute the derivatives of a tape's loss with respect to all inputs of the run.
+    """Compute the derivatives of the loss of a recorded run with respect to all inputs of the run.
 
     Args:
         wanted: derivatives to compute beyond the start: MODEL, SCALE, FORCE (the integrator's numbers),
@@ -365,10 +365,11 @@ def reverse(
 
 
 class StretchReversal:
-    """A reverse pass in progress, from the end of a tape to its start; arguments as for `reverse`.
+    """State of a reverse pass through a recorded run, from its last step to its first; see `reverse`.
 
     Attributes:
-        carry: the carried cotangents, atoms in the user's order. guard: None if flips are not included.
+        carry: the carried cotangents, atoms in the user's order. guard: radial speed of grazing flips; None
+            if flips are not included.
         met: the crossings of the stretch that was transposed last.
     """
 
@@ -402,7 +403,7 @@ class StretchReversal:
         )
 
     def arguments(self, stretch: TapeStretch) -> tuple[Any, ...]:
-        """Return the arguments of `transposed` for a stretch, at the current point of the reverse pass."""
+        """Return the arguments of `transposed` for a stretch of steps, from the state of the reverse pass."""
         simulation, order = self.tape.simulation, stretch.table.order
         self.met = None if self.guard is None else crossings(simulation, stretch, self.guard)
         tape, tables = self.tape, simulation.tables(stretch.table)
@@ -414,12 +415,12 @@ class StretchReversal:
         )  # fmt: skip
 
     def through(self, stretch: TapeStretch) -> tuple[Float[np.ndarray, "room most"], AdjointCarry]:
-        """Transpose a stretch; return the weights of its crossings and the cotangents at each step."""
+        """Transpose a stretch of steps; return the weights of its crossings and each step's cotangents."""
         self.carry, (weights, trace) = transposed(*self.arguments(stretch))
         return np.asarray(weights), trace
 
     def cotangents(self) -> Cotangents:
-        """Return the derivatives, once the reverse pass has reached the start."""
+        """Return the derivatives of the loss, after the reverse pass has reached the start of the run."""
         simulation, carry, start = self.tape.simulation, self.carry, self.tape.start.state
         through = carry.integrator, carry.x, carry.v
         if jax.tree.leaves(carry.extra):
@@ -448,11 +449,12 @@ def transposed(
     carry: AdjointCarry,
     wanted: frozenset[str],
 ):
-    """Transpose a stretch of steps; return the carry before it, the weights of its crossings, and its trace.
+    """Transpose a stretch of steps; return the cotangents before it, its crossings' weights, and its trace.
 
     The part of a step between two force evaluations is transposed by JAX, with respect to positions,
-    velocities, extra state, forces, virial and box. For a linear `KickDrift` this derivative does not depend
-    on the forces, so the rows need not contain them; `pull_back` returns them for the integrator's numbers.
+    velocities, extra state, forces, virial and box. For a linear `KickDrift` integrator this derivative does
+    not depend on the forces, so the recorded rows need not contain forces; `pull_back` computes them for the
+    derivatives by the integrator's numbers.
     """
     loss, origin, around, onto_total, pace = looking
     order, moves = tables.order, integrator.moves_cell

@@ -1,9 +1,9 @@
 """Derivatives of averages over states, from one run that is not differentiated.
 
-An average over states does not depend on the time order of the frames. Its derivative by a parameter has
-three contributions: the change of each frame's term at fixed positions; the pairs at the cutoff (a term that
-jumps when a pair enters changes with the radius by the jump times the density of pairs there, which no
-derivative at fixed decisions contains); and, under a thermostat, the change of the weight exp(-U/kT).
+An average over states does not depend on the time order of the frames. Its derivative by a parameter has up
+to three contributions. The term of each frame changes at fixed positions. Pairs cross the cutoff: a term that
+jumps when a pair enters changes with the radius by the jump times the density of pairs at the cutoff, which
+derivatives at fixed decisions miss. Under a thermostat, the weight exp(-U/kT) of each frame changes.
 """
 
 from __future__ import annotations
@@ -63,14 +63,14 @@ def known(name: str) -> bool:
 def energy_of_forces(simulation: Simulation) -> Simulation:
     """Return the system whose energy has the given system's forces as its gradient everywhere.
 
-    A hard cutoff has the forces of the shifted one, and no force at the sphere where its energy jumps: a run
-    samples the ensemble of the shifted energy, whatever energy is reported.
+    A hard cutoff has the same forces as a shifted cutoff, because its energy jump at the cutoff exerts no
+    force: a run samples the ensemble of the shifted energy, whatever energy is reported.
     """
     return simulation.with_cutoff("shifted") if isinstance(simulation.cutoff, Hard) else simulation
 
 
 def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], None] | None = None) -> Frames:
-    """Evaluate the frames of a tape's loss, with derivatives by the named parameters.
+    """Evaluate the loss of a recorded run in each frame, with derivatives by the named parameters.
 
     Args:
         tape: the run, of a pair potential.
@@ -215,8 +215,9 @@ def density(
     """Sum over frames a weight times the density of pairs at the cutoff, delta(r_cut - r_ij).
 
     The delta function is replaced by a parabola of finite width. The bias is even in the width; extrapolation
-    from three widths, each half of the previous one, removes the second and fourth orders. The widest triple
-    is used that differs from no narrower triple by more than twice the standard error of the difference.
+    from three widths, each half of the previous one, removes the second and fourth orders. The result comes
+    from the widest three kernels whose estimate differs from that of no narrower three by more than twice the
+    standard error of the difference.
 
     Args:
         weights: one per frame and pair type. reach: the largest width, length.
@@ -290,7 +291,7 @@ class BoundaryTerm(Method):
         return self.result(tape.value, gradient, details={"frames": len(seen), **details})
 
     def terms(self, simulation: Simulation, seen: Frames, names: Sequence[str], progress=None):
-        """Return each frame's contribution to the derivative, by parameter name, and the details."""
+        """Return each frame's contribution to the derivatives, by parameter name, and further details."""
         energy, force = simulation.jumps()
         radii = np.asarray(simulation.decider.r_cut)
         # what a pair that enters adds to the loss of each frame
@@ -327,9 +328,9 @@ class Reweighting(Method):
     The explicit part is that of `BoundaryTerm`; the response is minus the covariance of the loss's terms with
     the derivative of the energy, divided by kT.
 
-    Error: statistical; the details hold a standard error from block averages. With few correlated frames the
-        error is large; the estimate covers only the variation within this run.
-    Source: S. Thaler, J. Zavadlav, Nature Communications 12, 6884 (2021).
+    Error: statistical; `details` holds a standard error from block averages. With few correlated frames the
+    error is large; the estimate covers only the variation within this run. Source: S. Thaler, J. Zavadlav,
+    Nature Communications 12, 6884 (2021).
     """
 
     at_states: BoundaryTerm = field(default_factory=BoundaryTerm)  # the explicit part

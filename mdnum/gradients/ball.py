@@ -1,8 +1,8 @@
-"""Derivatives of a ball's rollout: a program with decisions has several, and each has a method of its own.
+"""Derivatives of a ball's rollout by several methods, because a program with decisions has several.
 
 The methods here differentiate the operations that ran (unrolled), the program with every decision pinned
-(frozen), or the mean loss over random parameters (randomized). `ball_contacts` has methods that change the
-contact.
+(frozen), or the loss averaged over random parameters (randomized). Methods that change the contact are in
+`ball_contacts`.
 
 JAX has no `requires_grad`: the derivative is 0.0 both for a parameter that the run never used and for one
 whose derivative underflowed or was clamped to zero. `dependence` distinguishes the two cases.
@@ -51,7 +51,7 @@ class BallMethod(Method):
     def of(
         self, value: float, slopes: dict[str, float], use: dict[str, Use], details: dict[str, Any]
     ) -> Gradient:
-        """Create this method's `Gradient` from slopes and notes on dependence."""
+        """Create a `Gradient` from derivatives and notes on which parameters the run used."""
         gradient = {name: np.asarray(slope, np.float64) for name, slope in slopes.items()}
         made = self.result(value, gradient, {name: one.note for name, one in use.items()}, details)
         return replace(made, depends={name: one.depends for name, one in use.items()})
@@ -105,7 +105,7 @@ def compare(
 
 
 class Dependence(NamedTuple):
-    """Whether any path of a program leads from a parameter to the loss, and whether an executed path does."""
+    """Whether any path in a program leads from a parameter to the loss, and whether an executed path does."""
 
     written: bool
     used: bool
@@ -119,8 +119,8 @@ def dependence(
 ) -> dict[str, Dependence]:
     """Determine whether a scalar loss depends on its parameters, in the branches and iterations that ran.
 
-    The test uses tangents that are NaN: NaN passes through every operation that carries a derivative,
-    whatever the factor, and reaches nothing else.
+    The test sets the tangent of a parameter to NaN, which propagates through every operation that carries a
+    derivative, whatever the factor, and through no other operation.
 
     Args:
         function: maps a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as
@@ -167,8 +167,8 @@ def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str
 
 
 def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
-    """Inline the loops of `stopping.elementwise` in place of their custom rule: it multiplies by a Jacobian,
-    and zeros in this Jacobian would not distinguish a flat loop from a loop that did not run.
+    """Replace the custom derivative rule of `stopping.elementwise` by its loops: zeros in the Jacobian of the
+    rule would not distinguish a loop with zero slope from a loop that did not run.
     """
 
     def run(*inputs):
@@ -197,7 +197,7 @@ def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 class _Rollout(eqx.Module):
-    """Loss after a given number of steps; equal for equal problems, so that the function is compiled once."""
+    """Loss after a given number of steps; functions of equal problems are equal and compiled once."""
 
     steps: int = eqx.field(static=True)
     loss: BallLoss
@@ -294,7 +294,7 @@ class Frozen(BallMethod):
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """Compute the derivative by reverse mode, and central differences of the pinned program as a check.
 
-        Error: rounding in the derivative; about u^(2/3) relative in the differences.
+        Error: rounding for the derivative; about u^(2/3), relative, for the finite differences.
         """
         run = problem.run(keep=False)
         decisions = jax.tree.map(jnp.asarray, run.decisions())
@@ -320,9 +320,9 @@ def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
 class RandomizedSmoothing(BallMethod):
     """The derivative of E[loss(parameters + width * noise)], estimated from loss values alone.
 
-    The estimate includes jumps (of iteration counts, of contacts) and belongs to a smoother loss; the same
-    seed gives the same bits. Each sample is used with its mirror image, which removes the value from the
-    variance.
+    The estimate includes the effect of jumps (of iteration counts and contacts) and is the derivative of a
+    smoother loss; the same seed gives the same bits. Each noise sample is paired with its mirror image, so
+    that the loss itself does not add to the variance.
     """
 
     # standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0)

@@ -1,4 +1,4 @@
-"""Derivatives that account for a ball's contacts: of a solver's fixed point, a soft floor, or the motion."""
+"""Derivatives of a ball with special treatment of contacts: fixed point, soft floor, or true motion."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _NARROW = 1e-6
 
 
 def _moving(x: Any) -> Any:
-    """Return 0 with the derivative of x; adding this term gives a value another derivative."""
+    """Return a zero that has the derivative of x and can be added to a value to give it this derivative."""
     return x - lax.stop_gradient(x)
 
 
 class FixedPointRule(eqx.Module):
-    """Custom rule: gives a projection's result the derivative of the fixed point that it approximates.
+    """Rule that gives the result of a projection the derivative of the fixed point that it approximates.
 
     For a ball in contact the fixed point of y ← y + gain max(0, -y) that is reached from below is y = 0. This
     point lies on the kink of max(0, -y), where dG/dy has two values: the value from below is used, because
@@ -58,7 +58,7 @@ class FixedPointRule(eqx.Module):
     def attach(
         self, y: Float[Array, "balls"], gain: Float[Array, "balls"], contact: Bool[Array, "balls"]
     ) -> Float[Array, "balls"]:
-        """Return y, unchanged, with the derivative of the fixed point.
+        """Return the heights y unchanged, with the derivative of the fixed point.
 
         Args:
             y: heights where the iteration stopped.
@@ -82,8 +82,8 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """The derivative of the projection's fixed point, by the implicit function theorem.
 
-    The loss is that of the iterations that ran; the derivative is that of their limit: the floor, whatever
-    the gain. A nonzero derivative by k from the method unrolled is an artifact of the tolerance.
+    The loss uses the iterations that ran; the derivative uses their limit, which is the floor for every gain.
+    The method `unrolled` gives a nonzero derivative by k, which is an artifact of the tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
@@ -159,7 +159,7 @@ class SoftImpact(eqx.Module):
         return free + self.k * depth * (share + (1 - share) * jax.nn.sigmoid(-v / self.slow))
 
     def move(self, motion: Motion) -> Moved:
-        """Integrate one step under this force; the contact decision is only recorded."""
+        """Integrate one step under the force of the spring; the contact decision is only recorded."""
 
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, motion.rounding)
@@ -189,8 +189,8 @@ class SoftFloor(BallMethod):
         Raises:
             InputError: eps is not positive, or the smooth program does not have the parameter.
 
-        Error: rounding; as a derivative of the given program, a bias that shrinks with eps only if that
-        program has a derivative.
+        Error: rounding; relative to the given program, also a bias that shrinks with eps only if this program
+        has a derivative.
         """
         eps = _suitable(problem) if self.eps is None else self.eps
         if not eps > 0:
@@ -256,13 +256,13 @@ def _suitable(problem: BallProblem) -> float:
 
 @dataclass(frozen=True)
 class ThroughContacts(BallMethod):
-    """The derivative of the ball's motion, contacts included, rather than of the steps that approximate it.
+    """The derivative of the ball's true motion, contacts included, rather than of the discrete steps.
 
-    A step decides about contact at its end, so its derivative misses that a ball which starts higher arrives
-    later. This method uses the saltation matrix of every contact. For an impact located inside the step, the
-    program's own derivative already contains it. A projection is treated as the impact that it approximates.
-    The force of a spring without a damper does not jump: for such a spring the result equals the unrolled
-    derivative, and the description says so.
+    Contact is decided at the end of a step, so the derivative of the steps does not contain the later arrival
+    of a ball that starts higher. This method uses the saltation matrix of every contact. If impacts are
+    located inside the step, the program's own derivative already contains this matrix. A projection is
+    treated as the impact that it approximates. The force of a spring without a damper does not jump: for such
+    a spring the result equals the unrolled derivative, and the description of the gradient says so.
     """
 
     name = "event-aware"
@@ -275,8 +275,8 @@ class ThroughContacts(BallMethod):
         Raises:
             NumericalError: a contact grazes the floor, so that its time has no derivative.
 
-        Error: none beyond rounding if impacts are located inside the step; otherwise of the order of the
-        step, like the error of the rollout itself.
+        Error: only rounding if impacts are located inside the step; otherwise of the order of the time step,
+        like the error of the rollout itself.
         """
         world = problem.world
         located = isinstance(world.integrator, EventLocated)
@@ -310,10 +310,10 @@ class ThroughContacts(BallMethod):
 
 
 class _SaltatingReset:
-    """A contact that resets the velocity at the end of a step, with the derivative of the motion."""
+    """A contact that resets the velocity at the end of a step and has the derivative of the true motion."""
 
     def move(self, motion: Motion) -> Moved:
-        """Compute the step with its contact; derivatives use only the flight and the saltation matrix."""
+        """Compute one step with a contact; its derivative uses only the flight and the saltation matrix."""
         made = super().move(motion)  # type: ignore[misc]
         height, v = motion.integrator.fly(motion.y, motion.v, motion.free, motion.rounding)
         arrived, nothing, bounce = lax.stop_gradient(v), jnp.zeros_like(v), self.restitution.astype(v.dtype)  # type: ignore[attr-defined]
@@ -343,7 +343,7 @@ class _SaltatingProjection(_SaltatingReset, Projection):
 
 class _SaltatingPenalty(Penalty):
     def move(self, motion: Motion) -> Moved:
-        """Compute a step: the force of a damper jumps by -damping v, which changes tangents."""
+        """Compute one step with a spring; a damper's force jumps by -damping v, which changes tangents."""
         contact = super().move(motion).record.contact
         y, v = lax.stop_gradient((motion.y, motion.v))
         jump = jnp.where(contact, -1.0, 1.0).astype(v.dtype) * lax.stop_gradient(self.damping) * v

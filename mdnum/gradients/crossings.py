@@ -1,10 +1,10 @@
-"""Contribution of flips to a gradient, through the time at which a pair crosses its cutoff.
+"""Contributions of flips to a gradient, through the times at which pairs cross their cutoff.
 
-Where the force jumps, a perturbed pair crosses earlier or later, and its momentum differs ever after.
-Differentiating the steps of a program misses this change; the error does not shrink with the time step.
-The term is the saltation term of mdnum.numerics, with the cutoff's sphere as the threshold, written for the
-reverse pass. A loss that uses the potential energy or the virial jumps with them too: if its frames follow
-one another at equal times, a later crossing moves the jump across a fraction of a frame.
+If the force jumps at the cutoff, a perturbed pair crosses earlier or later, and its momentum differs from
+then on. Derivatives of a program's steps miss this effect, and the error does not shrink with the time step.
+The contribution is the saltation term of mdnum.numerics, with the cutoff sphere as the threshold, in the form
+for a reverse pass. A loss that uses the potential energy or the virial also jumps at a crossing: if its
+frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
 
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
 dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.
@@ -36,7 +36,7 @@ _ROOM_BITS = 6
 
 
 class Met(NamedTuple):
-    """Crossings in a compiled program, padded to a fixed size, of one row or of all rows in sequence."""
+    """Crossings of one step or of all steps in sequence, padded to a fixed size for a compiled program."""
 
     # i, j: sorted atoms; beyond the last one where there is no crossing
     i: Int[Array, "most"]
@@ -59,7 +59,7 @@ class MetRows(NamedTuple):
     slots: Int[np.ndarray, "most"]  # numbers from 0, as many as the row with the most has, or a few more
 
     def row(self, span: Int[Array, "2"], atoms: int) -> Met:
-        """Return the crossings of the row that a span describes."""
+        """Return the crossings of one row, given the row's first crossing and number of crossings."""
         most = len(self.slots)
         own = Met(*(lax.dynamic_slice_in_dim(column, span[0], most, -1) for column in self.met))
         # behind them are those of the next row
@@ -97,18 +97,18 @@ class Crossings:
 
     @property
     def kick(self) -> Float[np.ndarray, "crossings"]:
-        """Derivative of the momentum along the pair by its distance through the crossing, energy/length per
-        (length/time): the saltation of (distance, momentum), whose threshold is the cutoff.
+        """Change of the momentum along the pair per change of its distance at the crossing, energy/length per
+        (length/time): the saltation of (distance, momentum) with the cutoff as threshold.
         """
         return self.force / self.speed
 
     def spans(self, room: int) -> Int[np.ndarray, "room 2"]:
-        """Return where each row begins and how many crossings it has."""
+        """Return the index of the first crossing of each row, and the number of its crossings."""
         starts = np.searchsorted(self.row, np.arange(room + 1))
         return np.stack([starts[:-1], np.diff(starts)], axis=1)
 
     def rows(self, room: int) -> MetRows:
-        """Return the crossings in padded form for a compiled program, with `room` rows."""
+        """Return the crossings of `room` rows in the padded form for a compiled program."""
         spans = self.spans(room)
         most = _padded(int(spans[:, 1].max(initial=0)))
         # a slice of so many fits everywhere
@@ -128,7 +128,7 @@ class Crossings:
         return MetRows(Met(*map(padded, columns)), spans, np.arange(most))
 
     def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
-        """Return the values of padded rows as one sequence without padding, one entry per crossing."""
+        """Return the values of padded rows without the padding, one entry per crossing."""
         return values[np.arange(values.shape[1]) < self.spans(len(values))[:, 1:]]
 
     def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
@@ -155,8 +155,8 @@ def onto_crossings(
 ) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"], Float[Array, "3 3"]]:
     """Transpose the saltation of one step's crossings.
 
-    A crossing lies between two steps, on average in their middle, where positions are half a drift short of
-    the later step's. Let n be the unit vector from i to j, f the force jump and s = n · (v_j - v_i) +
+    A crossing lies between two steps, on average in their middle, where positions are half a drift before
+    those of the later step. Let n be the unit vector from i to j, f the force jump and s = n · (v_j - v_i) +
     n · (dh/dt h^-1) r the radial speed, including the motion of the box. If the distance there is longer by
     dr (n · (dx_j - dx_i), less the change of the lattice vectors between the two), the jump acts for a time
     that differs by dr/s:
@@ -214,7 +214,7 @@ def of_energy(
     """Compute cotangents of the distances at which an energy gains or loses a pair: E(with) - E(without).
 
     Besides the pair, all atoms whose energy includes the pair are affected. The pair is placed at its cutoff;
-    other crossing pairs of the same step are as they are at the end of the step.
+    other pairs that cross in the same step are taken as at the end of the step.
 
     Args:
         met: crossings whose `push` is one over the radial speed, negative where the pair leaves.
@@ -254,8 +254,8 @@ def of_energy(
 def _along(
     met: Met, vectors: Float[Array, "3 atoms"], matrix: Float[Array, "3 3"] | None = None
 ) -> Float[Array, "most"]:
-    """Return the component along each pair of the difference of a vector between its atoms; for given lattice
-    vectors, of the nearest images.
+    """Return the component, along each pair, of the difference of a vector between the two atoms; with
+    lattice vectors, the difference is that of nearest images.
     """
     dtype = vectors.dtype
     there = vectors.at[:, met.j].get(mode="fill", fill_value=0)
@@ -299,7 +299,7 @@ def push_through(
 
 
 def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Crossings:
-    """Return the flips of a stretch as events, with their normals and radial speeds between two steps.
+    """Return the flips of a stretch of steps as events, with their normals and radial speeds.
 
     Args:
         stretch: recorded with its flips.
@@ -322,13 +322,13 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
     atoms = stretch.x.shape[2]
 
     def positions(rows: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return the positions of an atom in each of some rows; row -1 is the step before the first."""
+        """Return the positions of given atoms in given rows; row -1 is the step before the first row."""
         axes = [of + k * atoms for k in range(3)]
         seen = [x.take(3 * atoms * rows + at, mode="clip") for at in axes]
         return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)
 
     def apart(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return minimum-image differences, and the lattice vectors from these to the wrapped ones."""
+        """Return minimum-image displacements of pairs, and lattice vectors to the wrapped displacements."""
         start, end = positions(rows, i).astype(np.float64), positions(rows, j).astype(np.float64)
         inverse = inverses[rows + 1]
         if stretch.cell.size:

@@ -3,9 +3,9 @@
 A replica is the same system with different velocities, and with different noise under a thermostat. Each
 replica is a run with its own neighbor lists, so replicas run one after another on the available devices.
 
-Between two crossings that change the step at which they happen, a loss with a force jump follows the
-derivative of its steps; at each of them it jumps. The event-aware gradient predicts the slope over many such
-jumps, so a finite difference that is compared with it must span many jumps.
+When a parameter changes, crossings move from one step to the next. If the force jumps, the loss jumps at each
+such move, and between two moves it follows the derivative of its steps. The event-aware gradient predicts the
+slope over many jumps of the loss, so a finite difference for comparison must span many jumps.
 """
 
 from __future__ import annotations
@@ -270,7 +270,7 @@ class ShadowDifferences(Method):
 
 @dataclass(frozen=True)
 class Replicas:
-    """Starts that differ only by random numbers."""
+    """Starts of a system that differ only in their random numbers."""
 
     count: int = 8  # how many
     seed: int = 0  # of the first one; the others count on from there
@@ -283,7 +283,7 @@ class Replicas:
             raise InputError(f"{seen}; expected at least 2, and at least 0")
 
     def of(self, problem: Problem) -> list[Problem]:
-        """Return the problem with each of the starts."""
+        """Return the problem with each of these starts, as a list."""
         return [
             replace(problem, simulation=replica(problem.simulation, self.seed + k, self.settle))
             for k in range(self.count)
@@ -340,7 +340,7 @@ class Estimate:
 
     @classmethod
     def from_replicas(cls, values: Sequence[Any] | np.ndarray) -> Estimate:
-        """Create the estimate from the values of all replicas."""
+        """Create an estimate of mean and standard error from the values of all replicas."""
         of = np.stack([np.asarray(value, np.float64) for value in values])
         return cls(np.asarray(of.mean(axis=0)), np.asarray(of.std(axis=0, ddof=1) / np.sqrt(len(of))), of)
 
@@ -433,9 +433,8 @@ def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
 class SmoothedDifferences(Method):
     """Central differences with wide steps over replicas that share their random numbers.
 
-    Each pair of successive steps (the first twice the second) is extrapolated to zero step. The widest pair
-    is used that differs from no narrower pair by more than twice the standard error of the difference:
-        narrower
+    Each pair of successive difference steps, one twice the other, is extrapolated to zero. The widest pair is
+    used that differs from no narrower pair by more than twice the standard error of the difference: narrower
     steps have more noise from single events. Standard errors, steps and moved crossings are in the details.
     """
 
@@ -500,14 +499,14 @@ def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable
 
 
 def _share(high, low) -> float | None:
-    """Return the fraction of crossings that are not in both runs at the same step; None if there are none."""
+    """Return the fraction of crossings that are not in both runs at the same step; None without crossings."""
     total = sum(len(a[1]) + len(b[1]) for a, b in zip(high, low, strict=True))
     differing = sum(len(a[1] ^ b[1]) for a, b in zip(high, low, strict=True))
     return differing / total if total else None
 
 
 def _chosen(found: Float[np.ndarray, "steps replicas"]) -> tuple[Estimate, float, int]:
-    """From differences by step, return the extrapolated derivative, its error, and the index of its step."""
+    """Return the extrapolated derivative, its error, and the index of its step, from differences by step."""
     if len(found) == 1:
         only = Estimate.from_replicas(found[0])
         return only, float(only.error), 0

@@ -1,8 +1,9 @@
 """Losses of a trajectory, evaluated frame by frame: the trajectory is never stored whole.
 
 A loss observes some frames, each together with the first frame, sums its observations, and computes a number
-from the sums. This covers averages, correlations with the start, and histograms; the derivative also needs
-one frame at a time. A loss available on the command line is a class here with a name, a label and a unit.
+from the sums. Such sums cover averages, correlations with the start, and histograms; the derivative also
+needs only one frame at a time. A loss available on the command line is a class here with a name, a label and
+a unit.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class LossFrame(NamedTuple):
 
 
 class LossContext(NamedTuple):
-    """Quantities that a loss may use in addition to a frame; the box is that of the frame."""
+    """Quantities that a loss may use in addition to a frame, such as masses and the box of the frame."""
 
     masses: Float[Array, "atoms"]  # of the atoms
     matrix: Float[Array, "3 3"]  # lattice vectors as rows, length
@@ -79,7 +80,7 @@ class Loss(eqx.Module):
         return cls(**options)
 
     def looks_at(self, steps: Int[np.ndarray, "rows"], last: int) -> Bool[np.ndarray, "rows"]:
-        """Return which steps' frames the loss uses, for a run with a given last step."""
+        """Return for each step whether the loss uses its frame, in a run with a given last step."""
         return (steps >= self.first) & ((steps - self.first) % self.every == 0)
 
     @abstractmethod
@@ -308,8 +309,8 @@ class RadialDistribution(Loss):
     """A number computed from g(r), the pair density relative to an ideal gas, averaged over frames.
 
     Cubic B-splines, which add up to one, share every distance among the four nearest bins: g(r) has two
-    continuous derivatives by every position. A frame costs of the order of atoms² operations and of atoms
-    memory.
+    continuous derivatives by every position. The cost of a frame is of order atoms² in time and of order
+    atoms in memory.
 
     Source: of the loss, J. P. Hansen, I. R. McDonald, Theory of Simple Liquids (2013), section 2.5.
     """
@@ -352,7 +353,7 @@ class RadialDistribution(Loss):
         return (jnp.arange(self.bins, dtype=jnp.float64) + 0.5) * self.width
 
     def reason_unavailable(self, around: LossContext) -> str | None:
-        """Return why g(r) is not defined here; distances are those of nearest images."""
+        """Return why g(r), which uses nearest images, is not defined for a box; None if it is defined."""
         if why := _bulk(around):
             return why
         half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2
@@ -439,7 +440,7 @@ for _loss in (
 
 
 def parse(text: str, simulation: Simulation, steps: int) -> Loss:
-    """Return the loss that a text describes.
+    """Return the loss that a text from the command line describes.
 
     Args:
         text: a name of `LOSSES`, optionally with options after a colon: "potential:every=10,first=500".

@@ -63,13 +63,13 @@ class Direction(NamedTuple):
 def quantities(force: PairForce | ManyBodyForce) -> Any:
     """Return the differentiable quantities of a force, as a pytree of arrays.
 
-    For a many-body potential they are its arrays and constants, by name.
+    For a many-body potential, the quantities are its arrays and constants, by name.
     """
     return force.model if isinstance(force, PairForce) else manybody.quantities_of(force.potential)
 
 
 def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce | ManyBodyForce:
-    """Return the force with other quantities; the function also works inside jit."""
+    """Return the force with its quantities replaced; the function also works inside jit."""
     if isinstance(force, PairForce):
         return replace(force, model=values)
     return replace(force, potential=manybody.with_quantities(force.potential, values))
@@ -172,7 +172,7 @@ def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.n
 
 
 def moved(simulation: Simulation, still: Direction, column: ParameterEntry) -> Direction:
-    """Return the derivatives of all inputs by one number, per unit of it, with all other numbers fixed."""
+    """Return the derivatives of all inputs of a rollout by one number, with all other numbers fixed."""
     entry = parameters.entry(simulation, column.name)
     unit_entry = np.zeros(np.shape(value(simulation, entry.whole)))
     unit_entry[(*entry.index, *column.index)] = 1 / entry.factor
@@ -188,7 +188,7 @@ def moved(simulation: Simulation, still: Direction, column: ParameterEntry) -> D
 
 @dataclass(frozen=True)
 class ParameterEntry:
-    """One number among the parameters."""
+    """One number of a parameter: a scalar, or one entry of an array."""
 
     name: str  # full name of the parameter
     index: tuple[int, ...] = ()  # which of its entries; empty for a scalar
@@ -198,7 +198,7 @@ class ParameterEntry:
 
 
 def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterEntry, ...]:
-    """Return the single numbers that some parameters consist of, in order."""
+    """Return all single numbers of the given parameters, in order."""
     return tuple(
         ParameterEntry(name, tuple(int(k) for k in index))
         for name in names
@@ -217,7 +217,7 @@ def gathered(
 
 
 def directions(simulation: Simulation, columns: Sequence[ParameterEntry]) -> Direction:
-    """Return the derivatives of all inputs by each column, stacked along a first axis, per parameter unit."""
+    """Return the derivatives of all inputs of a rollout by each number, stacked along a first axis."""
     nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
     still = Direction(
         nothing,

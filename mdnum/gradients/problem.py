@@ -31,7 +31,7 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Problem:
-    """A loss of a rollout.
+    """A loss of a rollout that is to be differentiated.
 
     Example:
         >>> loss = mdnum.gradients.losses.MeanPotential()
@@ -138,7 +138,7 @@ class Method:
     kind: ClassVar[Kind] = "steps"
 
     def reason_unavailable(self, problem: Any, names: Sequence[str]) -> str | None:
-        """Return why this derivative does not exist for a problem; None if it exists."""
+        """Return why the method gives no derivative for a problem; None if it gives one."""
         return None
 
     def __call__(self, problem: Any, names: Sequence[str], progress: Progress | None = None) -> Gradient:
@@ -174,7 +174,7 @@ class Method:
         return full
 
     def differentiate(self, problem: Any, names: tuple[str, ...], progress: Progress | None) -> Gradient:
-        """Compute the derivative, for names that were already checked."""
+        """Compute the derivative by parameters whose names were already checked."""
         raise NotImplementedError
 
     def result(self, value: float, gradient: dict[str, Any], notes=None, details=None) -> Gradient:
@@ -262,7 +262,7 @@ def scalars_only(problem: Problem, names: Sequence[str]) -> str | None:
 
 
 def in_phase(progress: Progress | None, phase: str) -> Callable[[int, int], None] | None:
-    """Return a callback of steps alone, which adds the name of the phase."""
+    """Return a progress callback that takes only steps, and adds the name of the phase."""
     if progress is None:
         return None
     return lambda step, steps: progress(step, steps, phase)

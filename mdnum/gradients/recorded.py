@@ -1,7 +1,7 @@
-"""Gradient methods at the recorded run: reverse by symmetric Jacobians, forward by tangents.
+"""Gradient methods that linearize a recorded run: backward by symmetric Jacobians, forward by tangents.
 
-The program that makes every run makes the run first. Then the run is linearized at the states and decisions
-that were recorded, or that are recomputed when a fixed-point run is reversed.
+The run is made first, by the same program as every other run. Then the run is linearized at the states and
+decisions that were recorded, or that are recomputed when a fixed-point run is reversed.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def passed(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> ReversePass:
-    """Run a problem and its reverse pass, with callbacks that receive the cotangents of every stretch.
+    """Run a problem and its reverse pass; callbacks receive the cotangents of every stretch of steps.
 
     Args:
         names: full names of the parameters. saltation: whether to include the contribution of flips.
@@ -109,7 +109,7 @@ def passed(
 
 
 def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progress | None = None) -> RunTape:
-    """Run a problem and return its tape."""
+    """Run a problem and return its tape, which is the recorded run."""
     return RunTape(
         problem.simulation, problem.loss, problem.steps, flips=flips, budget=budget,
         progress=in_phase(progress, "run"),
@@ -145,7 +145,7 @@ class Symmetric(Method):
 
 @dataclass(frozen=True)
 class EventAware(Method):
-    """The derivative of the flow: that of the steps, plus the contribution of the time of every flip."""
+    """The derivative of the flow: that of the steps, plus a contribution from the time of every flip."""
 
     # radial speed below which a crossing grazes and is left out, as a share of the rms radial speed of a
     # pair. Left in, single crossings would dominate: their terms go with one over that speed
@@ -318,7 +318,7 @@ def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
 
 
 def joined(crossings: Sequence[Crossings], name: str, *, ledger: bool = False) -> np.ndarray:
-    """Concatenate a column of the crossings of several stretches, or of their ledgers."""
+    """Concatenate one column of the crossings, or of their ledgers, over several stretches of steps."""
     return np.concatenate([getattr(one.ledger if ledger else one, name) for one in crossings])
 
 

@@ -1,6 +1,6 @@
 """Forward-mode derivatives: tangents of a few parameters along the recorded run.
 
-A tangent is propagated through each step at the recorded state and decisions. This needs no memory beyond
+A tangent is propagated through each step at the recorded state and decisions. Tangents need no memory beyond
 that of the run, and one force evaluation per step and parameter.
 """
 
@@ -36,7 +36,7 @@ from mdnum.rollout.epoch import over_rows
 
 
 class TangentCarry(NamedTuple):
-    """Tangents carried between two steps, user's order, one for each column."""
+    """Tangents of the state between two steps, one for each column, with atoms in the user's order."""
 
     # of the positions as if the box had no faces, at the step that comes next
     x: Float[Array, "columns 3 atoms"]
@@ -48,7 +48,7 @@ class TangentCarry(NamedTuple):
 
 @dataclass(frozen=True)
 class StretchTangents:
-    """Tangents along one stretch of a run."""
+    """Tangents along one stretch of steps of a run."""
 
     stretch: TapeStretch  # the steps
     columns: tuple[ParameterEntry, ...]  # the numbers by which it is differentiated
@@ -72,7 +72,7 @@ def tangents(
     states: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[StretchTangents]:
-    """Yield tangents by named parameters along a recorded run, stretch by stretch, first stretch first.
+    """Yield tangents by named parameters along a recorded run, for one stretch of steps after another.
 
     For tangents that do not jump and weights of an event-aware reverse pass, the sum of weight times
     (dr_cut - dr) over crossings is the contribution of the flips to the derivative by each column.
@@ -187,7 +187,7 @@ def _stretch(
         return jax.tree.map(jnp.add, total, seen)
 
     def push(row, told, see, span, carry: TangentCarry, along: Direction):
-        """Propagate the tangent of one column through one step."""
+        """Propagate the tangent by one number through one step."""
         number, x, v = row[0], row[1], row[2]
         dx, dv = carry.x, carry.v
         half, first = (0.5 * integrator.timestep).astype(dtype), number == 0

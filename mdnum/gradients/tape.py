@@ -1,8 +1,9 @@
-"""The forward run of a gradient: all stretches of steps, also in reverse order, and the sums of the loss.
+"""The recorded forward run of a gradient: its steps, also in reverse order, and the sums of the loss.
 
-Recorded stretches are kept as long as memory allows. The others are run again from their first states: the
-same compiled program from the same state with the same list gives the same bits. A run with a fixed-point
-integer state need not be kept at all: it is reversed step by step, and must return to its start bit for bit.
+Recorded stretches of steps are kept as long as memory allows. Other stretches are run again from their first
+states: the same compiled program from the same state with the same list gives the same bits. A run with a
+fixed-point integer state need not be kept at all: it is reversed step by step, and must return to its start
+bit for bit.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _FINGERPRINTS = 256
 
 @dataclass(frozen=True)
 class TapeStretch:
-    """Successive steps with one neighbor list, in the order of its atoms."""
+    """Successive steps with one neighbor list, with atoms in the order of this list."""
 
     # first, rows: its first step and the number of rows in use; those beyond are void
     first: int
@@ -119,7 +120,7 @@ def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) 
 
 
 class Pace(NamedTuple):
-    """How often a loss uses a frame."""
+    """Spacing of the frames that a loss uses."""
 
     between: Int[Array, ""]  # steps from one frame to the next; 0 where they are not a series at equal times
     first: Int[Array, ""]  # step of the first frame
@@ -216,14 +217,14 @@ class RunTape:
 
     @property
     def replayed(self) -> int:
-        """Number of stretches that are run again in a reverse pass."""
+        """Number of stretches of steps that are run again in a reverse pass."""
         return sum(isinstance(one, tuple) for one in self._made)
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
         """Derivatives of the loss by the energy and by the virial, if these jump at a flip and the loss uses
-        single frames: such a jump of the loss has no slope. Both are 0 for frames at equal times, where
-        averages account for the jumps.
+        single frames: such a jump of the loss has no slope. Both derivatives are 0 for equally spaced frames,
+        where averages account for the jumps.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0
@@ -245,15 +246,15 @@ class RunTape:
         return stretch_of(self._engine.again(one[0]), *one) if isinstance(one, tuple) else one.roomy()
 
     def backward(self) -> Iterator[TapeStretch]:
-        """Yield the stretches, last first."""
+        """Yield the stretches of steps, from last to first."""
         return map(self._whole, reversed(self._made))
 
     def forward(self) -> Iterator[TapeStretch]:
-        """Yield the stretches, first one first."""
+        """Yield the stretches of steps, from first to last."""
         return map(self._whole, self._made)
 
     def seen(self, stretch: TapeStretch) -> Bool[np.ndarray, "room"]:
-        """Return which rows the loss uses."""
+        """Return which rows of a stretch the loss uses."""
         steps = stretch.steps
         return self.loss.looks_at(steps, self.steps) & (np.arange(len(steps)) < stretch.rows)
 
@@ -268,10 +269,10 @@ class RunTape:
 
 
 class ReversibleTape(RunTape):
-    """A completed run with a fixed-point integer state that is reversed instead of kept, and its loss.
+    """A completed run with a fixed-point integer state, which is reversed instead of stored, and its loss.
 
-    `backward` reverses the steps, with neighbor lists that it builds itself, and raises NumericalError if the
-    states differ from those of the forward run.
+    `backward` reverses the steps, with newly built neighbor lists, and raises NumericalError if the states
+    differ from those of the forward run.
 
     Attributes:
         baths: bits discarded by a thermostat's friction, by step: the only memory that grows with the run.
@@ -306,7 +307,7 @@ class ReversibleTape(RunTape):
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:
-        """Run the steps again, because a reversible run is not kept."""
+        """Run the steps again, because a reversible run is not stored, and yield its stretches in order."""
         return RunTape(self.simulation, self.loss, self.steps, flips=self.flips).forward()
 
     def backward(self) -> Iterator[TapeStretch]:
@@ -391,13 +392,13 @@ def _summed(loss, total, rows, used, seen, origin, around, order):
 
 
 def in_box(around: LossContext, matrix: Float[Array, "3 3"]) -> LossContext:
-    """Return the surroundings with other lattice vectors."""
+    """Return the context of a loss with other lattice vectors."""
     volume = jnp.abs(jnp.dot(matrix[0], jnp.cross(matrix[1], matrix[2])))
     return around._replace(matrix=matrix, volume=jnp.where(around.volume > 0, volume, 0.0))
 
 
 def surroundings(simulation: Simulation) -> LossContext:
-    """Return the quantities besides frames that a loss may use, from a simulation at its start."""
+    """Return the context of a loss (masses, box, constants, time step) at the start of a simulation."""
     cell = simulation.cell
     volume = cell.volume if all(simulation.pbc) else 0.0
     parts = (

@@ -5,9 +5,9 @@ mode. When the list expires, the remaining steps of the chunk do nothing, and th
 at the positions that this program has reached. States between chunks are kept, every second one if they are
 too many, and the steps between kept states are run again.
 
-The differentiated program makes its own decisions. Reverse mode needs another forward pass than a run does,
-and a compiler may round it differently; the gradient then belongs to a trajectory that nobody simulated.
-Therefore every step's state and decisions are compared with those of the run.
+The differentiated program makes its own decisions. Reverse mode needs a forward pass of its own, which a
+compiler may round differently; the gradient then belongs to a trajectory that nobody simulated. Therefore
+every step's state and decisions are compared with those of the run.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class RunConstants(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Integer and list data needed to continue the program, which have no derivative, user's order."""
+    """Data without a derivative that are needed to continue the program: integers and the list."""
 
     step: Int[Array, ""]  # the step whose forces come next
     images: Int[Array, "3 atoms"]  # lattice vectors taken off so far
@@ -94,7 +94,7 @@ class Place(NamedTuple):
 
 
 class ChunkRecord(NamedTuple):
-    """Results of a chunk besides its end state."""
+    """Results of a chunk of steps besides its final state."""
 
     place: Place  # where it ended
     rows: Int[Array, ""]  # steps done
@@ -116,7 +116,7 @@ def chunk(
     tables: Tables,
     rule: tuple[int, int, bool],
 ) -> tuple[StepEnds, ChunkRecord]:
-    """Run some steps with one neighbor list; differentiable by the first two arguments.
+    """Run a chunk of steps with one neighbor list; differentiable by the first two arguments.
 
     Args:
         limit: largest number of steps. seen: which of the chunk's steps the loss uses.
@@ -196,19 +196,19 @@ def chunk(
 
 @partial(jax.jit, static_argnames=("rule",))
 def keep(inputs, between, *rest, rule):
-    """Return a chunk's end, its reverse function with all that this function stores, and its record."""
+    """Return the final state of a chunk of steps, its reverse function, and its record."""
     return jax.vjp(lambda *given: chunk(*given, *rest, rule), inputs, between, has_aux=True)
 
 
 @jax.jit
 def pull(back, onto_between: StepEnds, onto_inputs: Inputs) -> tuple[StepEnds, Inputs]:
-    """Apply the reverse function of a chunk to cotangents; those of the inputs are summed."""
+    """Apply the reverse function of a chunk to cotangents; cotangents of the inputs are summed."""
     by_inputs, by_between = back(onto_between)
     return by_between, jax.tree.map(jnp.add, onto_inputs, by_inputs)
 
 
 class Snapshot(NamedTuple):
-    """A state between two chunks; `slots` is the capacity of its list; 0 means chosen from the density."""
+    """A state between two chunks of steps; `slots` is the capacity of its list, 0 if set from the density."""
 
     between: StepEnds
     place: Place
@@ -250,7 +250,7 @@ class ChunkedProgram:
         self.frames = int(looked.sum())
 
     def forward(self, at: Snapshot, rows: int | None = None) -> Snapshot:
-        """Run one chunk of at most `rows` steps, without a derivative."""
+        """Run one chunk of at most `rows` steps without computing a derivative."""
         between, record = chunk(*self._arguments(at, rows), rule=self.rule)
         if not bool(record.finite):
             raise NumericalError(
@@ -260,7 +260,7 @@ class ChunkedProgram:
         return Snapshot(between, record.place, self.list_of(at)[0].slots)
 
     def keep(self, at: Snapshot, rows: int) -> tuple[ChunkRecord, Any]:
-        """Return one chunk's record and its reverse function."""
+        """Return the record and the reverse function of one chunk of steps."""
         _, back, record = keep(*self._arguments(at, rows), rule=self.rule)
         return record, back
 
@@ -277,7 +277,7 @@ class ChunkedProgram:
         return self._used[1]
 
     def cotangents(self, start: StepEnds, inputs: Inputs) -> Cotangents:
-        """Return the derivatives by all inputs, from those by `Inputs` and by the first positions."""
+        """Return the derivatives by all inputs, from the cotangents of `Inputs` and of the start."""
         numbers, x, v = onto_start(self.simulation, self.start.between, start.extra)
         inputs = inputs._replace(numbers=jax.tree.map(jnp.add, inputs.numbers, numbers))
         start = start._replace(x=start.x + x, v=start.v + v)
@@ -366,7 +366,7 @@ Marks = dict[int, tuple[bytes, tuple[int, int]]]
 
 
 def marks(first: int, rows: range, x, v, bits, table: PairTable) -> Iterator[tuple[int, Any]]:
-    """Yield digests of steps with one list; positions, velocities and decisions are in its order."""
+    """Yield digests of the states and decisions of steps with one list, in whose order the arrays are."""
     x, v, bits = (np.asarray(part) for part in (x, v, bits))
     for row in rows:
         state = fingerprint(table.order, x[row], v[row])

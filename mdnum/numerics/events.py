@@ -40,7 +40,7 @@ class Threshold:
         return self.value - quantity
 
     def decide(self, quantity):
-        """Return the decision, in the shape of the quantity; NaN gives no."""
+        """Return the decision, in the shape of the quantity; for NaN the decision is no."""
         return quantity <= self.value if INCLUSIVE[self.comparison] else quantity < self.value
 
 
@@ -49,8 +49,8 @@ class Hysteresis:
     """A decision that turns yes at one threshold and no at another (a Schmitt trigger).
 
     A quantity that fluctuates about one threshold flips its decision each time. With a gap between two
-    thresholds it flips once; choose a gap wider than the noise. The skin of a Verlet list is such a gap: the
-    list is built when the skin is used up, not whenever an atom moves.
+    thresholds the decision flips once; choose a gap wider than the noise. The skin of a Verlet list is such a
+    gap: the list is built when the skin is used up, not whenever an atom moves.
     """
 
     enter: Threshold  # where a no turns yes
@@ -81,7 +81,7 @@ class Hysteresis:
         return _where(before, self.leave.margin(quantity), self.enter.margin(quantity))
 
     def decide(self, quantity, before):
-        """Return the decision, given the previous one."""
+        """Return the decision for a quantity, given the previous decision."""
         return _where(before, self.leave.decide(quantity), self.enter.decide(quantity))
 
 
@@ -104,7 +104,7 @@ class Ledger:
         channel: name of the stream of decisions, for example "pair".
         step: step of each flip.
         subject: labels of what was decided, shape (flips, labels).
-        entered: True where the decision turned yes.
+        entered: whether the decision turned yes.
         margin: signed distance to the threshold at the step of the flip, in the quantity's space.
         bound: rounding bound on the quantity, in the same space.
         jump: change of the conserved quantity (energy) by the flip, signed.

@@ -2,8 +2,8 @@
 
 XLA on a CPU contracts a*b + c into a fused multiply-add, so the same expression has different bits in another
 fusion, another instruction set, or in numpy. A decision must not depend on the compiler: its products are
-protected by fences, and the host reproduces it bit for bit. Any other formula is run operation by operation
-instead: with a rounding after each, with enclosing intervals, or with the same bits on every processor.
+protected by fences, and the host reproduces it bit for bit. Any other formula is run operation by operation:
+with every result rounded, in interval arithmetic, or with the same bits on every processor.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def integer_of(dtype):
 
 
 def zero_bits(dtype) -> jax.Array:
-    """Return an integer zero as wide as dtype; pass it into jit as an argument, so that XLA cannot fold it."""
+    """Return an integer zero as wide as dtype; pass the zero into jit as an argument that XLA cannot fold."""
     return jax.device_put(np.zeros((), integer_of(dtype)))
 
 
@@ -57,7 +57,7 @@ def _fence_jvp(primals, tangents):
 
 
 def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
-    """Return Return dx² + dy² + dz², rounded after every operation: the bits of numpy's `dx*dx + dy*dy + dz*dz`.
+    """Return dx² + dy² + dz², rounded after every operation: the bits of numpy's `dx*dx + dy*dy + dz*dz`.
 
     Error: at most gamma_3 * r² for exact components (Higham 2002, 3.1).
     """
@@ -119,7 +119,7 @@ def stepwise(
 def interpreted(
     program: Any, arguments: Sequence[Any], rule: Rule, enter: Callable[[Any], Any] = _same
 ) -> list[Any]:
-    """Return the results of a program (see `stepwise`), closed or without constants."""
+    """Return the results of a jax program whose operations are computed by a rule (see `stepwise`)."""
     jaxpr, constants = (program.jaxpr, program.consts) if isinstance(program, ClosedJaxpr) else (program, ())
     known = dict(zip(jaxpr.constvars, map(enter, constants), strict=True))
     known.update(zip(jaxpr.invars, map(enter, arguments), strict=True))
@@ -145,7 +145,7 @@ def inlined(equation: Any) -> Any:
 
 
 def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
-    """Return jax's own results for an equation and its inputs.
+    """Return the results that jax itself computes for one equation of a program.
 
     Raises:
         TypeError: the equation contains a program of its own, such as a loop.
@@ -183,8 +183,8 @@ def _is_short(dtype: Any) -> bool:
 def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list[Any]]:
     """Return a float64 function in ball arithmetic: each number is an interval that contains the exact value.
 
-    Constants of the formula are taken as exact doubles. If the condition of a `where` holds for only part of
-    a ball, the result is the union of both values; at most one of them may be the wrong branch.
+    Constants of the formula are taken as exact float64 numbers. If the condition of a `where` holds for only
+    part of a ball, the result is the union of both values; at most one of them may be the wrong branch.
 
     Args:
         function: function of scalars; jax traces it once.
@@ -325,7 +325,7 @@ _SAFE = (
 
 @dataclass
 class _Held:
-    """A number of an interpreted program, with marks: safe to add unfenced, shared by all entries."""
+    """A number of an interpreted program, with flags that decide whether the number needs a fence."""
 
     value: Any
     safe: bool = True

@@ -137,8 +137,9 @@ def matmul(
 ) -> Float[Array, "... m n"]:
     """Emulate a device's matrix product: inputs in one format, products and sums in a wider one.
 
-    "float64": all in float64. "float32": all in float32. "tf32", "bfloat16" and "float16": inputs rounded to
-    the format, exact products, sums in float32. The result has the dtype of a.
+    With "float64" and "float32", everything is in this type. With "tf32", "bfloat16" and "float16", the
+    inputs are rounded to the format, products are exact, and sums are in float32. The result has the dtype of
+    the first matrix.
 
     Error: at most (2u + gamma_k) |a| |b| with the format's u and float32's gamma. The sums use the order of
     the CPU's own product, which differs from that of a device.
@@ -153,10 +154,10 @@ def matmul(
 def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Array, "..."]:
     """Round x up or down to a neighbor in a format, with probabilities that preserve the mean.
 
-    The result has the dtype of x; numbers of the format are unchanged. Unbiased: the expectation is x (for
-    |x| up to the largest number), with a standard deviation of at most half the spacing; so a long sum of
-    small terms does not stagnate. The uniform numbers have 53 bits. The derivative is 1. Source: Croci et
-    al., R. Soc. Open Sci. 9, 211631 (2022).
+    The result has the dtype of x; numbers of the format are unchanged. The expectation of the result is x
+    (for |x| up to the largest number), with a standard deviation of at most half the spacing; so a long sum
+    of small terms does not stagnate. The random numbers have 53 bits. The derivative by x is 1. Source: Croci
+    et al., R. Soc. Open Sci. 9, 211631 (2022).
     """
 
     def up_or_down(places: Array) -> Array:
@@ -174,9 +175,10 @@ def quantize(
     lowest: Float[Array, ""],
     highest: Float[Array, ""],
 ) -> Float[Array, "..."]:
-    """Return the multiple of scale nearest to x, from lowest * scale to highest * scale; all may be traced.
+    """Return the multiple of scale nearest to x, clamped to the range from lowest * scale to highest * scale.
 
-    The derivative is 1 inside, 0 where clamped. Error: at most scale/2 inside, plus one rounding.
+    The derivative is 1 inside the range, and 0 where the value is clamped. Error: at most scale/2 inside the
+    range, plus one rounding.
     """
     return jnp.clip(jnp.rint(x / jnp.broadcast_to(scale, x.shape)), lowest, highest) * scale
 

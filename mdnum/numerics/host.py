@@ -28,7 +28,7 @@ _NAMES = {
 def by_numpy(function: Callable[..., Any], *arguments: np.ndarray) -> list[np.ndarray]:
     """Return the results of a function of arrays; operations without a counterpart here are computed by jax.
 
-    Error: that of numpy's and scipy's functions, some ulp each.
+    Error: a few ulps for each function of numpy and scipy.
     """
     with jax.enable_x64(True), np.errstate(all="ignore"):
         program = jax.make_jaxpr(function)(*arguments)

@@ -82,10 +82,10 @@ class Operation:
 
 
 def first_not_finite(function: Callable[..., Any], *args: Any) -> Operation | None:
-    """Find the operation that makes the result of a function of arrays not finite, without compiling.
+    """Find the operation that makes the result of a function non-finite; the function is not compiled.
 
     Returns:
-        None if every number of the result is finite, or if an argument is not.
+        the operation; None if every number of the result is finite, or if an argument is not.
     """
     leaves, tree = jax.tree.flatten(args)
     if count_bad(leaves):
@@ -121,7 +121,7 @@ def is_inexact(leaf: Any) -> bool:
 
 @dataclass
 class _Interpreter:
-    """Interpreter of one run of a program, operation by operation, to its end."""
+    """Interpreter that runs a program to its end, operation by operation."""
 
     mended: list[int]  # numbers of operations whose results are made finite
     found: Operation | None = None  # the first operation at fault
@@ -129,7 +129,7 @@ class _Interpreter:
     rounds: list[int] = field(default_factory=list)  # of the loops that it is in
 
     def closed(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
-        """Return the results of a program."""
+        """Return the results of a program, which is run operation by operation."""
         return interpreted(program, inputs, self._equation)
 
     def _equation(self, equation: Any, inputs: list[Any]) -> list[Any]:

@@ -56,7 +56,7 @@ def _parts(terms: Float[Array, "n columns"], form: FloatFormat) -> tuple[jax.Arr
 
 
 def _carried(limbs: Int[Array, "limbs columns"]) -> tuple[Int[Array, "columns"], Int[Array, "limbs columns"]]:
-    """Return the carry out of the top (-1 for a negative number), and limbs from 0 to 2^32 - 1."""
+    """Propagate carries; return the final carry (-1 for a negative number) and limbs from 0 to 2^32 - 1."""
 
     def step(carry, limb):
         value = limb + carry
@@ -126,7 +126,7 @@ class Exact(Reduction):
         return jnp.where(special, jnp.sum(flat, axis=0), total).reshape(shape)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """Return the bound u |sum|, where |sum| itself is bounded, because the host adds in float64."""
+        """Return the error bound u |sum|, with a bound for |sum| itself, because the host adds in float64."""
         wide = terms.astype(np.float64)
         total = np.abs(wide.sum(axis=0)) + gamma(len(terms)) * np.abs(wide).sum(axis=0)
         return np.asarray(unit_roundoff(terms.dtype) * total)
@@ -158,7 +158,7 @@ class FixedPoint(Reduction):
         return jnp.where(fits, value, jnp.nan).astype(terms.dtype)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """Return half a unit for each term, plus one rounding of the result."""
+        """Return the error bound: half a unit for each term, plus one rounding of the result."""
         size = np.abs(terms.astype(np.float64)).sum(axis=0)
         return np.asarray(len(terms) * 2.0 ** (-self.bits - 1) + 2 * unit_roundoff(terms.dtype) * size)
 
@@ -167,7 +167,7 @@ class FixedPoint(Reduction):
 
 
 def _numbered(reduction: Callable[[int], Reduction], default: int) -> Callable[..., Reduction]:
-    """Return a constructor of a reduction from the text of its number."""
+    """Return a function that creates a reduction from a number given as text."""
 
     def make(number: str | None = None) -> Reduction:
         try:

@@ -84,14 +84,14 @@ class Reach:
 
     @classmethod
     def of(cls, lattice: Float[np.ndarray, "vectors 3"], coordinate: Float[np.ndarray, "3"]) -> Reach:
-        """Create the reach of a box from arrays."""
+        """Create a `Reach` from arrays of lattice vectors and largest coordinates."""
         return cls(tuple(_three(row) for row in lattice), _three(coordinate))
 
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
-        """Return the summed sizes of the rounded results, beyond that of the displacement, and their number.
+        """Return the summed sizes of rounded results beyond the displacement, and the number of roundings.
 
         After the first subtraction a component is d + n_1 a_1 + n_2 a_2 + n_3 a_3, with each n in {-1, 0, 1};
-        each following subtraction removes one term. The final d is contained in each of these results.
+        each following subtraction removes one term. Each of these results contains the final displacement d.
         """
         sizes, most = np.zeros(3), 1
         for axis in range(3):
@@ -102,7 +102,7 @@ class Reach:
         return sizes, most
 
     def narrowed(self, dtype: DTypeLike) -> Float[np.ndarray, "3"]:
-        """Return the error of lattice vectors stored in dtype, per axis, summed over vectors, length."""
+        """Return the error of lattice vectors stored in dtype, per axis, summed over the vectors, length."""
         lattice = np.array(self.lattice, np.float64).reshape(-1, 3)
         return np.abs(lattice.astype(dtype).astype(np.float64) - lattice).sum(axis=0)
 

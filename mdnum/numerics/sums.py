@@ -61,7 +61,7 @@ def _data_zero(terms: jax.Array) -> jax.Array:
 
 
 class Reduction:
-    """Order of a sum, over slots that arrive in blocks or over the leading axis of an array.
+    """Order of the additions in a sum over slots that arrive in blocks, or over an array's leading axis.
 
     A subclass defines the sum of a whole array; its blocks are stacked and summed at the end.
     """
@@ -153,7 +153,7 @@ class Sequential(Serial):
         return in_order(terms[::-1] if self.order == "reversed" else terms, add)
 
     def places(self, terms: np.ndarray) -> list[int]:
-        """Return the indices in ascending or, if reversed, descending order."""
+        """Return the indices of the terms in ascending order, or in descending order if reversed."""
         return list(range(len(terms)))[:: -1 if self.order == "reversed" else 1]
 
 
@@ -202,7 +202,7 @@ class Blocked(Reduction):
         return _levels(terms, add, self.width)
 
     def depth(self, n: int) -> int:
-        """Return (width - 1) additions times the number of levels."""
+        """Return the number of additions: (width - 1) times the number of levels."""
         levels = 0
         while n > 1:
             n, levels = -(-n // self.width), levels + 1
@@ -235,7 +235,7 @@ class Permuted(Serial):
         return in_order(terms[np.array(self.places(terms))], add)
 
     def places(self, terms: Any) -> list[int]:
-        """Draw the order for this number of terms."""
+        """Draw a random order for this number of terms."""
         return np.random.default_rng(self.seed).permutation(len(terms)).tolist()
 
 
@@ -261,7 +261,7 @@ class Halves(Reduction):
 
 @dataclass(frozen=True)
 class Twice(Reduction):
-    """A sum of every term twice, halved: a loop, and the same loop again starting from its result.
+    """A sum of all halved terms, taken twice: a loop, and the same loop again from its result.
 
     A scatter onto the sums of a dense list gives this order, if each pair is stored from both ends. Error: at
     most gamma_{2n} * sum |terms|, if no half of a term is subnormal.
@@ -273,13 +273,13 @@ class Twice(Reduction):
         return in_order(halves, add, in_order(halves, add))
 
     def depth(self, n: int) -> int:
-        """Count the additions of both loops."""
+        """Count the additions of a term in both loops."""
         return max(2 * n - 1, 0)
 
 
 @dataclass(frozen=True)
 class Sorted(Serial):
-    """A loop over the terms by magnitude; equal magnitudes by sign, so the order of arrival does not matter.
+    """A loop over terms sorted by magnitude, then by sign, so that the order of arrival does not matter.
 
     The smallest term first loses least if all terms have one sign (Higham 2002, 4.2), the largest first if
     terms cancel.
@@ -293,7 +293,7 @@ class Sorted(Serial):
         return in_order(terms if self.order == "ascending" else terms[::-1], add)
 
     def places(self, terms: np.ndarray) -> list[int]:
-        """Return the indices sorted by magnitude."""
+        """Return the indices of the terms sorted by magnitude."""
         wide = terms.astype(np.float64)
         order = np.lexsort((wide, np.abs(wide))).tolist()
         return order if self.order == "ascending" else order[::-1]
@@ -309,7 +309,7 @@ def _start(terms: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 class _Compensated(Reduction):
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """Return (2u + 8(n u)²) * sum |terms|: independent of n until n is near 1/u (Higham 2002, 4.3)."""
+        """Return the error bound (2u + 8(n u)²) * sum |terms|, for n well below 1/u (Higham 2002, 4.3)."""
         u, n = unit_roundoff(terms.dtype), len(terms)
         factor = 2 * u + 8 * (n * u) ** 2 if n * u < 0.1 else np.inf
         return np.asarray(factor * np.abs(terms.astype(np.float64)).sum(axis=0))
@@ -324,7 +324,7 @@ class Kahan(_Compensated):
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Sum with four additions per term."""
+        """Sum the terms with four additions for each term."""
 
         def step(carry, term):
             total, lost = carry
@@ -344,7 +344,7 @@ class Neumaier(_Compensated):
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Sum with four additions per term and one at the end."""
+        """Sum the terms with four additions for each term, and one addition at the end."""
 
         def step(carry, term):
             total, lost = carry
@@ -404,7 +404,7 @@ class RunningSum:
     columns = ("term", "addend", "running sum", "exact sum", "bits lost")
 
     def table(self) -> tuple[tuple[Any, ...], ...]:
-        """Return plain rows under `columns`, with floats as the shortest decimals that give the same float64."""
+        """Return plain rows under `columns`, with exact sums rounded to float64."""
         return tuple(
             (row.term, row.addend, row.running, float(row.exact), row.bits_lost) for row in self.rows
         )

@@ -1,12 +1,13 @@
 """Two runs that differ in one choice: when and how fast they diverge, and whether flips are the cause.
 
 The verdict compares two separations from the first run: that of the second run, and that of the second run's
-arithmetic under the first run's decisions. Only the latter shows whether the flips are the cause. If it
-splits as well, repeats of the pair decide whether the flips accelerated the split or are bystanders, by a
-sequential sign test: if at most half of such pairs are delayed by more than a given delay, the probability of
-k or more delayed pairs among n is at most that of k heads or more in n tosses, whatever the distribution of
-the delays. "Such pairs" have the same displacement of their starts. At another displacement the majority may
-differ; the verdict is then left open. docs/verdict-calibration.md has the error rates.
+arithmetic under the first run's decisions. Only the latter separation shows whether the flips are the cause.
+If the latter run also splits, repeats of the pair decide whether the flips accelerated the split or are
+bystanders, by a sequential sign test: if at most half of such pairs are delayed by more than a given delay,
+the probability that k or more of n pairs are delayed is at most that of k or more heads in n tosses, whatever
+the distribution of the delays. All these pairs have the same displacement of their starts. At another
+displacement the majority may differ; the verdict is then left open. docs/verdict-calibration.md has the error
+rates.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Delay:
 
     @classmethod
     def of(cls, free: Float[np.ndarray, "steps"], imposed: Float[np.ndarray, "steps"], tolerance: float):
-        """Create the delay from separations at each step, length; NaN after a run ended."""
+        """Create a `Delay` from separations at each step, length; NaN after a run ended."""
         splits = (split_of(run, tolerance) for run in (free, imposed))
         return cls(*splits, free_until=_last_seen(free), imposed_until=_last_seen(imposed))
 
@@ -62,8 +63,9 @@ class Delay:
 def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
     """Return the stages of the sign test: at each, the number of pairs and the number that must agree.
 
-    The error is spent in proportion to the pairs (Lan and DeMets, Biometrika 70, 659, 1983): up to each stage
-    the exact probability that fair coins have stopped on one given side is at most that share of the error.
+    The error probability is spent in proportion to the pairs (Lan and DeMets, Biometrika 70, 659, 1983): up
+    to each stage the exact probability that fair coins have stopped on one given side is at most the
+    corresponding share of the error.
 
     Args:
         pairs: largest number of pairs.
@@ -106,7 +108,7 @@ class Count:
 
     @property
     def needed(self) -> tuple[int, int] | None:
-        """The current or next stage of the test: pairs, and how many must agree; None if there is none."""
+        """The current or next stage of the test: number of pairs, and how many must agree; None if none."""
         return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
 
     @property
@@ -126,7 +128,7 @@ class Count:
 
     @property
     def wanted_for_majority(self) -> int:
-        """Pairs that would settle the majority if all agreed; 0 if it is known or cannot be settled."""
+        """Number of pairs that would settle the majority if all agreed; 0 if needless or impossible."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -134,14 +136,14 @@ class Count:
 
     @property
     def wanted(self) -> int:
-        """Pairs to run before the next stage of the test; 0 if there is none or the result is clear."""
+        """Number of pairs to run before the next stage; 0 if there is none or the result is clear."""
         if self.delayed is not None:
             return 0
         return next((end - self.pairs for end, _ in looks(self.most) if end > self.pairs), 0)
 
 
 def count(delays: tuple[Delay, ...], steps: float, most: int) -> Count:
-    """Count the pairs that split later without the flips by more than a number of steps.
+    """Count the pairs whose split comes more than a given number of steps later without the flips.
 
     Args:
         delays: of the pair itself and its repeats.
@@ -213,8 +215,8 @@ class Growth:
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
     """Return a logarithm's growth per row, its standard error, and whether it exceeds that of linear growth.
 
-    The estimate uses blocks of the later rows. The result is NaN, NaN, False if there are too few rows or if
-    they are not finite.
+    The rate and its error are estimated from blocks of the later rows. The result is NaN, NaN, False if there
+    are too few rows or if they are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
@@ -276,7 +278,7 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 def expected(
     separation: Float[np.ndarray, "steps"], tolerance: float, exponent: float | None = None
 ) -> float | None:
-    """Predict how many steps after the last one runs that have not split will split; None if unpredictable.
+    """Predict the number of further steps until two runs split; None if there is no basis for a prediction.
 
     The growth of the separation has predictive value only if it outlasts the first steps: its later half must
     be several e-foldings, at a rate within a factor of 2 of the whole.
@@ -331,7 +333,7 @@ class ForkVerdict:
 
     @property
     def wanted(self) -> int:
-        """Further repeats to run before the next stage, of `other` if present; 0 if none are needed."""
+        """Number of repeats to run before the next stage, of `other` if present; 0 if none are needed."""
         if self.other is not None:
             return self.other.wanted_for_majority
         return self.count.wanted if self.count is not None else 0
@@ -399,7 +401,7 @@ def _counted(
 ) -> ForkVerdict:
     """Return the verdict if the runs also split under the first run's decisions, by counting later splits.
 
-    The count at the other displacement can only withdraw a verdict, so that it spends no error.
+    The count at the other displacement can only withdraw a verdict, so it uses up no error probability.
     """
     pair = delays[0][0]
     threshold = 0.0 if rate is None else E_FOLDINGS / rate
@@ -542,7 +544,7 @@ def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -
 
 
 def shares(cells: tuple[SplitCell, ...], rate: float) -> tuple[Share, ...]:
-    """Return the contributions of the decisions and of the arithmetic, relative to A and to B.
+    """Return how much the decisions and the arithmetic contribute to a split, relative to runs A and B.
 
     Args:
         cells: of `table`.

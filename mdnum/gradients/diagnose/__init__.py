@@ -1,8 +1,8 @@
-"""Diagnosis of a gradient through a rollout: whether and how far it can be trusted, and its contributions.
+"""Diagnosis of a gradient through a rollout: how far it can be trusted, and what contributes to it.
 
 Methods answer different questions: the derivative of the steps that ran, the derivative of the flow including
 the times of its flips, the slope of the loss between shifted runs, the slope of an average, the derivative of
-another program. Two derivatives that differ need not contradict one another: the agreement names the reason.
+another program. Two derivatives that differ need not contradict one another: `agreement` names the reason.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class GradientDifference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Comparison of all methods that apply, at one horizon."""
+    """Comparison of all applicable gradient methods, for a run of one length."""
 
     horizon: int  # steps
     reference: str  # name of the method that the others are compared with
@@ -143,7 +143,7 @@ def agreement(
 
 
 def _asked(method: Method, problem: Problem, names: Sequence[str], progress: Progress | None) -> Opinion:
-    """Compute the gradient of one method, by all parameters or by those that the method supports."""
+    """Compute the gradient by one method, for all parameters or for those that the method supports."""
     began = time.perf_counter()
 
     def report(done: int, steps: int, phase: str) -> None:
@@ -163,7 +163,7 @@ def _asked(method: Method, problem: Problem, names: Sequence[str], progress: Pro
 def compare(
     name: str, one: Gradient, reference: Gradient, unit: float, growth: float, *, jumps: bool
 ) -> GradientDifference:
-    """Compare two derivatives by one parameter, which both gradients contain.
+    """Compare the derivatives by one parameter in two gradients.
 
     Args:
         unit: unit roundoff of the run's state or forces, whichever is coarser.
@@ -188,7 +188,7 @@ def _meaning(
     name: str, one: Gradient, reference: Gradient, size: float, relative: float, rounding: float,
     grown: float, jumps: bool,
 ) -> tuple[str, dict[str, float] | None]:  # fmt: skip
-    """Return the reason for a difference and the numbers that support it; None: what rounding explains."""
+    """Return why two derivatives differ, and the supporting numbers; None stands for the rounding bound."""
     kinds = {one.kind: one, reference.kind: reference}
     if not np.isfinite(relative):
         return "unexplained", {}
@@ -222,7 +222,7 @@ def _meaning(
 
 @result
 class GradientDiagnosis:
-    """Whether a gradient can be trusted, and how far. A part that was not requested is None.
+    """Whether a gradient can be trusted, and how far. Parts that were not requested are None.
 
     Attributes:
         horizon: steps. names: full names of the parameters. value: the loss.
@@ -361,7 +361,7 @@ def diagnose(
 
 
 def _methods(asked: Sequence[str | Method] | None) -> list[Method]:
-    """Return the methods as objects; all methods if none were given."""
+    """Return the given gradient methods as objects; all methods if none were given."""
     return [by_name(one) if isinstance(one, str) else one for one in (METHODS if asked is None else asked)]
 
 

@@ -1,9 +1,10 @@
 """Search for the first operation of a reverse pass that is not finite although its run is finite.
 
 A force can be finite while its derivative is not, a loss can have a square root at zero, a sum can overflow
-its format in the reverse pass. The pass is repeated up to the step where this happens, and that step is run
-operation by operation. An operation is at fault if its inputs are finite and its result is not, and if
-repairing it repairs the program's result: a number that is masked away later does no harm.
+its format in the reverse pass. The reverse pass is repeated up to the step at which a number stops being
+finite, and this step is run operation by operation. An operation is at fault if its inputs are finite and its
+result is not, and if repairing it repairs the program's result: a number that is masked away later does no
+harm.
 """
 
 from __future__ import annotations
@@ -122,7 +123,7 @@ def _in_forward(tape: RunTape) -> NotFinite:
 
 
 def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFinite:
-    """Run the step of a row operation by operation."""
+    """Run the reverse pass of one step, operation by operation, and find the operation at fault."""
     whole = back.arguments(stretch)
     loss, origin, *rest = whole[8]
     # the energy of the frame of step 0 is not known there, and nothing that is finite has used it
@@ -140,7 +141,7 @@ def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFi
 
 
 def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
-    """Return the arguments of a reverse pass over some of the rows."""
+    """Return the arguments of a reverse pass over a range of rows."""
     out = list(arguments)
     for k in (4, 5, 7):
         out[k] = jax.tree.map(lambda leaf: leaf[first:end], out[k])
@@ -154,7 +155,7 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 def _pair(
     back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
-    """Return labels and distance of the pair that an operation's entry belongs to; -1, -1, NaN if none."""
+    """Return labels and distance of the pair to which an operation's result belongs; -1, -1, NaN if none."""
     nowhere = (-1, -1, float("nan"))
     if made is None or not made.index:
         return nowhere

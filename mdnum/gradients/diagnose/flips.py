@@ -1,9 +1,9 @@
 """Contribution of each flip to a gradient, and the gradient's jump at the nearest boundaries of decisions.
 
 The contribution of a crossing is the derivative of the loss by its own cutoff, times the distance by which
-the cutoff moves ahead of the pair. The first factor is a weight of the reverse pass, which includes all later
-flips; the second comes from tangents that include no earlier flip. So the contributions of all flips sum
-exactly to the total contribution of flips.
+the cutoff moves ahead of the pair. The first factor, from a reverse pass, includes all later flips; the
+second factor, from tangents, includes no earlier flip. So the contributions of all flips sum exactly to the
+total contribution of flips.
 
 Between two boundaries every run makes the same decisions, and loss and gradient are smooth functions of the
 parameter. At a boundary the decision on one pair differs between two adjacent floats: a longer step of an
@@ -42,7 +42,7 @@ _FIRST, _FACTOR = 1e-12, 8.0
 class FlipTerms:
     """Contribution of each flip to the gradient, largest first.
 
-    A number is a scalar parameter, or an entry of an array parameter: "potential.sigma[1]".
+    Here a number is a scalar parameter, or one entry of an array parameter such as "potential.sigma[1]".
     """
 
     # a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the decision,
@@ -68,7 +68,7 @@ def flips(
     made: ReversePass | None = None,
     progress: Progress | None = None,
 ) -> FlipTerms:
-    """Compute the contributions of all flips, largest first.
+    """Compute the contributions of all flips to a gradient, largest first.
 
     Args:
         problem: of a pair potential. names: parameters, full or short names.
@@ -134,7 +134,7 @@ def flips(
 
 @dataclass(frozen=True)
 class DecisionEdge:
-    """The nearest boundary of decisions on one side of a parameter, and the gradient across it."""
+    """The nearest decision boundary on one side of a parameter, and the gradient on both sides of it."""
 
     side: str  # "below" or "above"
     runs: int  # that the search took
@@ -159,7 +159,7 @@ class DecisionEdge:
 
 @dataclass(frozen=True)
 class DecisionEdges:
-    """The nearest boundaries of decisions below and above the value of one parameter."""
+    """The nearest decision boundaries below and above the value of one parameter."""
 
     name: str
     value: float
@@ -170,7 +170,7 @@ class DecisionEdges:
 def edges(
     problem: Problem, name: str, *, reach: float = REACH, progress: Progress | None = None
 ) -> DecisionEdges:
-    """Find the nearest boundaries below and above a parameter, and compute the gradients across them.
+    """Find the nearest decision boundaries below and above a parameter, and the gradients on both sides.
 
     Tangents predict where a pair first crosses differently; then runs on either side are compared, until two
     adjacent floats differ.
@@ -211,7 +211,7 @@ def edges(
 
 
 def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[int, float]:
-    """Predict the parameter shifts, by sign, at which the first pair crosses; infinite if none does."""
+    """Predict the smallest positive and negative parameter shifts at which a pair crosses; else infinity."""
     if name == "box.scale":
         # the images move too, which these differences of positions leave out
         return {-1: np.inf, 1: np.inf}
@@ -285,7 +285,7 @@ def _edge(
 
 
 def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:
-    """Return the loss of another simulation and its derivatives by one parameter, by method."""
+    """Return the loss of another simulation, and its derivatives by one parameter for each method."""
     there = Problem(simulation, problem.loss, problem.steps)
     tape = tape_of(there, True)
     found = {

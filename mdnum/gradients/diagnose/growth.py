@@ -5,9 +5,9 @@ one reverse pass over T steps holds a gradient for every horizon up to T, each w
 same trajectory. Cotangents of a chaotic run span many powers of two: one loss scale helps if they are small
 everywhere, but not if they span more powers than the narrow format.
 
-The largest singular values of a run's Jacobian bound every gradient of a loss of the last state. They come
-from subspace iteration with a random block (Halko, Martinsson and Tropp 2011), orthonormalized after every
-stretch, so that lengths do not overflow and the vectors do not become parallel.
+The largest singular values of a run's Jacobian bound every gradient of a loss of the last state. The singular
+values come from subspace iteration with a random block (Halko, Martinsson and Tropp 2011), orthonormalized
+after every stretch, so that lengths do not overflow and the vectors do not become parallel.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class GrowthWatch:
         self._scalars = [name for name in self.names if not name.startswith("initial.")]
 
     def __call__(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Process one stretch of the reverse pass."""
+        """Process one stretch of steps of the reverse pass."""
         rows, first = stretch.rows, stretch.first
         onto_x, onto_v = (np.asarray(part, np.float64)[:rows] for part in (trace.x, trace.v))
         v = stretch.v[:rows].astype(np.float64)
@@ -107,8 +107,9 @@ class GrowthWatch:
                 self.gradient[name][first + row] = value
 
     def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> GradientGrowth:
-        """Return the growth. The last row is the gradient of the whole run, because a loss may compare with
-        the start, and this comparison is not in the cotangents carried from step to step.
+        """Return the growth. The last row of the growth table is the gradient of the whole run, because a
+        loss may compare with the start, and this comparison is not in the cotangents carried from step to
+        step.
         """
         units = self.simulation.units
         timestep = float(self.simulation.integrator.timestep)
@@ -139,7 +140,7 @@ class GrowthWatch:
 
 
 def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
-    """Return one of WORDS; a run is bounded if its rms speeds stay within a factor of the median."""
+    """Return an entry of WORDS; a run is bounded if its rms speed stays within a factor of the median."""
     usual = float(np.median(speed))
     if usual > 0 and not (np.isfinite(speed).all() and speed.max() <= _WILD * usual):
         return WORDS[2]
@@ -152,10 +153,10 @@ def growth(
     """Compute the gradient for every horizon, from one reverse pass.
 
     Raises:
-        InputError: a parameter does not exist, or flips are not of a pair potential.
+        InputError: a parameter does not exist, or flips were requested without a pair potential.
         NumericalError: the run blew up.
 
-    Error: that of the reverse pass; horizons below T belong to later starts of the same run.
+    Error: the error of the reverse pass; horizons below T belong to later starts of the same run.
     """
     names = parameters.resolve(problem.simulation, names)
     watch = GrowthWatch(problem.simulation, names, problem.steps)
@@ -194,7 +195,7 @@ class ScalingWatch:
         self.exponents = np.zeros((steps + 1, _HIGHEST - _LOWEST + 1), np.int32)
 
     def __call__(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Process one stretch of the reverse pass."""
+        """Process one stretch of steps of the reverse pass."""
         for row in range(stretch.rows):
             both = (np.asarray(part[row], np.float64).ravel() for part in (trace.x, trace.v))
             self.put(stretch.first + row, np.concatenate(list(both)))
@@ -217,7 +218,7 @@ class ScalingWatch:
             table["largest"][step] = np.inf
 
     def result(self) -> Scaling:
-        """Return the counts, with and without the best scale; exact except for numbers at a power of two."""
+        """Return the counts without and with the best scale; exact except for numbers at a power of two."""
         form = self.format
         largest = float(self.table["largest"].max())
         there = self.exponents.sum(axis=1, dtype=np.int64)
@@ -271,7 +272,7 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class TangentImage:
-    """Image of a block of orthonormal vectors: basis @ exp(log_scale) mixing."""
+    """Image of a block of orthonormal vectors, stored as basis @ mixing * exp(log_scale)."""
 
     basis: Float[np.ndarray, "coordinates vectors"]  # orthonormal, shape (coordinates, vectors)
     mixing: Float[np.ndarray, "vectors vectors"]  # upper triangular, of size one, shape (vectors, vectors)
@@ -450,7 +451,7 @@ def spectrum(
 
 
 def _defect(start, there: TangentImage, back: TangentImage) -> float:
-    """Return the relative defect of Q' (Phi q) = (Phi' Q)' q."""
+    """Return the relative error of the identity Q' (Phi q) = (Phi' Q)' q."""
     forward = there.mixing
     factor = np.exp(np.clip(back.log_scale - there.log_scale, -600, 600))
     backward = factor * (back.basis @ back.mixing).T @ start
@@ -458,7 +459,7 @@ def _defect(start, there: TangentImage, back: TangentImage) -> float:
 
 
 def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the logarithms of the singular values on the block, and both sets of vectors in its bases."""
+    """Return the logarithms of the singular values of a map on a block, and both sets of vectors."""
     diagonal = image.stretches[-1]
     if diagonal.max() - diagonal.min() > _RANGE:
         # rounding has eaten the small ones in the product; the block is aligned, so its diagonal has them

@@ -1,9 +1,10 @@
 """Pairs that turn around near their cutoff: contributions of flips that almost happened.
 
-A pair that turns back just outside its cutoff leaves no flip; had it come a little further, it would have
-entered and left at a radial speed near zero, and both crossings would have contributed terms proportional to
-one over this speed. So every turning point within reach of the cutoff counts, on either side of the cutoff
-and also between two steps: pairs beyond the cutoff have their term in the gradient, and could lose it.
+A pair that turns back just outside its cutoff leaves no flip. If the pair had come a little closer, it would
+have entered and left at a radial speed near zero, and both crossings would have contributed terms
+proportional to one over this speed. So every turning point within reach of the cutoff counts, on either side
+of the cutoff and also between two steps: pairs that pass the cutoff contribute to the gradient, and this
+contribution could vanish.
 
 Near the turning point r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth d crosses it
 twice with the speed sqrt(2 a d), and the two crossings contribute 2 w / sqrt(2 a d), where w is the
@@ -81,7 +82,7 @@ class Turns:
 
     @property
     def reach(self) -> Float[np.ndarray, "turns"]:
-        """Range of uncertainty of the distance, from its own shift and those of adjacent turning points."""
+        """Uncertainty of the distance at a turning point, from its own shift and those of adjacent points."""
         if not len(self):
             return np.zeros(0)
         shift = self.table["shift"]
@@ -93,13 +94,14 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """Whether each pair may be on the other side of its cutoff, or is there without a recorded flip."""
+        """Whether each pair may lie on the other side of its cutoff, or does so without a recorded flip."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """Magnitude of the contribution of the two crossings. Within reach, the depth is taken as 1 % of the
-        reach (one crossing in a hundred is shallower); out of reach, run and shorter steps are subtracted.
+        """Magnitude of the contribution of the two crossings at each turning point. Within reach of the
+        cutoff, the pair is assumed to pass it by 1 % of the reach; beyond, the value is the change with
+        shorter steps.
         """
         bend, reach = self.table["bend"], self.reach
 
@@ -116,7 +118,7 @@ class Turns:
     def heaviest(
         self, words: tuple[str, ...], named: Callable[[Any], dict[str, Any]], most: int = 10
     ) -> list[dict[str, Any]]:
-        """Return turning points with a contribution as plain rows, largest first, with terms by number.
+        """Return the turning points with the largest contributions as plain rows, with terms by parameter.
 
         Args:
             named: returns further columns for a kind of decision.
@@ -137,7 +139,7 @@ class Turns:
 
 @dataclass
 class Near:
-    """Collector of turning points during a reverse pass, tangents and other runs."""
+    """Collector of turning points during a reverse pass, a tangent pass, and other runs."""
 
     simulation: Simulation
     pace: Pace  # how often the loss looks
@@ -149,11 +151,11 @@ class Near:
 
     @property
     def jumps(self) -> bool:
-        """Whether a crossing contributes at all: the force or the energy of a pair jumps."""
+        """Whether a crossing contributes to the gradient, because the force or the energy of a pair jumps."""
         return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
 
     def reverse(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Process one stretch of the event-aware reverse pass, last first: turning points and weights."""
+        """Collect turning points and weights from a stretch of the event-aware reverse pass, last first."""
         if not self.jumps:
             return
         simulation = self.simulation
@@ -179,7 +181,7 @@ class Near:
         found["weight"] = force * along + seen
 
     def tangents(self, part: StretchTangents) -> None:
-        """Process one stretch of the tangents: how far each distance moves."""
+        """Compute from a stretch of tangents how far the distance at each turning point moves."""
         simulation, stretch = self.simulation, part.stretch
         if part.dr is not None and part.dr_cut is not None:
             self.moved.append(part.dr_cut - part.dr)
@@ -203,7 +205,7 @@ class Near:
         found["moved"] = np.asarray(along.r_cut).T[found["kind"]] - dr
 
     def compared(self, stretch: TapeStretch, per: int) -> None:
-        """Process one stretch of another run, which makes `per` steps for one step of this run."""
+        """Process one stretch of another run, which takes `per` steps for each step of this run."""
         cell, place = HostCell(self.simulation.cell), stretch.table.place
         for found in self._found.values():
             for earlier, name in ((1, "before"), (0, "after")):
@@ -245,7 +247,7 @@ def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, 
 def hermite(
     r0: np.ndarray, s0: np.ndarray, r1: np.ndarray, s1: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find where the cubic through two distances with their rates turns, between rates of unlike signs.
+    """Find the extremum of the cubic through two distances and their rates, which have opposite signs.
 
     Args:
         r0, s0, r1, s1: distance and its rate at the two ends. time: between the ends.
@@ -266,7 +268,7 @@ def hermite(
 
 
 def turning(simulation: Simulation, stretch: TapeStretch) -> dict[str, np.ndarray]:
-    """Find the turning points of pairs near their cutoff within a stretch, from distances and their rates.
+    """Find turning points of pairs near their cutoff in a stretch of steps, from distances and their rates.
 
     Returns:
         the table of `Turns`, with weights and shifts still 0, and without the column `moved`.

@@ -88,11 +88,11 @@ class Shorter(Loss):
         return jax.tree.map(spread, seen)
 
     def value(self, total, frames):
-        """Return the loss of the longest horizon."""
+        """Return the loss of the run with the longest horizon."""
         return self.of(total, self.table.shape[1] - 1)
 
     def of(self, total: Any, k: int) -> Float[Array, ""]:
-        """Return the loss of one horizon."""
+        """Return the loss of the run that ends at horizon number k."""
         frames = int(np.asarray(self.table)[:, k].sum())
         return self.inner.value(jax.tree.map(lambda leaf: leaf[k], total), frames)
 
@@ -124,7 +124,7 @@ class Horizons:
     flips: Int[np.ndarray, "flips 4"]  # step, pair and whether it entered, of each flip of the run, in order
 
     def by_name(self) -> dict[str, Float[np.ndarray, "points entries"]]:
-        """Return the gradient by parameter."""
+        """Return the gradient at every horizon, by parameter."""
         names = [column.name for column in self.columns]
         return {
             name: self.gradient[:, [k for k, one in enumerate(names) if one == name]]
@@ -133,7 +133,7 @@ class Horizons:
 
 
 def spread(problem: Problem, points: int) -> Int[np.ndarray, "points"]:
-    """Return evenly spread horizons at which the loss of a run of this length uses a frame; T is the last."""
+    """Return evenly spaced horizons, up to the whole run, at which the loss uses at least one frame."""
     steps = np.unique(np.round(np.linspace(0, problem.steps, points + 1)).astype(np.int64))[1:]
 
     def looks(h: int) -> bool:
@@ -232,7 +232,7 @@ class Judgment:
 
 @dataclass(frozen=True)
 class Trust(Judgment):
-    """How far a gradient can be trusted; the verdict of this object covers all parameters together."""
+    """How far a gradient can be trusted; the overall verdict covers all parameters together."""
 
     by: dict[str, Judgment]  # of each parameter, by full name
     tolerance: float  # relative difference above which two precisions, or two time steps, disagree
@@ -248,9 +248,9 @@ class Trust(Judgment):
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
     """Return a comparison run, and the formats of the given run that are narrower than float64.
 
-    If any role of a number is narrower, the comparison run uses float64 for all roles. No hardware format is
-    wider than float64: such a run is compared with one whose start is shifted by one rounding, which shows
-    the contribution of rounding to its gradient, up to a factor of order one.
+    If any role has a format narrower than float64, the comparison run uses float64 for all roles. No hardware
+    format is wider than float64: a float64 run is compared with a run whose start is shifted by one rounding,
+    which shows the effect of rounding on the gradient, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -355,7 +355,7 @@ def trust(
     moved, ambiguous, chaotic = near and near.moved, ambiguity(problem), grew(growth)
 
     def judged(*chosen: str) -> Judgment:
-        """Judge the derivatives by these parameters; a term may matter for one and not for another."""
+        """Return the verdict on the derivatives by some parameters."""
         apart, halved, scattered = (
             {name: one[name] for name in chosen if name in one} for one in (differing, steps, scatter)
         )
@@ -396,14 +396,14 @@ def grew(growth: GradientGrowth) -> bool:
 
 
 def no_half_step(simulation: Simulation) -> bool:
-    """Return whether half the time step is no comparison, because the noise of a thermostat would differ."""
+    """Return whether a run at half the time step would have different noise, because of a thermostat."""
     return simulation.integrator.random is not None
 
 
 def verdict_of(
     limits: Sequence[Limit], steps: int, chaotic: bool, skipped: bool
 ) -> tuple[str, int, str, tuple[str, ...]]:
-    """Return the verdict, the horizon up to which no limit was met, the first limit, and unknowns."""
+    """Return the verdict, the horizon up to which no limit was met, the limit met first, and unknowns."""
     examined = [one for one in limits if one.horizon is not None]
     horizon = min((one.horizon or 0 for one in examined), default=0)
     met = [one.what for one in examined if one.reached and one.horizon == horizon]
@@ -418,7 +418,7 @@ def verdict_of(
 
 
 def _unseen(part: StretchTangents) -> None:
-    """Ignore the tangents of a stretch."""
+    """Ignore the tangents of a stretch of steps."""
 
 
 def _digits(*relative: float) -> int:
@@ -440,7 +440,7 @@ def _missed(
     problem: Problem, own: Horizons, turns: Turns | None, unseen, made: ReversePass, moved, tolerance: float,
     saltation: bool, names: Sequence[str],
 ) -> Limit:  # fmt: skip
-    """Find where omitted terms or turning points near the cutoff matter for these derivatives."""
+    """Find the step from which omitted terms or near misses of the cutoff matter for the derivatives."""
     if not np.any(np.asarray(problem.simulation.jumps())):
         return Limit(NEAR, problem.steps, False, "no jump")
     if not saltation:
@@ -486,7 +486,7 @@ def _left_out(
     made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
     tolerance: float,
 ) -> Limit | None:  # fmt: skip
-    """Return a limit if jumps of a loss of single frames, at their mean rate, or grazing flips matter."""
+    """Return a limit if grazing flips, or jumps of a loss of single frames, contribute too much."""
     tape, met = made.tape, made.crossings[::-1]
     energy, virial, speed, weight, slow = (
         joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")
@@ -504,7 +504,7 @@ def _left_out(
 
 
 def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]:
-    """Return the norm of the difference over the larger norm, by parameter and horizon; 0 if both are 0."""
+    """Return the norm of the difference of two gradients over the larger norm, by parameter and horizon."""
     out = {}
     second = b.by_name()
     for name, first in a.by_name().items():
@@ -515,7 +515,7 @@ def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]
 
 
 def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "points"]]:
-    """Return the standard error over the size of the mean, by parameter and horizon."""
+    """Return the standard error divided by the size of the mean, by parameter and horizon."""
     out = {}
     for name in made[0].by_name():
         each = np.stack([one.by_name()[name] for one in made])
@@ -530,8 +530,8 @@ def last_below(
 ) -> tuple[int, bool]:
     """Return the longest horizon before values exceed a limit for good, and whether they do.
 
-    A single point beyond the limit does not count: a gradient that changes sign is small there, so that any
-    error is large in comparison.
+    A single point beyond the limit does not count: a gradient that changes sign is small near its zero, where
+    any error is relatively large.
     """
     beyond = ~(np.max(np.stack(list(values.values())), axis=0) <= limit)
     lasting = beyond & np.append(beyond[1:], True)
@@ -546,8 +546,9 @@ def last_agreeing(
 ) -> tuple[int, bool]:
     """Return the longest horizon at which no value exceeds a limit, and whether it is short of the last one.
 
-    Shorter horizons do not matter: the error of a time step does not only grow, and the contribution of few
-    flips is coarse if there is little else. A single horizon among others beyond the limit agrees by chance.
+    Disagreement at shorter horizons is ignored: the error of a time step may shrink again, and the
+    contribution of few flips is coarse if there is little else. Agreement at a single horizon, among others
+    beyond the limit, is taken as chance.
     """
     within = np.max(np.stack(list(values.values())), axis=0) <= limit
     if len(within) > 1:
