@@ -1,9 +1,10 @@
 """Derivatives of averages over states, from one run that is not differentiated.
 
-An average over states does not depend on the time order of the frames. Its derivative by a parameter has up
-to three contributions. The term of each frame changes at fixed positions. Pairs cross the cutoff: a term that
-jumps when a pair enters changes with the radius by the jump times the density of pairs at the cutoff, which
-derivatives at fixed decisions miss. Under a thermostat, the weight exp(-U/kT) of each frame changes.
+An average over states does not depend on the time order of the frames. The derivative of an average by a
+parameter has up to three contributions. The term of each frame changes at fixed positions. Pairs cross the
+cutoff: a term that jumps when a pair enters changes with the radius by the jump times the density of pairs at
+the cutoff, which derivatives at fixed decisions miss. Under a thermostat, the weight exp(-U/kT) of each frame
+changes.
 """
 
 from __future__ import annotations

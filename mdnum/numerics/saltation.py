@@ -1,8 +1,8 @@
 """Saltation: the effect of an event on a perturbation that is carried through it.
 
 A perturbed trajectory reaches a threshold at a different time, and between the two times only one of the
-trajectories follows the new law. To first order this changes the tangent by a rank-one term, which is absent
-from derivatives of a program's steps, because the steps do not move with the event.
+trajectories follows the new law. To first order, the difference changes the tangent by a rank-one term, which
+is absent from derivatives of a program's steps, because the steps do not move with the event.
 
 The functions take numpy and jax arrays, with any number of leading batch axes, and work inside jit.
 """

@@ -94,7 +94,7 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """Whether each pair may lie on the other side of its cutoff, or does so without a recorded flip."""
+        """Whether each pair may lie beyond its cutoff (or short of it), or did so without a recorded flip."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
