@@ -1,7 +1,7 @@
 """The bouncing ball in closed form: its motion, and its derivative with respect to every parameter.
 
-A ball above a floor at height 0, with gravity g, starts at (y0, v0). Its speed at the floor is s = sqrt(v0² +
-2 g y0), reached at t_1 = (v0 + s) / g. With restitution e, impact n has speed e^(n-1) s, and the time between
+A ball above a floor at height 0, with gravity g, starts at (y0, v0). It reaches the floor at t_1 = (v0 + s) /
+g with speed s = sqrt(v0² + 2 g y0). With restitution e, impact n has speed e^(n-1) s, and the time between
 impacts n and n + 1 is 2 e^n s / g. Therefore
 
     t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e),
@@ -340,8 +340,7 @@ def _later(t: Times) -> Float[np.ndarray, "*times"]:
 def _powers(e: complex, n: Any) -> tuple[Any, Any]:
     """Return e^n and 1 + e + ... + e^(n-1) for integers n, by repeated squaring with sums of one sign.
 
-    Near e = 1 the formula (1 - e^n) / (1 - e) loses all digits, and the digits of its derivative even
-    earlier.
+    Near e = 1 the formula (1 - e^n) / (1 - e) loses all digits, and its derivative even earlier.
     """
     n = np.asarray(n, np.float64)
     power, total = np.ones(n.shape, complex), np.zeros(n.shape, complex)

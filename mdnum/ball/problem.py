@@ -42,7 +42,7 @@ class FinalHeight(eqx.Module):
         return jnp.zeros((), dtype)
 
     def end(self, state, steps, total):
-        """Return the mean over the batch."""
+        """Return the mean final height, or the mean squared distance from the target."""
         y = state.y.astype(total.dtype)
         if self.target is None:
             return jnp.mean(y, dtype=total.dtype)
@@ -72,7 +72,7 @@ class ResidualPenetration(eqx.Module):
         return jnp.mean(left if self.power == 1 else left**self.power, dtype=dtype)
 
     def end(self, state, steps, total):
-        """Return the sum over steps."""
+        """Return the penetration summed over steps."""
         return total
 
 
@@ -115,8 +115,7 @@ class BallProblem:
         return float(_loss(problem.bare, problem.world, *problem.start_arrays, imposed))
 
     def origin(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return the point at which `loss_at` is differentiated: parameter values, and zero displacement of
-        the start.
+        """Return the point at which `loss_at` is differentiated: parameter values, zero start displacement.
 
         Raises:
             InputError: a parameter does not exist.
@@ -129,7 +128,7 @@ class BallProblem:
     def value_and_grad(
         self, names: Sequence[str], imposed: BallDecisions | None = None, scale: float = 1.0
     ) -> tuple[float, dict[str, float]]:
-        """Compute the loss and its derivative with respect to each named parameter, through the actual
+        """Compute the loss and its derivatives with respect to named parameters through the actual
         iterations.
 
         Args:
@@ -191,7 +190,7 @@ def loss_of(
 
 
 def loss_at(bare, world, y0, v0, values, imposed):
-    """Evaluate `loss_of` for given parameter values; all inputs are arguments, so that no fence is folded.
+    """Evaluate `loss_of` for given parameter values; all inputs are arguments, so that fences survive.
 
     Args:
         bare: number of steps, and loss.
@@ -216,8 +215,7 @@ def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
-    """Compute heights after a number of steps, and their derivative with respect to one parameter (forward
-    mode).
+    """Compute final heights and their derivative with respect to one parameter, by forward mode.
 
     One compilation serves all step sizes and numbers of steps.
     """

@@ -286,7 +286,7 @@ class CrossDecision(NamedTuple):
 
 @dataclass(frozen=True)
 class BallDifference:
-    """The first differences between two rollouts of the same length."""
+    """Differences between two rollouts of the same length: steps, counts and separation."""
 
     seed: int | None  # first step whose state bits differ (0: the start itself); None where none do
     fork: int | None  # first step whose decisions differ; None where none do
@@ -303,7 +303,7 @@ class BallDifference:
 
 
 def first_difference(a: BallRun, b: BallRun) -> BallDifference:
-    """Find the first differences between two rollouts.
+    """Compare two rollouts, and find where they first differ.
 
     Raises:
         InputError: the rollouts differ in length or batch size.

@@ -140,14 +140,14 @@ class _Euler(eqx.Module):
 
 
 class ExplicitEuler(_Euler):
-    """y += h v; v += h a(y), both from the old state. Order 1; a stiff contact always gains energy."""
+    """Explicit Euler: y += h v; v += h a(y). Order 1; a stiff contact gains energy at any time step."""
 
     def fly(self, y, v, a, r):
         return r(y + r(self.h * v)), r(v + r(self.h * a))
 
 
 class SemiImplicitEuler(_Euler):
-    """v += h a(y); y += h v with the new velocity. Order 1, symplectic; stable for h sqrt(k) < 2."""
+    """Semi-implicit Euler: v += h a(y); y += h v. Order 1, symplectic; stable for h sqrt(k) < 2."""
 
     def fly(self, y, v, a, r):
         v = r(v + r(self.h * a))
@@ -155,7 +155,7 @@ class SemiImplicitEuler(_Euler):
 
 
 class BallVerlet(eqx.Module):
-    """Half kick, drift, force, half kick. Order 2 between events, symplectic; stable for h sqrt(k) < 2."""
+    """Velocity Verlet: kick, drift, kick. Order 2 between events, symplectic; stable for h sqrt(k) < 2."""
 
     h: Any
 
@@ -263,7 +263,7 @@ class Contact(Protocol):
     """Base class of the contact models."""
 
     def move(self, motion: Motion) -> Moved:
-        """Make one step."""
+        """Make one step with this contact model."""
         ...
 
     def acceleration(self, y: Balls, v: Balls, free: Balls, contact: Touching, r: Rounding) -> Balls:
@@ -318,8 +318,7 @@ class Penalty(eqx.Module):
 
 
 class Projection(_Forceless):
-    """y ← y + alpha k p with p = max(0, -y) until the rule stops the iteration; then clamping and
-    restitution.
+    """Iteration y ← y + alpha k p, p = max(0, -y), until the rule stops; then clamping and restitution.
 
     Each iteration leaves 1 - alpha k of the penetration, so tol is reached after ceil(log(tol / p0) / log(1 -
     alpha k)) iterations; with alpha k in (1, 2) they overshoot, and at 2 they never end. The floor is at 0
@@ -371,7 +370,7 @@ class Projection(_Forceless):
 
 
 class Impact(_Forceless):
-    """v ← -restitution v at the floor.
+    """Instantaneous impact: v ← -restitution v at the floor.
 
     With an event-located step the impact happens at its exact time, and the flight continues for the rest of
     the step. With any other scheme, a ball that passed the floor is put on the floor, and its velocity is

@@ -1,5 +1,4 @@
-"""The command line: parse arguments, call a verb, print the result; without science and without importing
-jax.
+"""Command line of mdnum: parse arguments, call a verb and print the result, without importing jax.
 
 Every verb is a function that returns its exit code: 0 without findings, 1 with findings, 2 for invalid input,
 3 if time ran out before a verdict.

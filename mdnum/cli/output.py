@@ -244,7 +244,7 @@ def _print_part(table: Table) -> None:
 
 
 class CommandBar(ProgressBar):
-    """Progress bar of a command; after the first report, control-C raises, because results can be kept."""
+    """Progress bar that lets control-C raise KeyboardInterrupt after the first report."""
 
     def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
         """Show the progress that a rollout reports."""

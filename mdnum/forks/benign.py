@@ -158,7 +158,7 @@ class Planted:
 
     @property
     def ok(self) -> bool:
-        """True if all tries failed (for a change that must fail), or no more than chance allows."""
+        """True if a change that must fail always failed, or another failed no more than by chance."""
         if self.must_fail:
             return self.failures == self.tries
         return bounds(self.failures, self.tries)[0] <= ACCEPTED

@@ -92,8 +92,7 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 
 
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """Return, at each step, the distance of the nearest pair from its cutoff, and the required distance;
-    lengths.
+    """Return the distance of the nearest pair from its cutoff and the required distance (lengths), per step.
 
     Each of two atoms may be displaced by the separation of the runs, so their distance may be wrong by twice
     the separation. The margins are those of the run with the smaller rounding error, which is added to the

@@ -41,7 +41,7 @@ _NUMBERS = (
 
 
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
-    """Return the distances (length, ascending) at which the hats of the pair histogram peak, and its end.
+    """Return ascending distances at which the hats of the pair histogram peak, then its upper end.
 
     The distances range from that of the closest pairs of a start to the largest distance that is counted.
     """
@@ -133,7 +133,7 @@ def starts(simulation: Simulation, count: int, seed: int, start: Start | None = 
 
 
 def stretches(simulation: Simulation, start: Start, steps: Iterable[int]) -> Iterator[Segment]:
-    """Run to each of some ascending steps, yielding the segment that ends there; stop if the run blows up."""
+    """Run to each of some ascending steps and yield the segment that ends there, until a blow-up."""
     for step in steps:
         for segment in Engine(simulation, step, start=start, record=False).segments():
             if segment.closes in FAILURES:
@@ -201,7 +201,7 @@ class Change:
 def planted(a: Simulation) -> tuple[Change, ...]:
     """Create the planted changes that apply to a simulation.
 
-    A longer time step, and a shorter cutoff must fail. Forces in the other precision, pairs in another order
+    A longer time step and a shorter cutoff must fail. Forces in the other precision, pairs in another order
     and lists built by the other search must pass. The cutoff and the precision of a many-body potential
     cannot be changed, so these two changes are omitted for such a potential.
     """

@@ -146,7 +146,8 @@ def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bo
 
 
 def twin_of(found: FolderFork, objects: Sequence[Simulation] = ()) -> Twin:
-    """Rebuild the programs of two molecular-dynamics folders, to run them again (`objects`: `simulation_in`).
+    """Rebuild the programs of two molecular-dynamics folders, to run them again (for `objects` see
+    `simulation_in`).
 
     A replay agrees bit for bit with the stored run if versions and processor are the same.
     """
@@ -358,9 +359,7 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
 
 
 def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
-    """Compare two sets of atoms property by property; yield whether a property agrees, and the message if
-    not.
-    """
+    """Compare two sets of atoms by property; yield whether each agrees, and a message if not."""
     yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
     symbols = [each.get_chemical_symbols() for each in (one, other)]
     yield symbols[0] == symbols[1], "species differ or their order"

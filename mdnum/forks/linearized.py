@@ -236,7 +236,7 @@ class Lyapunov:
     def ratio(self, seen: Growth) -> float:
         """Return the growth rate of two runs divided by the exponent; NaN if no growth was found.
 
-        A ratio near 1 means that the dynamics separated the runs; with a ratio well above 1 their flips did.
+        A ratio near 1 means that the dynamics separated the runs; a ratio well above 1, that flips did.
         """
         return seen.rate / self.rate if self.chaotic else float("nan")
 

@@ -112,11 +112,12 @@ def fork(
 
     Args:
         twin: the pair of programs.
-        steps: last step; default the system's own. Molecular dynamics is followed to twice the split at most,
-            but a fifth beyond the last step if the split comes too late to distinguish a cause from a delay.
+        steps: last step; default the system's own. Molecular dynamics ends at twice the split at the latest.
+            If the split is near the last step, the runs continue to 1.2 times the split, to distinguish a
+            cause from a delay.
         split: separation that counts as split, length; default 0.01 of the longest cutoff or start height.
         counterfactual: whether to run B under A's decisions, which is impossible for many-body potentials.
-        back: whether to run A under B's decisions too; default: the value of `counterfactual`.
+        back: whether to run A under B's decisions too; default: only if B is run under A's decisions.
         repeats: largest number of repeats of B, each free and under A's decisions; default 15. Their starts
             are displaced at random by the initial separation of the runs (an ulp at least). If the runs split
             either way, they are run until the verdict is clear, and then at a hundredth of the displacement.
@@ -168,8 +169,7 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Return whether to run B under A's decisions, whether to run A under B's, and the largest number of
-    repeats.
+    """Return whether to run B under A's decisions and A under B's, and the largest number of repeats.
 
     Raises:
         InputError: a requested counterfactual run or repeat is not possible.
@@ -213,8 +213,7 @@ def _beyond(step: int) -> int:
 
 
 def displacements(fork: Fork) -> tuple[float, float]:
-    """Return two displacements (lengths) of the starts of repeats: the initial separation of the runs, and
-    less.
+    """Return two displacements (lengths) for starts of repeats: the runs' initial separation, and less.
 
     At a hundredth of the first displacement a repeat begins to have the pair's rounding errors; at much less
     it equals the pair itself and proves nothing. If a hundredth is less than an ulp, the second displacement
@@ -349,8 +348,7 @@ def screen(
     choices: Sequence[Choice] | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[Screened]:
-    """Compare runs of a system under every choice, without counterfactual runs; the earliest fork comes
-    first.
+    """Compare runs of a system for every choice, without counterfactual runs; earliest fork first.
 
     Args:
         system: a loaded system.

@@ -119,7 +119,7 @@ class Variants:
 
     @property
     def clusters(self) -> list[list[str]]:
-        """Names of the variants that agree bit for bit, by cluster, that of the reference first."""
+        """Names of the variants in each cluster of bitwise agreement; the reference's cluster is first."""
         count = max(row.cluster for row in self.rows) + 1
         return [[row.variant.name for row in self.rows if row.cluster == k] for k in range(count)]
 
@@ -271,8 +271,7 @@ def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
 def positions_of(
     simulation: Simulation, steps: int, program: ProgramName
 ) -> Float[np.ndarray, "steps 3 atoms"]:
-    """Compute wrapped positions at steps 1, 2, ... with one program in this process, in the user's atom
-    order.
+    """Compute wrapped positions at steps 1, 2, ... with one program in this process, in the user's order.
 
     The result ends before an atom has moved by half the skin of the only list.
     """
@@ -415,7 +414,7 @@ def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
 
 
 def _question(system: Simulation | BallSystem, steps: int, folder: Path) -> dict[str, Any]:
-    """Assemble the question to a process: the system, written into a folder, and the last step."""
+    """Assemble the input of a process: the system, written into a folder, and the last step."""
     path = in_a_file(system).write(folder / "system")
     return {"path": str(path), "steps": steps, "code": is_allowed()}
 
@@ -427,7 +426,7 @@ def _ask(
     timeout: float | None = None,
     settings: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Run a process that answers a question; return the reason if it fails, or "".
+    """Run a process that answers a question; return the reason for a failure, or "".
 
     Args:
         file: file to which the question is written.

@@ -50,7 +50,7 @@ class Neighborhood:
 
 
 def neighborhood(fork: Fork) -> Neighborhood | None:
-    """Collect the atoms around the pair at the fork, repeating both runs up to there; None without a pair."""
+    """Repeat both runs and return the atoms around the pair at the fork; None without a pair."""
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
@@ -197,8 +197,7 @@ def check_pins(fork: Fork) -> None:
 
 
 def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
-    """Return the intervals in which two runs decide a pair differently: first step, and end step (None if
-    open).
+    """Return intervals (first step, end step or None) in which two runs decide a pair differently.
 
     Only the cross-run flips that were kept are used.
     """

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 
 def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = None) -> Simulation | BallSystem:
-    """What a verb of both worlds works with: a simulation, or the system of a ball; arguments as for `load`.
+    """Load a system of either world: a simulation, or a ball's system; for arguments see `load`.
 
     Raises:
-        InputError: anything that cannot be run, in one line.
+        InputError: the system cannot be run; the message is one line.
     """
     if world_of(system) == "ball":
         return load(system, overrides)  # type: ignore[arg-type]
@@ -36,7 +36,7 @@ def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = Non
 
 
 class _Package(ModuleType):
-    """This package, in which `build` and `build_ball` are the functions, whoever imports their files."""
+    """Module class that keeps `build` and `build_ball` bound to the functions, not to the submodules."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         # Python binds an imported submodule to its package; here that would hide the function of its name

@@ -52,7 +52,7 @@ def admitted(simulation: Simulation) -> Simulation:
 
 
 def _of_a_part(simulation: Simulation) -> Trial | None:
-    """Examine a few atoms of a large structure, then all energies; return None if this is not sufficient."""
+    """Examine a few atoms of a large structure, and check all energies; return None if inconclusive."""
     if simulation.atoms <= _ENOUGH or simulation.model.start is not None:
         return None
     try:
@@ -183,7 +183,7 @@ class _Moved:
         return all(abs(trial.energy(x, idx, cell) - energy) <= allowed for x in moved)
 
     def follows(self) -> bool:
-        """Return True if a slightly sheared box changes the energy in the expected way."""
+        """Return True if the energy is invariant under lattice vectors of a slightly sheared box."""
         trial = self.trial
         cell = trial.cell + trial.cell @ _SHEAR
         energy, push = trial.energy(idx=self.whole), np.abs(trial.there(idx=self.whole)[1]).max()

@@ -137,7 +137,7 @@ class PenaltyContact(_Contact):
 
 
 class ProjectionContact(_Contact):
-    """y <- y + alpha k p with p = max(0, -y), until the rule in [stop] ends it; then clamped to the floor."""
+    """Iterate y <- y + alpha k p, p = max(0, -y), until [stop] ends it; then clamp y to the floor."""
 
     kind: Literal["projection"]
     k: Positive = Field(description="gain (no unit)")
@@ -150,7 +150,7 @@ class ProjectionContact(_Contact):
 
 
 class ImpactContact(_Contact):
-    """v <- -e v at the floor."""
+    """Reset the velocity to v <- -e v at the floor."""
 
     kind: Literal["impact"]
     restitution: Annotated[float, Field(ge=0, le=1)] = Field(

@@ -272,7 +272,7 @@ class BallSystem:
         """Return this system with an additional variant.
 
         Args:
-            changes: dotted keys to values; text is read as TOML would read it.
+            changes: dotted keys to values; text is parsed as a TOML value.
             name: name of the variant; default the text of the changes.
 
         Raises:
@@ -288,8 +288,7 @@ class BallSystem:
         return BallSystem(self.name, spec, self.path, {**self.variants, name: variant})
 
     def for_steps(self, steps: int) -> BallSystem:
-        """Return this system with another number of steps; control values are cut, or the last one is
-        repeated.
+        """Return this system with another number of steps; control values are cut or extended.
 
         Args:
             steps: number of steps of a run, at least 1.

@@ -128,7 +128,7 @@ def is_positive(simulation: Simulation, name: str) -> bool:
 
 
 def by(simulation: Simulation, name: str) -> str:
-    """Return what indexes a parameter: "pair type", "species" or "atom"; "" for a single value."""
+    """Return "pair type", "species" or "atom" if a parameter has an entry for each, else ""."""
     if name.startswith("initial.") or is_weight(name):
         return "atom"
     if not _is_typed(simulation, name) or simulation.pair_types == 1:

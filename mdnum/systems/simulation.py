@@ -376,7 +376,7 @@ class Simulation:
         return self._ended(lambda end: end.continuous)
 
     def with_policy(self, policy: PrecisionPolicy = PrecisionPolicy()) -> Simulation:
-        """Return the system with floating-point roles of a policy, by default float64 throughout."""
+        """Return the system with the dtypes of a policy and a floating-point state; default float64."""
         decider = replace(self.decider, dtype=policy.decision, state=policy.state)
         return replace(self, policy=policy, decider=decider, fixed_point=None)
 

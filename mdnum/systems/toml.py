@@ -146,8 +146,7 @@ def line_of(text: str, key: Key) -> int | None:
 def dump(tables: Mapping[str, Any]) -> str:
     """Return TOML text of nested tables; None means absent, and floats keep every bit.
 
-    In each table, scalars come first, as TOML requires, beginning with the kind or rule; empty tables are
-    omitted.
+    In each table, scalars come first, as TOML requires, the kind or rule first; empty tables are omitted.
     """
     lines: list[str] = []
     _dump_table((), tables, lines)
@@ -276,7 +275,7 @@ def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
 
 
 def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
-    """Return possible models of the table at a key, that of the kind in data first; empty for a value."""
+    """Return the possible models of the table at a key, best match first; empty if the key is a value."""
     found, table = [root], data
     for part in key:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}

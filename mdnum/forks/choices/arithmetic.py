@@ -43,7 +43,7 @@ FORMATS = ("dense", "sparse", "ordered-sparse")
 
 @choice("precision")
 class PrecisionChoice(Choice):
-    """Another float in one role, or in several.
+    """Another floating-point format in one role, or in several.
 
     In molecular dynamics, 16-bit floats are allowed only for pair forces: in any other role they change the
     model and not only the rounding (`mdnum.numerics.roles.check_role` gives the reason).

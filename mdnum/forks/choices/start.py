@@ -217,8 +217,7 @@ class Images(Choice):
 def exact_images(
     cell: Any, positions: Float[np.ndarray, "atoms 3"], images: Int[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"], int]:
-    """Return wrapped positions near given ones, their equivalents in other images, and the number without
-    any.
+    """Return wrapped positions near given ones, their images, and the number of atoms without exact images.
 
     Wrapping the second array gives the first, bit for bit. In a box along the axes, a position whose image
     was rounded has an exact image (Sterbenz's lemma: the lattice vector is subtracted again without

@@ -101,8 +101,7 @@ def certify(
     policies: Mapping[str, Roles] | None = None,
     progress: Progress | None = None,
 ) -> Certificate:
-    """Compute the exact history of a system, and the step at which a run in each precision leaves that
-    history.
+    """Compute the exact history of a system, and the step at which a run in each precision leaves it.
 
     The numbers of the file are rounded to float64. A run in lower precision rounds them further, and this
     rounding is part of its deviation.
@@ -254,8 +253,7 @@ def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
 
 
 def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
-    """Return how many bits closer to the exact positions one run is than another, while all decisions are
-    exact.
+    """Return how many bits closer to the exact positions one run is than another, while decisions agree.
 
     The value is the median over the second half of the steps before the first wrong decision. Unlike the
     horizon, this median does not depend on which pair happens to come close to its cutoff.
