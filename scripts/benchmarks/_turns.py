@@ -79,6 +79,9 @@ def finish(
     """Print what was measured, as tables or as one JSON document (--json)."""
     result["machine"] = machine()
     if chosen.json:
+        result["claims"] = [
+            dict(zip(("what", "measured", "required", "holds"), one, strict=True)) for one in claims(result)
+        ]
         print(json.dumps(result, indent=2))
         return
     print("on " + result["machine"])
