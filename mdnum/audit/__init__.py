@@ -1,1 +1,1 @@
-"""Anybody's potential: is this ASE calculator safe to run and to differentiate?"""
+"""Audit of any ASE calculator: is it safe to run dynamics with it, and to differentiate it?"""

@@ -1,4 +1,4 @@
-"""The contract of a check of a calculator: what it may ask, and what it gives back."""
+"""Base classes of the calculator checks: limits on calls and time, findings, results, and `AuditCheck`."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ Skipped = tuple[str, str]  # (what, why) of what was not asked, and why somethin
 
 
 def idle(done: int, total: int, info: dict[str, Any]) -> None:
-    """A progress that nobody watches."""
+    """Ignore progress reports (the default progress callback)."""
 
 
 class CallsUp(TimeUp):
-    """The calls that a check or a search may make have been made: what is in progress is left."""
+    """Raised when a check or a search has used up its calls; the work in progress is abandoned."""
 
     why = "the calls of this check were used up"
 
@@ -39,11 +39,11 @@ TIME_UP, CALLS_UP = TimeUp.why, CallsUp.why
 
 
 class CalculatorError(MdnumError):
-    """The calculator raised, or answered with a number that is not finite.
+    """The calculator raised an exception, or returned a number that is not finite.
 
     Args:
-        structure: the file that holds what it was asked about; None where enough have been saved.
-        cause: what it raised, None where it answered.
+        structure: file with the structure that failed; None when enough of them have been saved.
+        cause: the exception of the calculator; None if the calculator returned a value.
     """
 
     def __init__(
@@ -55,9 +55,10 @@ class CalculatorError(MdnumError):
 
 @dataclass
 class Meter:
-    """Calls of a calculator by all of its objects, and the calls and the time that are left for more.
+    """Number of calls made by all objects of a calculator, with limits on further calls and on time.
 
-    Evidence is counted in calls, whatever the load of a machine; a deadline cuts it short.
+    The amount of evidence is set by the number of calls, independent of the load of the machine; only a
+    deadline cuts it short.
     """
 
     calls: int = 0
@@ -70,7 +71,7 @@ class Meter:
         """Count a call.
 
         Raises:
-            TimeUp: the deadline has passed, or the calls are used up, and what is in progress may be left.
+            TimeUp: inside `limited`, the deadline has passed or the calls are used up.
         """
         if self._limited and (up := self.up):
             raise up
@@ -78,12 +79,12 @@ class Meter:
 
     @property
     def up(self) -> type[TimeUp] | None:
-        """Why no more may be asked, if so."""
+        """The exception for the limit that has been reached; None while calls and time remain."""
         return TimeUp if self.deadline.passed else CallsUp if self.calls >= self.most else None
 
     @contextmanager
     def apart(self, calls: int) -> Iterator[None]:
-        """What several checks rest on is found here, by calls of its own; what is left is for the check."""
+        """Grant extra calls for a result that several checks share; the check keeps its own calls."""
         most = self.most
         self.most = self.calls + calls
         try:
@@ -93,7 +94,7 @@ class Meter:
 
     @contextmanager
     def limited(self) -> Iterator[None]:
-        """One way of many is asked here: no call is made past a limit, which raises `TimeUp`."""
+        """Enforce the limits on calls and time in this block: a call beyond them raises `TimeUp`."""
         if up := self.up:
             raise up
         self._limited += 1
@@ -105,7 +106,7 @@ class Meter:
 
 @dataclass(frozen=True)
 class Observed:
-    """What a check found: a code, and values for its sentences in mdnum/verbs/audit.toml."""
+    """One finding of a check: a code, and values for its sentences in mdnum/verbs/audit.toml."""
 
     code: str  # short stable name
     severity: Severity  # info (nothing to do), warning (look at it), error (the numbers are wrong)
@@ -117,13 +118,14 @@ class Observed:
 def finding(
     code: str, severity: Severity, *variants: str | None, tests: Collection[str] = (), **values: Any
 ) -> Observed:
-    """What was found, with those of its variants that are not None.
+    """Return a finding with those of its text variants that are not None.
 
     Args:
-        tests: names in `causes.TESTS` of those that were made and that leave this cause.
+        tests: names in `causes.TESTS` of the tests that were made and that leave this cause possible.
 
     Raises:
-        ValueError: a cause that was not separated from its rivals; give the code of its symptom instead.
+        ValueError: the cause was not separated from alternative causes; report the code of the symptom
+            instead.
     """
     if left := [test for test in cause(code).tests if test not in tests]:
         raise ValueError(
@@ -135,7 +137,7 @@ def finding(
 
 @dataclass(frozen=True)
 class Chart:
-    """Lines by label over a shared x, with marks (a threshold, say) on x by theirs."""
+    """A chart: labeled lines over a shared x axis, with labeled marks (such as a threshold) on that axis."""
 
     title: str
     x_label: str
@@ -148,7 +150,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What one check found; all of it plain values, in eV and Å."""
+    """Result of one check, as plain values in eV and Å."""
 
     says: tuple[list[str], dict[str, Any]]  # its summary: names of sentences, and values for all of them
     findings: list[Observed] = field(default_factory=list)
@@ -168,24 +170,24 @@ class CheckResult:
 
 
 class AuditCheck:
-    """One question to a calculator: a file in `mdnum.audit.checks`, or an entry point of another package.
+    """One question about a calculator: a file in `mdnum.audit.checks`, or an entry point of another package.
 
     A subclass has a name, a title, a one-line docstring and `ask`; its sentences are under the codes of its
     findings in mdnum/verbs/audit.toml. To add one, add the file `checks/NAME.py` with the class `NameCheck`.
 
     Args:
-        timestep: of a run, internal time; None for a fraction of the fastest vibration.
-        steps: of a run; None for as many as a check thinks enough.
+        timestep: time step of a run, internal time; None for a fraction of the fastest vibration's period.
+        steps: number of time steps of a run; None for the check's default.
 
     Attributes:
-        order: checks with a lower one are asked before: what tells most by a call first.
-        basic: whether it has a brief form of a few dozen calls. The brief forms are asked before any check is
-            asked in full: with them there is an answer.
-        calls: that it may make at most, besides those that checks before it left.
-        brief: whether this is the brief form.
-        needed_to: answers that are not known without this check, "run" or "differentiate".
-        seed: of all that it draws.
-        structures: that show a finding, by name; those of a pair end in -before and -after.
+        order: checks run in ascending order; those that reveal most per call come first.
+        basic: whether the check has a brief form of a few dozen calls. All brief forms run before any full
+            check; together they give a first answer.
+        calls: largest number of calls, not counting the unused calls of earlier checks.
+        brief: whether this object is the brief form of the check.
+        needed_to: questions that have no answer without this check, "run" or "differentiate".
+        seed: seed of all random numbers of the check.
+        structures: structures that show a finding, by name; names of a pair end in -before and -after.
     """
 
     name: ClassVar[str]
@@ -202,16 +204,16 @@ class AuditCheck:
         self.structures: dict[str, Atoms] = {}
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """The check itself.
+        """Run the check.
 
         Raises:
-            TimeUp: the time was up before anything was found out.
-            CalculatorError: the calculator fails where the check cannot go on.
+            TimeUp: the time was up before the check had any result.
+            CalculatorError: the calculator failed and the check cannot continue.
         """
         raise NotImplementedError
 
     def __call__(self, subject: CalculatorSubject, progress: Progress | None = None) -> CheckResult:
-        """Ask it, with name, title and the time that it took."""
+        """Run the check, and add its name, its title and the elapsed time to the result."""
         began, meter = perf_counter(), subject.meter
         meter.most = meter.calls + self.calls + (0 if self.brief else meter.spare)
         try:
@@ -224,7 +226,7 @@ class AuditCheck:
 
 
 def _above_limits(result: CheckResult) -> Iterator[Observed]:
-    """Findings of figures that are above their limits where no finding of the check reports them."""
+    """Yield a finding for each figure above its limit that no finding of the check reports."""
     codes = {one.code for one in result.findings}
     for name, (limit, reports) in result.limits.items():
         value = result.numbers.get(name)
@@ -235,14 +237,14 @@ def _above_limits(result: CheckResult) -> Iterator[Observed]:
 
 @dataclass
 class Ways:
-    """Ways of asking, of which some may be left: what every check counts."""
+    """Counts of the cases that a check examined, skipped, or could have examined."""
 
     skipped: list[Skipped] = field(default_factory=list)
     asked: int = 0  # those on which the calculator failed included
     possible: int = 0
 
     def skip(self, what: str, why: str) -> None:
-        """Take note of what was not asked, and why."""
+        """Record what was skipped, and why."""
         self.skipped.append((what, why))
 
     def each(
@@ -261,17 +263,17 @@ class Ways:
         tolerant: bool = False,
         most: int | None = None,
     ) -> dict[int, T]:
-        """The answers about many items, by their place; those that come after the deadline are skipped.
+        """Call `ask` for each item and return the answers by index; items after the deadline are skipped.
 
         Args:
-            subject: whose deadline it is.
-            name: of an item, where it is skipped.
-            phase, unit: words for the progress.
-            spread: ask in an order in which a few answers tell of the beginning, the middle and the end.
-            required: raise `TimeUp` where none could be asked.
-            failed: called where the calculator fails; otherwise that is raised.
-            tolerant: skip those on which it fails instead.
-            most: ask so many at most; the others are possible.
+            subject: calculator whose limits on calls and time apply.
+            name: returns the name of a skipped item.
+            phase, unit: text for the progress report.
+            spread: order the items so that a few answers cover the beginning, the middle and the end.
+            required: raise `TimeUp` if no item could be examined.
+            failed: called when the calculator fails; without it the error is raised.
+            tolerant: skip items on which the calculator fails.
+            most: largest number of items to examine; all items count as possible.
         """
         found: dict[int, T] = {}
         stride = 4 if spread else 1

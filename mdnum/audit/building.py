@@ -1,4 +1,4 @@
-"""A structure for a calculator that came without one: of elements that it is meant for, within few calls."""
+"""Build a test structure for a calculator given without one, from elements it supports, within few calls."""
 
 from __future__ import annotations
 
@@ -45,20 +45,22 @@ _SAME = 1e-9  # of the energy: a second element that changes it by less is none 
 
 
 def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None) -> Atoms:
-    """A structure for a calculator: its own, or a crystal of elements it takes, or rigid water.
+    """Return a test structure for a calculator: its own, a crystal of supported elements, or rigid water.
 
-    The crystal is that of an element that the calculator is meant for, half of its atoms of a second one
-    where it tells the two apart, with the lattice at the calculator's own least energy. It is repeated until
-    two cutoffs fit in (at most 500 atoms, fewer where a calculation takes long), its atoms displaced a
-    little. `info["origin"]` describes it. For a calculator that fails on atoms without neighbors a denser
-    crystal is built: that it fails is a finding, and no reason to stop.
+    The crystal is that of an element that the calculator is meant for; half of its atoms are of a second
+    element if the calculator distinguishes the two. The lattice constant is at the calculator's own energy
+    minimum. The crystal is repeated until two cutoffs fit into the cell (at most 500 atoms, fewer for a slow
+    calculator), and its atoms are displaced slightly. `info["origin"]` describes the structure. If the
+    calculator fails on atoms without neighbors, a denser crystal is built: this failure is a finding and does
+    not stop the audit.
 
     Args:
-        deadline: of building; what is known by then has to do, as after `BUILDING_CALLS` calls.
+        deadline: time limit for building; at the deadline, or after `BUILDING_CALLS` calls, the best
+            structure so far is returned.
 
     Raises:
-        InputError: the calculator answers for no element and not for water; where it was asked about water,
-            that is saved.
+        InputError: the calculator supports no single element and no water; the failing water structure is
+            saved.
     """
     if loaded.atoms is not None:
         return _labeled(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
@@ -78,7 +80,7 @@ def _labeled(atoms: Atoms, origin: str) -> Atoms:
 
 
 class _Builder:
-    """Builds a structure for a calculator, and keeps the best that was answered for so far."""
+    """Builds a structure for a calculator, and keeps the best structure computed so far."""
 
     def __init__(self, loaded: LoadedCalculator, meter: Meter):
         self.name, self.calculator, self.meter = loaded.name, loaded.make(), meter
@@ -87,13 +89,13 @@ class _Builder:
         self.likely = list(dict.fromkeys([*self.named, *_FIRST]))
 
     def about(self, atoms: Atoms) -> CalculatorSubject:
-        """The calculator, and a structure that it is to be asked about."""
+        """Return the calculator together with a structure to evaluate."""
         subject = CalculatorSubject(self.name, lambda: self.calculator, atoms, kT=1.0)
         subject.meter = self.meter
         return subject
 
     def built(self) -> Atoms:
-        """The structure."""
+        """Build and return the structure."""
         from ase.data import chemical_symbols
 
         others = [one for one in chemical_symbols[1:_LAST_ELEMENT] if one not in self.likely]
@@ -126,7 +128,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """The crystal of the first element that is answered for, two atoms of it first where asked."""
+        """Return the crystal of the first supported element, after testing two atoms if `paired`."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():
@@ -136,7 +138,7 @@ class _Builder:
         return None
 
     def _mixed(self, made: Atoms) -> Atoms:
-        """The same with a second element, where the calculator takes one and tells it from the first."""
+        """Return the crystal with a second element, if the calculator distinguishes one from the first."""
         from ase.data import atomic_numbers
 
         self.best, symbol = made, str(made.symbols[0])
@@ -161,7 +163,7 @@ class _Builder:
         return made
 
     def _crystal(self, subject: CalculatorSubject, pair: Pair | None, *symbols: str) -> Atoms | None:
-        """The crystal, None where the calculator answers for it at no density."""
+        """Build the crystal; return None if the calculator fails at every density."""
         if pair is not None:
             self.cutoff, self.least = _felt(subject, pair)
         elif len(symbols) == 1:
@@ -180,7 +182,7 @@ class _Builder:
 
 
 def meant_for(calculator: Any, words: str) -> list[str]:
-    """Elements that a calculator, its arguments, file or documentation name, the likeliest first."""
+    """Return the elements named by a calculator, its arguments, file or documentation, most likely first."""
     from ase.data import atomic_names, atomic_numbers, chemical_symbols
 
     module = sys.modules.get(type(calculator).__module__)
@@ -202,7 +204,7 @@ def meant_for(calculator: Any, words: str) -> list[str]:
 
 
 def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]:
-    """Symbols of elements in a value or its attributes; keys of a dictionary where all of them are."""
+    """Yield element symbols found in a value or its attributes; dictionary keys only if all are symbols."""
     from ase.data import chemical_symbols
 
     value = value.tolist() if hasattr(value, "tolist") else value
@@ -224,7 +226,7 @@ def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]
 
 
 def water(edge: int = 4) -> Atoms:
-    """Rigid water on a cubic grid in random orientations (always the same ones), in the order O, H, H."""
+    """Return rigid water on a cubic grid, in fixed random orientations; atoms in the order O, H, H."""
     from ase.calculators.tip3p import angleHOH, rOH
     from scipy.spatial.transform import Rotation
 
@@ -238,10 +240,10 @@ def water(edge: int = 4) -> Atoms:
 
 
 def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Seconds of processor time of energy and forces, after the first; the less of two.
+    """Return the processor time of a repeated energy and force calculation, s: the smaller of two values.
 
-    Programs that a calculator starts and ends count. What other programs do at the time does not, so that
-    the same structure is asked about whatever the load.
+    Child processes of the calculator are counted. Other programs are not, so the choice of structure does not
+    depend on the load of the machine.
     """
 
     def clock() -> float:
@@ -259,9 +261,9 @@ def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """(where a pair stops interacting, where its energy is least), roughly; None if never.
+    """Estimate (the cutoff distance of a pair, the distance of its energy minimum); None where there is none.
 
-    Of a calculator that fails on atoms without neighbors, the distance from which on it does.
+    If the calculator fails on atoms without neighbors, the cutoff is the distance where it starts to fail.
     """
     curve, distances = pair.curve(subject), _DISTANCES.tolist()
     known: dict[float, tuple[float, float]] = {}
@@ -294,7 +296,7 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
 
 
 def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
-    """Whether atoms feel each other: a force, or an energy that changes as they move."""
+    """Return whether the atoms interact: a force is not zero, or the energy changes as they move."""
     (energy, forces), moved = subject.both(atoms), atoms.copy()
     moved.rattle(_RATTLE * nearest_distance(atoms), seed=1)
     other = subject.try_both(moved)
@@ -305,7 +307,7 @@ def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
 def _grown(
     subject: CalculatorSubject, cell: Atoms, kind: str, scale: float, relaxed: bool, cutoff: float | None
 ) -> Atoms | None:
-    """The largest crystal up to one with two cutoffs that is answered for soon enough; None where none is."""
+    """Build the largest crystal up to two cutoffs wide that is computed fast enough; None if none is."""
     at = "at the calculator's own least energy" if relaxed else _tabulated(scale)
     if cutoff and scale * _least_distance(cell) > _BARELY * cutoff:
         # nothing holds it together: a crystal in which nothing is felt would tell nothing
@@ -333,7 +335,7 @@ def _tabulated(scale: float) -> str:
 
 
 def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, repeat: int = 2) -> Atoms:
-    """The crystal with its lattice scaled, repeated and displaced a little."""
+    """Return the crystal with its lattice scaled, repeated, and its atoms displaced slightly."""
     cell = modified(cell, cell=cell.cell.array * scale, scaled=True)
     atoms, nearest = cell.repeat(repeat), _least_distance(cell)
     atoms.rattle(_RATTLE * nearest, seed=0)
@@ -345,9 +347,9 @@ def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, r
 
 
 def _unit_cell(symbol: str, *others: str) -> tuple[Atoms, str]:
-    """The element's crystal as a rectangular cell; fcc of its size where it has none of these.
+    """Return a rectangular unit cell of the element (fcc, bcc or diamond; otherwise fcc of its size).
 
-    Every second atom is of the other element, where there is one.
+    Every second atom is of the second element, if one is given.
     """
     from ase.build import bulk
     from ase.data import atomic_numbers, covalent_radii, reference_states
@@ -364,14 +366,14 @@ def _unit_cell(symbol: str, *others: str) -> tuple[Atoms, str]:
 
 
 def _least_distance(cell: Atoms) -> float:
-    """Smallest distance between two atoms of a crystal, images included."""
+    """Return the smallest distance between two atoms of a crystal, periodic images included."""
     return nearest_distance(cell.repeat(2))
 
 
 def _least_energy(
     subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
 ) -> tuple[float, bool]:
-    """(factor on the lattice at which its energy is least, whether there was one), from a start on."""
+    """Find the lattice scale of least energy from `start`: (scale factor, whether a minimum exists)."""
 
     def energy(scale: float) -> float:
         try:
@@ -394,6 +396,6 @@ def _least_energy(
 
 
 def _small(cell: Atoms, scale: float) -> Atoms:
-    """A few atoms of a crystal whose lattice is scaled."""
+    """Return a small crystal with its lattice scaled."""
     small = cell.repeat(max(int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))), 1))
     return modified(small, cell=small.cell.array * scale, scaled=True)

@@ -1,4 +1,4 @@
-"""What brings about what: causes.toml beside this file, which has a table for each code of a finding."""
+"""Which causes explain which findings: causes.toml, next to this file, has one table per finding code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mdnum.plain import beside
 
 @dataclass(frozen=True)
 class Cause:
-    """What is known about the finding of one code."""
+    """Known consequences, alternatives and tests of the cause reported under one finding code."""
 
     brings: tuple[str, ...] = ()  # codes of findings that it explains
     rivals: tuple[str, ...] = ()  # codes of other causes that show the same
@@ -41,16 +41,16 @@ _SEVERITIES = ("info", "warning", "error")
 
 
 def cause(code: str) -> Cause:
-    """The row of a code; of one that another package gives, an empty one."""
+    """Return the table row of a finding code; an empty row for a code of another package."""
     return CAUSES.get(code, Cause())
 
 
 def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
-    """For each finding the place of the one that it goes below, its own where it is listed by itself.
+    """Return the index of the finding under which each finding is listed (its own if it stands alone).
 
-    It goes below the deepest mistake found that brings it about and is no less severe, and below the first
-    finding of its own code. That it has the same cause is likely and not known: correct the one above, and
-    ask again.
+    A finding is listed under the deepest reported cause that explains it and is no less severe, or under the
+    first finding of the same code. A shared cause is likely but not proven: correct the upper finding and run
+    the audit again.
 
     Args:
         findings: code and severity of each, in the order in which they were found.

@@ -1,4 +1,4 @@
-"""What all checks of a calculator add up to: whether it is safe to run, and to differentiate."""
+"""Overall conclusion of all calculator checks: is the calculator safe to run, and to differentiate?"""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ _QUESTIONS = ("run", "differentiate")
 
 
 def in_order(names: Sequence[str]) -> list[str]:
-    """Names of checks in the order in which they are asked."""
+    """Return the names of checks in the order in which they run."""
     return sorted(names, key=lambda name: (CHECKS[name].order, name))
 
 
 def needed_to(question: str) -> set[str]:
-    """Checks without which a question ("run", "differentiate") has no answer."""
+    """Return the checks that are required to answer a question ("run", "differentiate")."""
     return {name for name in CHECKS if question in CHECKS[name].needed_to}
 
 
 def answers(results: Sequence[CheckResult], wanted: Sequence[str]) -> Mapping[str, Answer]:
-    """An answer to each question ("run", "differentiate") by the checks that were wanted."""
+    """Answer each question ("run", "differentiate") from the results of the requested checks."""
     return {question: _answer(question, results, wanted) for question in _QUESTIONS}
 
 
@@ -45,12 +45,12 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
 
 
 def largely_unasked(result: CheckResult) -> bool:
-    """Whether the time was up before most ways of a check were asked."""
+    """Return whether the time was up before a check had examined most of its cases."""
     return result.asked < _NEARLY * result.possible
 
 
 def nothing_felt(results: Sequence[CheckResult]) -> bool:
-    """Whether no atom feels another in the structure: what was found right there tells nothing."""
+    """Return whether no atoms interact in the structure, so that findings there mean nothing."""
     return any(result.numbers.get("nothing_felt") for result in results)
 
 
@@ -59,15 +59,15 @@ def _begun(results: Sequence[CheckResult]) -> set[str]:
 
 
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
-    """Whether there is no verdict yet: no mistake is known, and of what is asked first, something is left."""
+    """Return whether there is no verdict yet: no error was found, and a basic check has not yet run."""
     begun, basic = _begun(results), {name for name in wanted if CHECKS[name].basic}
     return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
 
 
 def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
-    """Variants of sentences, by code, for what only several checks tell together.
+    """Return text variants, by finding code, that depend on the results of several checks.
 
-    Wrong forces that do no work around loops are the forces of another energy; those that do have none.
+    Incorrect forces that do no work around loops belong to another energy; those that do work have no energy.
     """
     numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
     curl, forces = numbers.get("curl"), numbers.get("forces")

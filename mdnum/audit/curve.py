@@ -1,9 +1,10 @@
-"""Where a curve jumps or has a kink: found by scanning and zooming, located to neighboring doubles, measured.
+"""Locate and measure jumps and kinks of a curve by scanning and zooming, down to neighboring doubles.
 
 A curve is an energy and the force along one coordinate. Each value is predicted from the points on its left
-and, independently, from those on its right. Across a smooth stretch the two predictions meet with the fourth
-power of the spacing; across a jump they never do, and across a kink only with the first power: so how fast
-the mismatch falls while one zooms in tells what is there, whatever the curve looks like elsewhere.
+and, independently, from those on its right. Across a smooth stretch the mismatch of the two predictions
+falls with the fourth power of the spacing; across a jump it does not fall, and across a kink it falls only
+with the first power. The rate at which the mismatch falls on zooming therefore identifies the singularity,
+whatever the curve looks like elsewhere.
 """
 
 from __future__ import annotations
@@ -39,10 +40,10 @@ SMOOTH = 3  # order of a threshold at which neither energy, force nor curvature 
 
 
 class Curve:
-    """Energy and force along one coordinate, each place evaluated once.
+    """Energy and force along one coordinate, each point evaluated once.
 
     Args:
-        at: gives (energy, force = -dE/dx) at a coordinate.
+        at: returns (energy, force = -dE/dx) at a coordinate.
     """
 
     def __init__(self, at: Callable[[float], tuple[float, float]]):
@@ -50,19 +51,19 @@ class Curve:
         self.known: dict[float, tuple[float, float]] = {}
 
     def __call__(self, x: float) -> tuple[float, float]:
-        """(energy, force) at x."""
+        """Return (energy, force) at x."""
         x = float(x)
         if x not in self.known:
             self.known[x] = self._at(x)
         return self.known[x]
 
     def many(self, places: Sequence[float] | np.ndarray) -> Float[np.ndarray, "2 points"]:
-        """Energies and forces as rows."""
+        """Return energies and forces at several points, as rows."""
         return np.array([self(float(x)) for x in places]).T
 
 
 def bisect(question: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
-    """Neighboring doubles between which an answer changes; it differs at low and at high."""
+    """Find neighboring doubles between which a truth value changes; it must differ at low and high."""
     before = question(low)
     while True:
         middle = low + 0.5 * (high - low)
@@ -75,14 +76,14 @@ def bisect(question: Callable[[float], bool], low: float, high: float) -> tuple[
 
 
 def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
-    """Where `find_jumps` looks first."""
+    """Return the scan points of `find_jumps`."""
     return np.linspace(low, high, max(int(np.ceil((high - low) / step)), 12) + 1)
 
 
 def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
-    """Scatter of energy and force (columns) from rounding, before low and after high (rows).
+    """Estimate the rounding scatter of energy and force (columns), before low and after high (rows).
 
-    The largest that any of some spacings shows: a calculator in float32 is constant over the smallest.
+    The largest estimate over several spacings is taken: a float32 calculator is constant over the smallest.
     """
     sides = []
     for start, sign in ((low, -1.0), (high, 1.0)):
@@ -98,7 +99,7 @@ def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndar
 
 
 def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> tuple[float, float]:
-    """(dF/dx at start from one side, its error) at the spacing that makes the error least."""
+    """Return (one-sided dF/dx at start, its error) at the spacing with the smallest error."""
     best = (0.0, np.inf)
     for relative in _WIDTHS:
         width = max(abs(start), 1.0) * relative
@@ -113,7 +114,7 @@ def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> t
 
 
 def _bend(curve: Curve, start: float, sign: int, room: float) -> float:
-    """|second derivative of the force| to one side, roughly."""
+    """Estimate |second derivative of the force| on one side."""
     width = min(1e-3 * max(abs(start), 1.0), room / 4)
     force = curve.many(start + sign * width * np.arange(3))[1]
     return abs(float(force[0] - 2 * force[1] + force[2])) / width**2
@@ -128,7 +129,7 @@ def _close(curve: Curve, start: float, toward: float) -> Float[np.ndarray, "2 po
 
 @dataclass(frozen=True)
 class Jump:
-    """A place where the curve or one of its derivatives jumps."""
+    """A coordinate at which the curve or one of its derivatives jumps."""
 
     low: float  # the last coordinate before it
     high: float  # the first one after it; the next double after low where `exact`
@@ -145,7 +146,7 @@ class Jump:
 
     @property
     def at(self) -> float:
-        """Where it is."""
+        """Coordinate of the jump."""
         return self.low if self.exact else 0.5 * (self.low + self.high)
 
 
@@ -158,21 +159,22 @@ def find_jumps(
     expected: Sequence[float] = (),
     calls: float = np.inf,
 ) -> tuple[list[Jump], int]:
-    """Every jump of energy, force, curvature or third derivative that stands out of a scan.
+    """Find every jump of energy, force, curvature or third derivative that stands out of a scan.
 
-    How small a jump that is depends on how the curve bends; `smallest_steps` tells it of a force. At 0.025 Å
-    of spacing, of 200 steps of the force by 1e-6 eV/Å at random places of five laws 199 are found, and all of
-    larger ones; of the energy, steps down to 3e-6 eV on a wall of ε = 1 eV, to 1e-8 eV on a soft one.
+    The detection limit depends on the bending of the curve; `smallest_steps` gives it for the force. At a
+    spacing of 0.025 Å, 199 of 200 force steps of 1e-6 eV/Å at random places of five potentials are found, and
+    all larger ones; energy steps are found down to 3e-6 eV on a wall of ε = 1 eV, and to 1e-8 eV on a soft
+    one.
 
     Args:
-        curve: must be defined a little beyond both ends.
+        curve: must be defined slightly beyond both ends.
         step: spacing of the scan. Two thresholds closer together than this may be taken for one.
-        most: how many places are zoomed into, those that stand out most.
-        expected: places that are known to stand out and are left out.
-        calls: places at which the curve may be asked, before all but the one that stands out most are left.
+        most: largest number of places to zoom into, starting with the most prominent.
+        expected: coordinates of known jumps, which are left out.
+        calls: number of curve evaluations after which no further place is examined; the first always is.
 
     Returns:
-        (jumps by coordinate, how many places that stood out were left out).
+        (jumps by coordinate, number of prominent places that were not examined).
     """
     suspects = [
         one
@@ -198,15 +200,15 @@ def find_jumps(
 
 
 def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
-    """The jumps between low and high, and how large they could look where there are none.
+    """Measure the jumps between low and high, with bounds on the apparent jumps of a smooth curve.
 
     Energy and force are taken at the last representable coordinates on either side (medians of four, so that
-    one unlucky rounding does not decide), the curvature from one-sided differences of the force.
+    a single rounding error does not decide), the curvature from one-sided differences of the force.
 
     Args:
-        room: how far to either side the curve can be used, coordinate.
+        room: usable length of the curve on either side, coordinate.
         exact: whether low and high are neighboring doubles.
-        curved: whether the curvature is asked for too; nan if not.
+        curved: whether the curvature is measured too; nan if not.
     """
     left, right = _close(curve, low, -np.inf), _close(curve, high, np.inf)
     values = np.median(right, axis=1) - np.median(left, axis=1)
@@ -229,10 +231,10 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
-    """Power with which the force vanishes toward an edge beyond which it is zero; None where unclear.
+    """Return the power with which the force vanishes toward the edge of its range; None where unclear.
 
     Args:
-        edge: where it ends, approached from below through room without another threshold.
+        edge: end of the interaction, approached from below; no other threshold lies within `room` of it.
     """
     distances = room * 0.5 ** np.arange(2, 14)
     forces = np.abs(curve.many(edge - distances)[1])
@@ -250,13 +252,14 @@ def decay_power(curve: Curve, edge: float, room: float) -> float | None:
 def smallest_steps(
     curve: Curve, low: float, high: float, step: float
 ) -> tuple[Float[np.ndarray, "intervals"], Float[np.ndarray, "intervals"]]:
-    """Where `find_jumps` looked, and how large a step of the force has to be there to be found.
+    """Return the intervals scanned by `find_jumps` and the smallest force step detectable in each.
 
     Returns:
-        (middles of the intervals that are compared with others, eV/Å at each).
+        (midpoints of the intervals that are compared with others, detection limit at each in eV/Å).
 
     Error:
-        of 125 steps of this size, planted in five laws, all are found; of those a third as large, half.
+        all of 125 steps of this size, planted in five potentials, are found; half of the steps a third as
+        large.
     """
     places = grid(low, high, step)
     seen = _outliers(curve, places)[1]
@@ -267,11 +270,11 @@ def smallest_steps(
 def _outliers(
     curve: Curve, places: Float[np.ndarray, "points"]
 ) -> tuple[list[tuple[float, float, float]], Float[np.ndarray, "intervals"]]:
-    """Intervals that do not join their two sides as those around them do, and what would stand out.
+    """Return the intervals with an unusually large mismatch of their two sides, and the detection limits.
 
     Returns:
-        (how far it stands out, left, right) of each, the worst first; and the smallest step of the force that
-        stands out, by interval: infinite at both ends, which nothing is compared with.
+        (relative mismatch, left, right) of each outlier, the largest first; and the smallest detectable force
+        step of each interval: infinite near both ends, where there is nothing to compare with.
     """
     middle = places[len(places) // 2]
     noise = scatter(curve, middle, middle, places[-1] - places[0]).min(axis=0)
@@ -298,21 +301,21 @@ def _outliers(
 
 
 def _eighth(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "2 intervals"]:
-    """Eighth differences of energy and force: of the two whose middles are an interval's ends, the smaller.
+    """Eighth differences of energy and force: the smaller of those centered on an interval's ends.
 
-    On a wall they are a hundredth of how badly two cubics meet, and a step is as much larger in them as
-    rounding is.
+    On a repulsive wall they are a hundredth of the mismatch of two cubics; the signal of a step grows in them
+    by the same factor as rounding.
     """
     differences = np.abs(np.lib.stride_tricks.sliding_window_view(curve.many(places), 9, axis=1) @ _EIGHTH)
     return np.minimum(differences[:, :-1], differences[:, 1:])
 
 
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
-    """How badly each interval joins its two sides: energy, force, and energy against the force's work.
+    """Mismatch of each interval with its two sides: of the energy, the force, and the energy minus the work.
 
-    The first two are |prediction from the left minus prediction from the right| in its middle, the third is
-    the change of the energy without the integral of the force (fifth power of the spacing where smooth),
-    which shows an energy that jumps on its own far sooner.
+    The first two are |prediction from the left minus prediction from the right| at the midpoint. The third is
+    the change of the energy minus the integral of the force (fifth power of the spacing where smooth), which
+    is far more sensitive to a jump of the energy alone.
     """
     values = curve.many(places)
     windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
@@ -324,7 +327,7 @@ def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.nda
 
 
 def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
-    """The jumps between left and right, down to neighboring doubles where a value jumps."""
+    """Find the jumps between left and right, down to neighboring doubles where a value jumps."""
     room = right - left
     left, right = left - 1.5 * room, right + 1.5 * room
     noise = np.maximum(scatter(curve, left, right, room).max(axis=0), 1e-300)
@@ -367,10 +370,10 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
 
 
 def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, float]:
-    """Neighboring doubles between which a value goes from that at left to that at right, all near one jump.
+    """Bisect for the neighboring doubles between which a value jumps from its left to its right level.
 
     Args:
-        row: 0 for the energy (without the work done on the way), 1 for the force.
+        row: 0 for the energy (minus the work done on the way), 1 for the force.
     """
     level = _level(curve, row, left, right)
     middle = 0.5 * (level(left) + level(right))
@@ -379,7 +382,7 @@ def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, fl
 
 
 def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float], float]:
-    """The force without its slope before left, or the energy without the work done from there: only jumps."""
+    """Return a function that is flat except for jumps: force minus its slope, or energy minus the work."""
     if row == 1:
         back = left - (right - left)
         slope_before = (curve(left)[1] - curve(back)[1]) / (left - back)
@@ -388,7 +391,7 @@ def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float
 
 
 def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
-    """A place where the force bends: where its continuations from both sides meet."""
+    """Locate a kink of the force: the point where its continuations from both sides meet."""
     width = min(room / 8, 1e-3)
     middle, reach = 0.5 * (left + right), max(0.5 * (right - left), width / 8)
     roots = np.roots(-_pieces(curve, middle, reach, width, 3))
@@ -401,16 +404,16 @@ def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
 
 
 def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int) -> np.ndarray:
-    """Polynomial of the force after a place minus that before, from seven points on either side."""
+    """Difference of polynomials fitted to seven force values after and before a point."""
     steps = reach + width * np.arange(7)
     before = np.polyfit(-steps, curve.many(middle - steps)[1], degree)
     return np.polyfit(steps, curve.many(middle + steps)[1], degree) - before
 
 
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
-    """A place where the third derivative of the energy jumps, by the force's second from both sides.
+    """Locate a jump of the energy's third derivative, from the force's second derivative on both sides.
 
-    Of several widths of the two pieces, that at which half of it agrees best counts.
+    Of several fit widths, the one with the best agreement between full and half width is used.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

@@ -1,9 +1,9 @@
-"""Where the energy of a run went: flips at thresholds, jumps elsewhere, work of the forces, drift.
+"""Energy balance of a run: flips at thresholds, jumps elsewhere, work of the forces, drift.
 
-The energy of every step is accounted for: ΔU plus the work of the forces on the straight way between two
-steps vanishes for a force that has this energy, whatever the integrator does. At a threshold it is the jump
-of a flip; at another single place, that of a cap on neighbors or a choice of the nearest; anywhere else it is
-a force that is not the energy's derivative.
+The energy of every step is accounted for: ΔU plus the work of the forces along the straight line between two
+steps vanishes for a force that has this energy, whatever the integrator does. A remainder at a threshold is
+the jump of a flip; at another single point it comes from a cap on neighbors or a choice of the nearest;
+anywhere else the force is not the derivative of the energy.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Steps = Float[np.ndarray, "steps"]
 
 @dataclass(frozen=True)
 class NveRun:
-    """A run at constant energy."""
+    """Trajectory of a run at constant energy."""
 
     start: Atoms  # its species and cell
     timestep: float  # internal time (length * sqrt(mass / energy))
@@ -51,23 +51,23 @@ class NveRun:
 
     @property
     def total(self) -> Float[np.ndarray, "steps"]:
-        """Energy of every step, eV."""
+        """Total energy at every step, eV."""
         return self.potential + self.kinetic
 
     @property
     def time(self) -> Float[np.ndarray, "steps"]:
-        """Internal time of every step."""
+        """Internal time at every step."""
         return self.timestep * np.arange(len(self.potential))
 
     def at(self, positions: Float[np.ndarray, "atoms 3"]) -> Atoms:
-        """The structure with its atoms somewhere else, and no constraints."""
+        """Return the structure with its atoms at other positions, without constraints."""
         there = self.start.copy()
         there.set_constraint()
         there.positions = positions
         return there
 
     def way(self, step: int, share: float) -> Float[np.ndarray, "atoms 3"]:
-        """Positions at a share of the straight way of a step."""
+        """Return the positions at a fraction of the straight line of a step."""
         return self.positions[step - 1] + share * (self.positions[step] - self.positions[step - 1])
 
 
@@ -89,12 +89,12 @@ class RunCrossing:
 
     @property
     def sign(self) -> float:
-        """1 for a pair that enters, -1 for one that leaves."""
+        """Direction of the crossing: 1 for a pair that enters, -1 for one that leaves."""
         return 1.0 if self.entered else -1.0
 
 
 def crossings(run: NveRun, thresholds: Sequence[PairThreshold]) -> list[RunCrossing]:
-    """All flips of a run at any number of thresholds, in the order of steps and of places on the way."""
+    """Find all flips of a run at any number of thresholds, in the order in which they happen."""
     species, cell, found = set(run.start.get_chemical_symbols()), run.start.cell.array, []
     for threshold in (one for one in thresholds if set(one.species) <= species):
         radius, skin, reference = threshold.radius, 0.0, run.positions[0]
@@ -127,7 +127,7 @@ def _furthest(moved: Float[np.ndarray, "atoms 3"]) -> float:
 
 
 def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
-    """The share s in [0, 1] at which |start + s way|² passes a value."""
+    """Return the fraction s in [0, 1] at which |start + s way|² passes a value."""
     a, b, c = float(way @ way), 2 * float(start @ way), float(start @ start) - square
     inside = b * b - 4 * a * c
     if a == 0 or inside < 0:
@@ -139,7 +139,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy, and force along it, by the share of the straight way of a step; at its ends the run's own."""
+    """Energy and force along the straight line of a step; with `ends`, the run's own at its ends."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:
@@ -155,20 +155,20 @@ def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = 
 def account(
     subject: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], smooth: int = 2
 ) -> tuple[list[float], float]:
-    """Work of the forces along the straight way of a step, in pieces between its crossings.
+    """Compute the work of the forces along the straight line of a step, in pieces between its crossings.
 
     Args:
-        subject: another object than the run's; asked three times for each crossing and once more.
-        crossed: those of the step that ends with this number, by their share.
-        smooth: order from which a threshold is passed without care: 2, for Simpson's rule takes a kink in the
-            force's slope; or 1 where kinks of the force are too many, on either side of the middle alike.
+        subject: a calculator object other than the run's, called three times per crossing and once more.
+        crossed: crossings of the step that ends with this number, by their fraction of the way.
+        smooth: threshold order from which crossings are ignored: 2, since Simpson's rule tolerates a kink in
+            the force's slope; or 1 if there are too many force kinks, symmetric about the middle.
 
     Returns:
         (jump of the energy at each crossing, 0 where it does not jump; change of the energy that neither a
         jump nor the work of the forces explains), eV.
 
     Error:
-        Simpson's rule on the way of one step, fifth power of its length; the calculator's noise.
+        Simpson's rule over one step, fifth power of its length; the calculator's noise.
     """
     curve, left = along_step(subject, run, step, ends=True), 0.0
     jumps, rest = [], 0.0
@@ -189,7 +189,7 @@ def account(
 
 
 def _unexplained(curve: Curve, low: float, high: float) -> float:
-    """Energy gained plus work done between two places, by Simpson's rule; 0 if forces have this energy."""
+    """Energy gained plus work done, by Simpson's rule; 0 if the force is the energy's derivative."""
     if high <= low:
         return 0.0
     (before, first), (after, last) = curve(low), curve(high)
@@ -198,7 +198,7 @@ def _unexplained(curve: Curve, low: float, high: float) -> float:
 
 @dataclass(frozen=True)
 class HiddenJump:
-    """A place on the straight way of a step at which the energy jumps."""
+    """A point on the straight line of a step at which the energy jumps."""
 
     step: int  # at its end
     share: float  # of the way
@@ -209,7 +209,7 @@ class HiddenJump:
 
 @dataclass(frozen=True)
 class HiddenJumps:
-    """Jumps in the steps of a run whose energy does not add up."""
+    """Energy jumps found in the steps of a run with an unexplained energy change."""
 
     jumps: tuple[HiddenJump, ...] = ()  # found in the steps that were searched
     steps: Mapping[int, float] = field(default_factory=dict)  # those, with what they left unexplained, eV
@@ -217,17 +217,17 @@ class HiddenJumps:
 
     @property
     def share(self) -> float:
-        """Of what those steps leave unexplained, the part that is jumps."""
+        """Fraction of the unexplained energy of the searched steps that is due to jumps."""
         whole = sum(abs(rest) for rest in self.steps.values())
         left = sum(abs(rest - self.brought(step)) for step, rest in self.steps.items())
         return max(1.0 - left / whole, 0.0) if whole else 0.0
 
     def brought(self, step: int) -> float:
-        """Energy that the jumps found in a step brought, eV."""
+        """Return the energy change by the jumps found in a step, eV."""
         return sum(jump.energy for jump in self.jumps if jump.step == step)
 
     def energies(self, rest: Steps) -> Steps:
-        """Energy that such jumps brought, by step; by their share where a step was not searched, eV."""
+        """Energy change by hidden jumps at each step, eV; estimated from `share` for steps not searched."""
         found = np.zeros(len(rest))
         for step in self.candidates:
             found[step] = self.brought(step) if step in self.steps else self.share * rest[step]
@@ -235,12 +235,12 @@ class HiddenJumps:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """(k, at how many jumps the k-th and next neighbors change places), the most frequent k."""
+        """Most frequent k whose k-th and next neighbors change places at a jump, and the number of jumps."""
         return _most_frequent(k for jump in self.jumps for k in {k for _, k in jump.ties})
 
     @property
     def radius(self) -> tuple[float, int]:
-        """(radius, at how many jumps a pair passes it), the most frequent pair threshold."""
+        """Most frequent pair threshold that a pair passes at a jump, and the number of these jumps."""
         return _most_frequent(jump.radius for jump in self.jumps if jump.radius is not None)
 
 
@@ -255,12 +255,12 @@ def hidden_jumps(
     crossed: Mapping[int, Sequence[RunCrossing]],
     noise: float,
 ) -> HiddenJumps:
-    """Search the steps that leave most unexplained: is it all at single places of their way?
+    """Search the steps with the largest unexplained energy for jumps at single points.
 
     Args:
-        rest: energy that each step leaves unexplained; nan where that is not known.
+        rest: unexplained energy of each step; nan where unknown.
         crossed: flips by step; where the energy of two atoms jumps, a jump is not counted again.
-        noise: that an energy may differ by, eV.
+        noise: noise level of an energy, eV.
     """
     limit = max(noise, _SMALL * probe.kT)
     large = np.abs(np.nan_to_num(rest)) > limit
@@ -279,7 +279,7 @@ def hidden_jumps(
 def _within(
     probe: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], limit: float
 ) -> list[HiddenJump]:
-    """The jumps on the way of one step."""
+    """Find the energy jumps within one step."""
     curve, parts = along_step(probe, run, step), [(0.0, 1.0)]
     first = _unexplained(curve, 0.0, 1.0)
     for level in range(_LEVELS):
@@ -303,7 +303,7 @@ def _within(
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Where the energy of a run went, step by step."""
+    """Energy balance of a run, step by step."""
 
     crossed: Sequence[RunCrossing]  # flips at thresholds
     jumps: Steps  # energy that the flips of each step brought, measured or by the mean of those measured, eV
@@ -314,18 +314,18 @@ class EnergyBalance:
 
     @property
     def elsewhere(self) -> Steps:
-        """Energy that jumps brought where no pair threshold is, by step, eV."""
+        """Energy change by jumps away from pair thresholds, at each step, eV."""
         return self.hidden.energies(self.rest)
 
     @property
     def filled(self) -> Steps:
-        """The rest without such jumps, with its mean at steps that were left out, eV."""
+        """Unexplained energy without hidden jumps, eV; its mean at steps that were left out."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 
     @property
     def means(self) -> dict[PairThreshold, float]:
-        """Jump of a pair that enters, by threshold, eV."""
+        """Mean energy jump of a pair that enters, by threshold, eV."""
         found: dict[PairThreshold, list[float]] = {}
         for place, jump in self.measured.items():
             found.setdefault(self.crossed[place].threshold, []).append(self.crossed[place].sign * jump)
@@ -391,30 +391,30 @@ def balance(
 
 @dataclass(frozen=True)
 class Drift:
-    """How a quantity changes with time."""
+    """Rate of change of a quantity with time, and its standard error."""
 
     slope: float  # per unit of time
     error: float  # standard error of it, from blocks
 
     @property
     def significant(self) -> bool:
-        """Whether it is told from zero: more than four standard errors away."""
+        """Whether the drift differs from zero by more than four standard errors."""
         return abs(self.slope) > 4 * self.error
 
     def times(self, factor: float) -> Drift:
-        """In another unit."""
+        """Return the drift multiplied by a unit conversion factor."""
         return Drift(self.slope * factor, abs(factor) * self.error)
 
     def minus(self, other: Drift) -> Drift:
-        """The difference of two that scatter independently."""
+        """Return the difference of two statistically independent drifts."""
         return Drift(self.slope - other.slope, float(np.hypot(self.error, other.error)))
 
 
 def drift(time: Steps, values: Steps) -> Drift:
-    """Slope of a straight line through the means of blocks, with its standard error.
+    """Return the slope of a straight line through block means, with its standard error.
 
-    Blocks are longer than what a step remembers, so their means scatter independently where the run is long
-    enough; neighboring steps do not. There must be 16 values at least.
+    Blocks are longer than the correlation time, so their means scatter independently if the run is long
+    enough; neighboring steps do not. At least 16 values are required.
     """
     blocks = np.array_split(np.arange(len(values)), _BLOCKS)
     x, y = ([float(row[block].mean()) for block in blocks] for row in (time, values))
@@ -423,10 +423,10 @@ def drift(time: Steps, values: Steps) -> Drift:
 
 
 def wandering(time: Steps, increments: Steps) -> Drift:
-    """Slope of a quantity that changes by increments, such as jumps, whose sum wanders without a memory.
+    """Return the drift of a quantity that changes by uncorrelated increments, such as energy jumps.
 
-    What is left of a straight line through a random walk is itself a walk, so the error is taken from the
-    sums over blocks instead.
+    The residual of a straight line through a random walk is itself a random walk, so the error is taken from
+    the sums over blocks instead.
 
     Args:
         increments: at least 16, each before its time.
@@ -438,7 +438,7 @@ def wandering(time: Steps, increments: Steps) -> Drift:
 
 
 def ratio(time: Steps, total: Steps, kinetic: Steps) -> float:
-    """Energy drifted over the run, over the standard deviation of the kinetic energy.
+    """Return the energy drift over the run, divided by the standard deviation of the kinetic energy.
 
     Source:
         the energy conservation score of the mlipaudit suite; meV/atom/ps is what lambench reports.

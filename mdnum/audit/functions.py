@@ -1,7 +1,7 @@
-"""Is a person's pair function smooth where atoms are, and how does it end? Found from its values alone.
+"""Check the smoothness of a user's pair function between close contact and cutoff, from its values alone.
 
-A run records what happens at its cutoff. Where a function has a break of its own, as pieces that do not meet,
-no flip is recorded, and no derivative through the run knows of it.
+A run records the flips at its cutoff. Where the function has a discontinuity of its own, such as pieces that
+do not join, no flip is recorded, and no derivative through the run includes it.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ _ORDERS = ("energy", "force", "curvature", "third derivative")
 
 
 def examined(simulation: Simulation) -> dict[str, Any] | None:
-    """The breaks of a person's pair functions between the closest pair of the start and the cutoff.
+    """Find the discontinuities of a user's pair functions from the closest initial pair to the cutoff.
 
     Returns:
-        None where all potentials are mdnum's, else plain values: `from` and `to`, length; `smoothness`, the
+        None if all potentials are mdnum's, else plain values: `from` and `to`, length; `smoothness`, the
         number of derivatives of the cut energy that do not jump at the cutoff (-1: the energy jumps; 3: or
         more); `places`, a row each: `term`, `pair`, `distance`, the `order` of the lowest derivative of the
         energy that jumps, `what` that is (the energy is 0, the force 1) and its `jump`, beyond minus before.
         Where the function is "singular" or "not finite" the order is -1; it is -2 where the "force" is not
-        minus the derivative of the energy, as with a wrong `custom_jvp`. Where the energy is piecewise linear
-        a row, of the largest, is for all `kinks` `between` two distances, those within a 1920th of the range
-        as one. `single`: whether a function rounds to float32 on the way.
+        minus the derivative of the energy, as with a wrong `custom_jvp`. If the energy is piecewise linear,
+        one row, that of the largest, stands for all `kinks` `between` two distances; those within a 1920th of
+        the range count as one. `single`: whether a function rounds to float32 internally.
 
     Error:
-        a step of the force by 1e-6 of its scale is found, one of a curvature by 1e-4, where no other break is
+        a force step of 1e-6 of its scale is found, and a curvature step of 1e-4, if no other discontinuity is
         within a 240th of the range.
     """
     if not simulation.pairwise:
@@ -81,7 +81,7 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
 
 
 def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
-    """Energy and force of two, from the parameters of their type and a distance."""
+    """Return a function for the energy and force of a pair, from its type's parameters and the distance."""
 
     @jax.jit
     def evaluate(own, r):
@@ -95,7 +95,7 @@ def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
 
 
 def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
-    """The cut energy and its first derivatives at distances, the last of which is pulled inside a little."""
+    """Return a function for the cut energy and its first derivatives, evaluated just inside each distance."""
 
     @jax.jit
     def evaluate(own, r_cut, r_onset, r):
@@ -114,7 +114,7 @@ def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
 
 
 def _order(derivatives: np.ndarray) -> int:
-    """How many derivatives do not jump at the last place."""
+    """Return the number of derivatives that do not jump at the last distance."""
     for order, row in enumerate(derivatives):
         usual = float(np.median(np.abs(row[np.isfinite(row)]))) if np.isfinite(row).any() else 0.0
         if not abs(row[-1]) <= _NOTHING[min(order, 1)] * usual:
@@ -123,7 +123,7 @@ def _order(derivatives: np.ndarray) -> int:
 
 
 def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float) -> list[dict[str, Any]]:
-    """What is wrong with a curve between two distances, a row for each place."""
+    """Find the defects of a curve between two distances, one row each."""
     step = (r_cut - low) / _INTERVALS
     curve, high = Curve(at), r_cut * (1 + _BEYOND)
     grid = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
@@ -170,7 +170,7 @@ def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float
 
 
 def _share(four: np.ndarray, width: float) -> np.ndarray:
-    """How far the change of the energy is from the work of the force by the cubic through four points."""
+    """Relative difference between energy change and work of the force, by cubics through four points."""
     u, f = np.moveaxis(four, -1, 1)
     with np.errstate(invalid="ignore"):
         change, work = u[2] - u[1], (13 * (f[1] + f[2]) - f[0] - f[3]) * width / 24
@@ -178,7 +178,7 @@ def _share(four: np.ndarray, width: float) -> np.ndarray:
 
 
 def _poles(curve: Curve, grid: np.ndarray, force: np.ndarray) -> list[float]:
-    """Where the force grows the more the nearer one looks."""
+    """Return the distances at which the force diverges on zooming in."""
     inner = force[1:-1]
     peaks = 1 + np.flatnonzero((inner >= force[:-2]) & (inner >= force[2:]) & (inner > 0))
     found, usual = [], np.median(force[np.isfinite(force)])
