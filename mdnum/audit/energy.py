@@ -332,7 +332,7 @@ class EnergyBalance:
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
 
     def by_means(self, crossed: Sequence[RunCrossing], steps: int) -> Steps:
-        """Energy that the flips of another run brought, by the mean jumps of this one, eV."""
+        """Estimate the energy change by another run's flips at each step from this run's mean jumps, eV."""
         jumps, means = np.zeros(steps), self.means
         for one in crossed:
             jumps[one.step] += one.sign * means.get(one.threshold, 0.0)
@@ -346,12 +346,12 @@ def balance(
     rng: np.random.Generator,
     noise: float = 0.0,
 ) -> EnergyBalance:
-    """Account for the energy of a run.
+    """Compute the energy balance of a run.
 
     Args:
-        probe: another object than the run's.
-        rng: picks the steps whose flips are measured where there are too many.
-        noise: that an energy may differ by, eV.
+        probe: a calculator object other than the run's.
+        rng: selects the steps at which flips are measured, if there are too many.
+        noise: noise level of an energy, eV.
     """
     crossed = crossings(run, limits)
     by_step: dict[int, list[int]] = {}

@@ -1,4 +1,4 @@
-"""How far a calculator's answers scatter and how many digits they carry: measured, not assumed."""
+"""Measure the noise of a calculator's energies and forces, and the number of digits they carry."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _FORMATS = ((8, "bfloat16"), (_HALF, "half precision"), (24, "single precision")
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """What an answer may differ by without anything being wrong."""
+    """Noise level of energies and forces: differences of this size do not indicate an error."""
 
     energy: float  # standard deviation, eV
     force: float  # standard deviation of a component, of the atom that scatters most, eV/Å
@@ -66,7 +66,7 @@ class NoiseFloor:
     freedom: float = math.inf  # independent values that the standard deviations were estimated from
 
     def louder(self, other: NoiseFloor) -> NoiseFloor:
-        """The larger of two, each part by itself, as well known as the one that is known less well."""
+        """Return the larger noise level for each component, with the smaller number of degrees of freedom."""
         return NoiseFloor(
             max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical),
             min(self.freedom, other.freedom),
@@ -74,10 +74,10 @@ class NoiseFloor:
 
     @property
     def allowed(self) -> NoiseFloor:
-        """What two answers may differ by: every comparison with noise is one with this.
+        """Largest difference allowed between two answers; every comparison with noise uses this value.
 
-        A standard deviation that few values gave may be far too small by chance, which Student's t takes into
-        account.
+        A standard deviation estimated from few values may be far too small by chance; Student's t
+        distribution accounts for this.
         """
         student = math.sqrt(2) * float(-stdtrit(min(self.freedom, 1e9), _BY_CHANCE / 2))
         return replace(self, **{
@@ -88,7 +88,7 @@ class NoiseFloor:
 def along_a_line(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, points: int = _POINTS
 ) -> NoiseFloor:
-    """Noise from differences of high order over equally spaced points: what is smooth drops out of them.
+    """Estimate noise from high-order differences at equally spaced points, which cancel smooth functions.
 
     Source:
         J. J. Moré and S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33, 1292 (2011).
@@ -115,7 +115,7 @@ def along_a_line(
 
 @dataclass(frozen=True)
 class Staircase:
-    """Whether answers go in steps, along a line on which smooth ones change from point to point."""
+    """Steps in energies and forces along a line on which smooth values change from point to point."""
 
     energy: float  # the size of a step, eV; 0 where there are none
     force: float  # of a force component, eV/Å
@@ -126,10 +126,10 @@ class Staircase:
 
 
 def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
-    """Steps of energies and forces: values that stay the same to the last bit and then change.
+    """Detect steps in energies and forces: values that stay the same to the last bit and then change.
 
-    A double, or a number of single precision, of something smooth is another one 1e-4 Å further on. Points
-    at which nothing at all has changed do not count: a calculator that has kept an answer looks like that.
+    In single or double precision, any smooth value changes within 1e-4 Å. Points at which nothing at all has
+    changed are not counted: a calculator that returned a cached answer looks the same.
     """
     key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
     if key in subject.known:
@@ -163,7 +163,7 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
 
 
 def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
-    """What the steps in which answers go make of them, and the digits that they carry."""
+    """Return the noise due to steps in the answers and to the number of digits they carry."""
     stairs = steps(subject, atoms)
     energies = stairs.energies
     grain = max(stairs.energy, digits(energies).grain(energies), _quantum(energies))
@@ -171,7 +171,7 @@ def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
 
 
 def _quantum(values: Float[np.ndarray, "points"]) -> float:
-    """A number of which second differences are different multiples; 0 where there is none above rounding."""
+    """Return a number of which the second differences are multiples; 0 if there is none above rounding."""
     sizes = np.abs(np.diff(values, n=2))
     sizes = sizes[sizes > np.spacing(largest(values)) / _ALIKE]
     for part in (1, 2, 3) if sizes.size else ():
@@ -182,7 +182,7 @@ def _quantum(values: Float[np.ndarray, "points"]) -> float:
 
 
 def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
-    """Standard deviation of the noise in each column, the middle one of three orders of difference."""
+    """Standard deviation of the noise in each column: the median of three orders of difference."""
     found = []
     for order in (4, 5, 6):
         weight = math.factorial(order) ** 2 / math.factorial(2 * order)
@@ -193,11 +193,11 @@ def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "c
 def order_change(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, rng: np.random.Generator
 ) -> tuple[float, NoiseFloor]:
-    """The largest change of the energy in other orders of the atoms, eV, and what rounding makes of it.
+    """Largest energy change on reordering the atoms, eV, and the noise floor if rounding explains it.
 
-    The floor is 0 where no rounding explains the change, or where nothing changes by more than the noise
-    along a line. The rounding of a sum is drawn anew wherever its terms are others, while terms that are
-    missing in another order change smoothly along a line.
+    The floor is 0 if rounding does not explain the change, or if no change exceeds the noise along a line.
+    The rounding error of a sum varies randomly with its terms, while terms that are missing in another order
+    change smoothly along a line.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
@@ -233,7 +233,7 @@ def order_change(
 
 
 def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
-    """Noise along a line, and what other orders of the atoms add to it."""
+    """Return the noise along a line, combined with the rounding noise from reordering the atoms."""
     noise = along_a_line(subject, atoms, rng)
     return noise.louder(order_change(subject, atoms, noise, rng)[1])
 
@@ -241,7 +241,7 @@ def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator)
 def in_order(
     subject: CalculatorSubject, atoms: Atoms, order: Int[np.ndarray, "atoms"]
 ) -> tuple[float, Forces]:
-    """Energy and forces of the atoms in another order, the forces put back into the given one."""
+    """Compute energy and forces with the atoms reordered; the forces are returned in the original order."""
     there = atoms[order]
     assert isinstance(there, Atoms)
     energy, forces = subject.both(there)
@@ -251,7 +251,7 @@ def in_order(
 
 
 def _odd_one(values: Float[np.ndarray, "points"]) -> int:
-    """The point without which the others are closest to a parabola."""
+    """Return the index of the point without which the others are closest to a parabola."""
     at = np.arange(len(values)) - len(values) // 2
     # of values that are all large, what they have in common has no digits to spare
     values = values - np.median(values)
@@ -265,9 +265,10 @@ def _odd_one(values: Float[np.ndarray, "points"]) -> int:
 def under_jitter(
     subject: CalculatorSubject, atoms: Atoms, size: float, rng: np.random.Generator
 ) -> NoiseFloor:
-    """The largest change of energy and of a force component when all atoms are moved at random by some Å.
+    """Largest change of energy and of a force component under random displacements of up to `size` Å.
 
-    Rounding coordinates of another image or of a turned structure moves atoms by an ulp of the largest.
+    Rounding the coordinates of a periodic image or of a rotated structure displaces atoms by an ulp of the
+    largest coordinate.
     """
     base, worst = subject.both(atoms), NoiseFloor(0.0, 0.0)
     for _ in range(_DRAWS):
@@ -284,15 +285,15 @@ def under_jitter(
 def settled(
     subject: CalculatorSubject, rng: np.random.Generator, at_least: int = FEW, brief: bool = False
 ) -> tuple[Atoms, NoiseFloor]:
-    """The structure with its atoms moved a little, away from any threshold, and the noise there.
+    """Return the structure with its atoms displaced slightly, away from any threshold, and the noise there.
 
-    In a perfect crystal a whole shell of neighbors can sit on a cutoff; a check that is not about
-    thresholds must not stand on one. A step of the energy inside the line shows as noise, so the quietest
-    of a few draws is taken.
+    In a perfect crystal a whole neighbor shell can lie exactly on a cutoff, which would disturb checks that
+    are not about thresholds. An energy step within the line appears as noise, so the quietest of several
+    random displacements is used.
 
     Args:
-        at_least: atoms; a smaller cell is repeated, where it repeats.
-        brief: take the first draw, and do not look at other orders.
+        at_least: minimum number of atoms; a smaller periodic cell is repeated.
+        brief: use the first displacement, and skip the test of other atom orders.
     """
     given = roomy(subject.atoms, at_least)
     # several checks ask with the same seed: the answer to the first is known
@@ -329,7 +330,7 @@ def settled(
 
 
 def roomy(atoms: Atoms, at_least: int) -> Atoms:
-    """A structure of so many atoms or more, repeated along its periodic axes; itself where none repeats."""
+    """Repeat a structure along its periodic axes until it has at least this many atoms."""
     if len(atoms) >= at_least or not len(atoms) or not atoms.pbc.any():
         return atoms
     times = math.ceil((at_least / len(atoms)) ** (1 / int(atoms.pbc.sum())))
@@ -337,13 +338,13 @@ def roomy(atoms: Atoms, at_least: int) -> Atoms:
 
 
 def direction(atoms: int, rng: np.random.Generator) -> Float[np.ndarray, "atoms 3"]:
-    """A random displacement of all atoms, the furthest by 1."""
+    """Return a random displacement of all atoms, with largest length 1."""
     drawn = rng.standard_normal((atoms, 3))
     return drawn / np.max(np.linalg.norm(drawn, axis=1))
 
 
 def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
-    """A copy with every atom moved by Å."""
+    """Return a copy with every atom displaced, Å."""
     there = atoms.copy()
     there.positions += by
     return there
@@ -351,28 +352,28 @@ def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
 
 @dataclass(frozen=True)
 class Digits:
-    """What all of some numbers share."""
+    """Decimals and significand bits shared by a set of numbers."""
 
     decimals: int | None  # they are rounded to; None where to none
     bits: int  # of their significands, at most; 53 for a double that is used in full
 
     @property
     def quantum(self) -> float:
-        """Step between two numbers that are rounded to decimals; 0 for others."""
+        """Spacing of numbers rounded to a fixed number of decimals; 0 for other numbers."""
         return 0.0 if self.decimals is None else 10.0**-self.decimals
 
     def grain(self, values: np.ndarray) -> float:
-        """Step between two numbers as large as the largest of some."""
+        """Return the spacing of representable numbers at the largest of these values."""
         return max(self.quantum, 2.0**-self.bits * largest(values))
 
     @property
     def format(self) -> str | None:
-        """Name of the narrow format that the bits fit into."""
+        """Name of the narrow floating-point format into which the bits fit; None if there is none."""
         return next((name for most, name in _FORMATS if self.bits <= most), None)
 
 
 def digits(values: np.ndarray) -> Digits:
-    """Decimals and bits of numbers; in full where there are too few different ones to tell."""
+    """Return the decimals and bits of numbers; full precision if there are too few distinct values."""
     found = np.unique(np.asarray(values, dtype=np.float64))
     found = found[np.isfinite(found) & (found != 0.0)]
     if len(found) < _FEWEST:
@@ -386,10 +387,10 @@ def digits(values: np.ndarray) -> Digits:
 
 
 def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
-    """A finding where answers carry fewer digits than a double: QUANTIZED, or LOW_PRECISION.
+    """Yield a finding, QUANTIZED or LOW_PRECISION, if answers carry fewer digits than a double.
 
-    Whether answers go in steps is measured along a line, whatever the numbers look like: forces that were
-    rounded before they were multiplied by a unit, or that come from rounded positions, are doubles in full.
+    Steps in the answers are measured along a line, whatever the numbers look like: forces that were rounded
+    before a unit conversion, or computed from rounded positions, use all digits of a double.
     """
     stairs = steps(subject, atoms)
     size, typical = largest(stairs.energies), rms(stairs.forces)

@@ -1,4 +1,4 @@
-"""Mistakes that belong to a place in the list of atoms: the first, the last, every eighth."""
+"""Detect errors tied to a position in the list of atoms: the first, the last, every eighth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PLACES, _CANDIDATES = 48, 4  # places that are tried, and of them for an ordina
 
 @dataclass(frozen=True)
 class WrongPlaces:
-    """Places in the list of atoms at which an answer is another one, whichever atom is there."""
+    """Positions in the list of atoms at which the answer is wrong, whichever atom is there."""
 
     places: tuple[int, ...]
     count: int  # of atoms
@@ -27,28 +27,28 @@ class WrongPlaces:
 
     @property
     def pattern(self) -> str:
-        """One of "first", "last", "every" (so many) and "some"."""
+        """Pattern of the wrong positions: "first", "last", "every" (nth) or "some"."""
         if len(self.places) == 1:
             return {0: "first", self.count - 1: "last"}.get(self.places[0], "some")
         return "every" if len(set(np.diff(self.places).tolist())) == 1 else "some"
 
     @property
     def values(self) -> dict[str, Any]:
-        """Of a finding."""
+        """Values for the sentences of a finding."""
         shown = ", ".join(map(str, self.places[:8])) + (", …" if len(self.places) > 8 else "")
         every = int(np.diff(self.places)[0]) if self.pattern == "every" else 0
         return {"places": shown, "every": every, "wrong_places": len(self.places), "count": self.count}
 
 
 def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) -> WrongPlaces | None:
-    """Find places by exchanging an atom with another of its species in an ordinary place, two at a time.
+    """Find wrong list positions by exchanging an atom with another of its species at an ordinary position.
 
-    In an ordinary pair of places nothing changes. A mistake that belongs to a place shows at that place in
-    any order of the atoms; what depends on all of the order, such as neighbors that are dropped, shows
-    nearly everywhere or elsewhere in another order.
+    Exchanging two atoms between ordinary positions changes nothing. An error tied to a position appears at
+    the same position in any order of the atoms; an error that depends on the whole order, such as dropped
+    neighbors, appears nearly everywhere, or elsewhere in another order.
 
     Returns:
-        None where no place stands out by more than is allowed, or nearly all do.
+        None if no position deviates by more than is allowed, or if nearly all do.
     """
     key = "places", atoms.positions.tobytes(), atoms.numbers.tobytes()
     if key not in subject.known:
@@ -75,10 +75,10 @@ def _wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor)
 def _at_places(
     subject: CalculatorSubject, atoms: Atoms, order: np.ndarray, places: Sequence[int], allowed: NoiseFloor
 ) -> dict[int, tuple[bool, bool]]:
-    """Whether energy and forces change when an atom is exchanged with an ordinary one of its species.
+    """Test whether energy and forces change when an atom is exchanged with one at an ordinary position.
 
     Returns:
-        for each place that was tried; none at all where most places of a species are no ordinary ones.
+        for each tested position; an empty dict if most positions of a species are not ordinary.
     """
     numbers, found = atoms.numbers[order], {}
     base = in_order(subject.fresh(), atoms, order)

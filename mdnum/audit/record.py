@@ -1,4 +1,4 @@
-"""A calculator by its words, what an audit of it keeps, and a script that shows its findings."""
+"""Load a calculator by name, store an audit, and write a script that reproduces its findings."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ STRUCTURES = "structures"  # where structures are kept that show a finding
 
 
 def load_calculator(words: str) -> LoadedCalculator:
-    """Find what words name, and make it once so that mistakes show here.
+    """Find the named calculator, and construct it once so that errors appear immediately.
 
-    A file is run again for each calculator, so that no two share a buffer.
+    A file is executed again for each calculator object, so that no two objects share a buffer.
 
     Args:
         words: `package.module:Class(argument=value)` with literals as arguments; a Python file in which
@@ -41,8 +41,8 @@ def load_calculator(words: str) -> LoadedCalculator:
             the name or path of a system of mdnum.
 
     Raises:
-        InputError: nothing by that name, arguments that are not literals, or making it failed; with what to
-            write instead.
+        InputError: the name was not found, an argument is not a literal, or the constructor failed; the
+            message gives the correct form.
     """
     text = words.strip()
     if not text:
@@ -111,7 +111,7 @@ def _of_system(text: str) -> LoadedCalculator:
 
 @dataclass
 class AuditState:
-    """An audit as far as it has come."""
+    """State of an audit that may be unfinished."""
 
     name: str  # of the calculator
     named: bool  # whether it was named in words, and is found again by them
@@ -134,18 +134,18 @@ class AuditState:
 
     @property
     def left(self) -> list[str]:
-        """Checks that are not done."""
+        """Names of the checks that are not finished."""
         done = {result.name for result in self.results}
         return [name for name in self.checks if name not in done]
 
     @property
     def shown(self) -> list[CheckResult]:
-        """What is known: of checks that are done, and of those that were asked in brief or cut short."""
+        """All results so far: finished checks, brief forms, and checks that were cut short."""
         return [*self.results, *(self.cut[name] for name in self.left if name in self.cut)]
 
     @property
     def atoms(self) -> Atoms:
-        """The structure."""
+        """Structure for which the calculator is audited."""
         atoms: Any = decode(self.structure)
         expect(isinstance(atoms, Atoms) and len(atoms), "no structure")
         expect(np.isfinite(atoms.positions).all() and np.isfinite(atoms.cell.array).all(), "no coordinates")
@@ -153,10 +153,10 @@ class AuditState:
 
 
 def kept(folder: RunFolder) -> AuditState:
-    """The audit in a folder.
+    """Load the audit stored in a folder.
 
     Raises:
-        FolderError: answers.json holds something else.
+        FolderError: answers.json does not hold an audit.
     """
     if not (folder.path / NAME).exists():
         raise FolderError("the folder holds no audit", remedy="Start a new audit", where=str(folder.path))
@@ -172,7 +172,7 @@ def kept(folder: RunFolder) -> AuditState:
 
 
 def encoded(atoms: Atoms) -> str:
-    """A structure as JSON, to the last bit; of its info what text can express."""
+    """Encode a structure as JSON, exact to the last bit; `info` keeps only text and numbers."""
     copy = atoms.copy()
     copy.info = {key: value for key, value in atoms.info.items() if isinstance(value, str | int | float)}
     copy.set_constraint()
@@ -180,10 +180,10 @@ def encoded(atoms: Atoms) -> str:
 
 
 def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
-    """A program that shows, with ASE alone, that structures which are the same have different answers.
+    """Return a program that shows, with ASE alone, that equivalent structures get different answers.
 
     Args:
-        words: the calculator as it was named.
+        words: the calculator as the user named it.
         pairs: names of structures without "-before" and "-after".
     """
     return _SCRIPT.format(
@@ -193,7 +193,7 @@ def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
 
 
 def _making(words: str) -> list[str]:
-    """Lines that define make()."""
+    """Return the source lines that define make()."""
     spot = place(words)
     head = ["", "", "def make():"]
     if spot is None:

@@ -1,4 +1,4 @@
-"""Structures that one object is asked about one after another: what a neighbor list can miss."""
+"""Sequences of structures for one calculator object, which reveal errors of its neighbor list."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked abou
 
 
 class SequenceStep(NamedTuple):
-    """A structure in a sequence, how it differs from the one before, and whether its answer is compared."""
+    """A structure in a sequence, its difference from the previous one, and whether its answer is compared."""
 
     what: str
     atoms: Atoms
@@ -28,7 +28,7 @@ class SequenceStep(NamedTuple):
 
 
 def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[SequenceStep]]:
-    """Sequences that begin with a structure, by name; those without anything in them left out."""
+    """Return the sequences that start from a structure, by name, without empty ones."""
     sequences = {
         "sizes": _sizes(atoms, rng), "a slow drift": _slow_drift(atoms, rng),
         "two atoms head on": _head_on(atoms), "strain": _strain(atoms), "wrapping": _wrapping(atoms, rng),
@@ -38,7 +38,7 @@ def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[Sequ
 
 
 def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """More atoms, fewer atoms, more and fewer neighbors, other species' places, other periodicity."""
+    """Yield structures with more or fewer atoms, more or fewer neighbors, other species and periodicity."""
     yield "the structure", atoms
     if len(atoms) <= 64 and atoms.pbc.any():
         yield "the structure grew to its supercell", atoms.repeat(np.where(atoms.pbc, 2, 1))
@@ -66,7 +66,7 @@ def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]
 
 
 def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """All atoms move a little each time, in directions of their own: what uses up a skin slowly."""
+    """Yield structures in which every atom moves slightly in its own direction, using up a skin slowly."""
     heading = rng.standard_normal((len(atoms), 3))
     heading /= np.linalg.norm(heading, axis=1)[:, None]
     yield "the structure", atoms
@@ -77,7 +77,7 @@ def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, A
 
 
 def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
-    """One atom, then two, move toward another in steps: what a criterion without its half misses."""
+    """Yield structures in which one atom, then two, approach another; this tests the half-skin criterion."""
     if len(atoms) < 2:
         return
     distances = atoms.get_distances(0, range(1, len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
@@ -95,7 +95,7 @@ def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
 
 
 def _strain(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
-    """The cell changes with the atoms, and without them."""
+    """Yield structures whose cell is strained, with and without scaling the atoms."""
     if not atoms.pbc.any():
         return
     cell = atoms.cell.array
@@ -111,7 +111,7 @@ def _strain(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
 
 
 def _wrapping(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Atoms jump to other images between calls, as codes that wrap positions make them."""
+    """Yield structures whose atoms jump to other periodic images, as in codes that wrap positions."""
     if not atoms.pbc.any():
         return
     there = atoms
@@ -130,10 +130,10 @@ def _scaled(atoms: Atoms, factor: float) -> Atoms:
 
 
 def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
-    """Two particles that come into one another's reach: sequences by name, each for an object of its own.
+    """Yield named sequences in which two particles come within the cutoff; each needs its own object.
 
     Args:
-        radius: beyond which they do not feel one another, Å.
+        radius: cutoff distance, beyond which the particles do not interact, Å.
     """
     apart, count = "the two apart", len(pair.first)
     for beyond in _BEYOND:

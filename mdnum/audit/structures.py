@@ -1,4 +1,4 @@
-"""What is asked about: a structure from a file, two particles on a line."""
+"""Structures used by an audit: a structure from a file, and two particles on a line."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _NEAREST = 0.3  # distances are walked from the first
 
 
 def read_structure(words: str | Path) -> Atoms:
-    """A structure from any file that ASE reads; `file@5` is its sixth, otherwise the last is taken.
+    """Read a structure from any file that ASE reads; `file@5` is the sixth structure, the default the last.
 
-    What follows the @ is what ASE takes there: a number, from the end if negative, or a choice in a database
-    (`file.db@id=3`), as long as it means one structure.
+    The text after @ is passed to ASE: a number, negative to count from the end, or a database selection
+    (`file.db@id=3`); it must select exactly one structure.
 
     Raises:
         InputError: no such file, ASE cannot read it, no atoms, numbers that are not finite.
@@ -72,7 +72,7 @@ def read_structure(words: str | Path) -> Atoms:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two particles, single atoms or whole molecules, that can be put at any distance."""
+    """Two particles, single atoms or whole molecules, that can be placed at any distance."""
 
     species: tuple[str, str]  # symbols of the two reference atoms; molecules by the heaviest of their atoms
     first: Atoms  # the particle that stays, its reference atom at the origin
@@ -84,7 +84,7 @@ class Pair:
     moves: Literal["atom", "molecule"] = "atom"
 
     def at(self, distance: float) -> Atoms:
-        """The two at a distance (of the reference atoms), which is exact in the last bit."""
+        """Return the pair at a given distance of the reference atoms, exact to the last bit."""
         both = self._together.copy()
         both.positions[len(self.first) :, 0] += distance
         return both
@@ -94,7 +94,7 @@ class Pair:
         return self.surrounded(self.first + self.second)
 
     def surrounded(self, atoms: Atoms, middle: bool = False) -> Atoms:
-        """Atoms in the cell that is around the two, moved to its middle where asked."""
+        """Put atoms into the cell of the pair, and center them if requested."""
         if self.box:
             atoms.set_cell([self.box] * 3)
             if middle:
@@ -103,12 +103,12 @@ class Pair:
         return atoms
 
     def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
-        """Distances between the two of all atoms but the reference atoms, at a distance of those."""
+        """Return the distances between atoms of the two particles, other than that of the reference atoms."""
         moved = self.second.positions[None] + [distance, 0.0, 0.0]
         return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
 
     def curve(self, subject: CalculatorSubject) -> Curve:
-        """Energy against distance, and the force that drives the second away from the first."""
+        """Energy as a function of distance, and the repulsive force on the second particle."""
 
         def at(distance: float) -> tuple[float, float]:
             energy, forces = subject.both(self.at(distance))
@@ -118,11 +118,12 @@ class Pair:
 
 
 def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[Skipped]]:
-    """Two of each species of the structure that the calculator answers for, the most frequent first.
+    """Return a pair for each two species that the calculator supports, the most frequent first.
 
-    Single atoms where it takes them as near as they come in the structure; where it does not (a bond order
-    may divide by the number of neighbors), each with two companions behind it; where it takes no such atoms
-    at all (rigid water), molecules of the structure.
+    A pair consists of single atoms if the calculator supports them at the smallest distance of the structure.
+    Otherwise (a bond order may divide by the number of neighbors) each atom gets two companions behind it; if
+    the calculator supports no such atoms at all (rigid water), the pair consists of molecules of the
+    structure.
 
     Returns:
         (pairs, what was left out and why).
@@ -150,7 +151,7 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
 
 
 def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
-    """A copy with other attributes; another cell takes the atoms along where they are scaled."""
+    """Return a copy with other attribute values; a new cell scales the atoms if `scaled`."""
     there = atoms.copy()
     if "cell" in values:
         there.set_cell(values.pop("cell"), scale_atoms=scaled)
@@ -160,7 +161,7 @@ def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
 
 
 def exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
-    """(atom, k) whose k-th and next neighbors are others after than before, by nearest images."""
+    """Return (atom, k) where the k-th and next nearest neighbors have changed places (minimum image)."""
     orders = []
     for atoms in (before, after):
         distances = atoms.get_all_distances(mic=bool(atoms.pbc.any()))
@@ -175,7 +176,7 @@ def exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
 
 
 def nearest_distance(atoms: Atoms) -> float:
-    """Smallest distance of two atoms of a structure, of the first 500 of many; 0 where there is one atom."""
+    """Smallest distance between two of the first 500 atoms of a structure; 0 for a single atom."""
     if len(atoms) < 2:
         return 0.0
     distances = atoms[: min(len(atoms), 500)].get_all_distances(mic=bool(atoms.pbc.any()))
@@ -183,13 +184,13 @@ def nearest_distance(atoms: Atoms) -> float:
 
 
 def trio(symbol: str, side: float, way: float) -> Atoms:
-    """An atom at the origin with two companions behind it."""
+    """Return an atom at the origin with two companions behind it."""
     depth = way * side * np.sqrt(0.75)
     return Atoms([symbol] * 3, [(0, 0, 0), (depth, side / 2, 0), (depth, -side / 2, 0)])
 
 
 def molecules(atoms: Atoms) -> list[np.ndarray]:
-    """Indices of the atoms of each molecule: those that bonds connect, by covalent radii."""
+    """Return the atom indices of each molecule: atoms connected by bonds, by covalent radii."""
     from ase.neighborlist import natural_cutoffs, neighbor_list
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -202,7 +203,7 @@ def molecules(atoms: Atoms) -> list[np.ndarray]:
 
 
 def whole(atoms: Atoms, indices: np.ndarray) -> Atoms:
-    """One molecule in one piece, its heaviest atom at the origin; no cell."""
+    """Return one molecule unwrapped, with its heaviest atom at the origin and no cell."""
     part = _part(atoms, indices)
     lead = int(np.argmax(part.get_masses()))
     offsets = part.get_distances(lead, np.arange(len(part)), mic=bool(atoms.pbc.any()), vector=True)
@@ -216,7 +217,7 @@ def _part(atoms: Atoms, indices: np.ndarray) -> Atoms:
 
 
 def _molecules(subject: CalculatorSubject) -> list[Pair]:
-    """Two molecules of the structure, where it consists of several; alike if there are two alike."""
+    """Return a pair of molecules of the structure, if there are several; identical ones if possible."""
     atoms, groups = subject.atoms, molecules(subject.atoms)
     if not 2 <= len(groups) <= len(atoms) / 2:
         return []
@@ -231,7 +232,7 @@ def _molecules(subject: CalculatorSubject) -> list[Pair]:
 def _answered(
     subject: CalculatorSubject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
 ) -> tuple[Pair | None, str]:
-    """The simplest surroundings in which the calculator gives energy and forces, or why there are none."""
+    """Return the pair in the simplest cell that the calculator supports, or the reason for None."""
     why = ""
     for cell, periodic in _SURROUNDINGS:
         name = "-".join(part.get_chemical_formula() for part in (first, second))
@@ -246,7 +247,7 @@ def _answered(
 
 
 def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
-    """Distances from where the calculator first answers to the farthest."""
+    """Return the scan distances from the first supported one to the farthest, and the farthest."""
     places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
     first = len(places)
     for k in range(len(places) - 1, -1, -1):
@@ -262,10 +263,10 @@ def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndar
 
 
 def group(atoms: Atoms) -> int | None:
-    """Atoms in a molecule, where the structure is molecules of several species, one after another; else None.
+    """Return the number of atoms per molecule, if the structure is a list of identical molecules; else None.
 
-    That species repeat in groups is not enough: so they do in a crystal of salt. Atoms of a group must be
-    bonded, by their covalent radii, and to no others.
+    A repeating sequence of species is not sufficient, since a salt crystal has one too. The atoms of a
+    molecule must be bonded to one another, by their covalent radii, and to no others.
     """
     numbers = atoms.numbers
     if len(set(numbers)) < 2:

@@ -1,4 +1,4 @@
-"""An ASE calculator as the checks see it: numbers or a clear error, never an answer from a cache."""
+"""An ASE calculator wrapped for the checks: numbers or a clear error, never a stale cached answer."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Answered = tuple[float, Forces] | CalculatorError  # energy and forces, or why t
 
 @dataclass
 class RepeatCounts:
-    """Questions that were asked more than once, to the last bit of the structure."""
+    """Statistics of structures that were evaluated more than once, identical to the last bit."""
 
     times: int = 0  # answers that could be compared with an earlier one
     differ: int = 0  # of them, those that are not the same to the last bit
@@ -49,12 +49,12 @@ class RepeatCounts:
 
 
 class Repeats:
-    """A few numbers of each answer of all objects of a calculator, compared where a question recurs.
+    """Fingerprints of all answers of a calculator's objects, compared when a structure is evaluated again.
 
     Attributes:
-        new: what new objects answered to the first question they were asked: nothing can be remembered there.
-        chance: answers that stuck out, asked for again of the same object; of those that differ, the ones
-            that rounding does not explain, and the largest difference of a force component.
+        new: statistics of the first answers of new objects, which have no memory of other structures.
+        chance: statistics of suspicious answers that were recomputed with the same object: number that differ
+            by more than rounding, and the largest difference of a force component.
     """
 
     def __init__(self):
@@ -62,7 +62,7 @@ class Repeats:
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
-        """Take note of what a new object (its number `which`) answered to its first question."""
+        """Record a new object's (number `which`) answer for its first structure."""
         before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
@@ -70,7 +70,7 @@ class Repeats:
             setattr(self.new, what, max(abs(value - before), getattr(self.new, what)))
 
     def findings(self, kT: float) -> list[Observed]:
-        """That one question has two answers, where that has come up and is no rounding."""
+        """Return the finding that one structure has two answers, if the difference is more than rounding."""
         for seen, who in ((self.chance, "same"), (self.new, "new")):
             if seen.differ:
                 told = not_repeatable(
@@ -83,7 +83,7 @@ class Repeats:
 
 
 def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) -> bool:
-    """Whether a change of the energy (eV) or of a force component (eV/Å) is more than any rounding."""
+    """Return whether a change of the energy (eV) or of a force component (eV/Å) is too large for rounding."""
     energy, forces = answer
     return change > max(_LARGE_ENERGY * kT, _LARGE_SHARE * abs(energy)) or (
         forces is not None and force > _LARGE * rms(forces)
@@ -91,7 +91,7 @@ def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) ->
 
 
 def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
-    """By how much two energies, and the force component that differs most, differ; 0 without forces."""
+    """Return the absolute energy difference and the largest force component difference; 0 without forces."""
     forces = None if one[1] is None or other[1] is None else other[1] - one[1]
     return abs(other[0] - one[0]), 0.0 if forces is None else largest(forces)
 
@@ -99,11 +99,11 @@ def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
 def not_repeatable(
     how: str, energy: float, force: float, typical: float, kT: float, **values: Any
 ) -> Observed:
-    """The finding that one question has two answers: an error where they differ by no rounding.
+    """Return the finding that one structure has two answers; an error if they differ by more than rounding.
 
     Args:
-        how: it came up, a variant of the sentences.
-        energy, force: by which answers differ, eV and eV/Å; typical: root mean square force, eV/Å.
+        how: how this was discovered, a variant of the sentences.
+        energy, force: difference of the answers, eV and eV/Å; typical: root mean square force, eV/Å.
     """
     values |= {"energy": energy, "force": force, "typical": typical}
     if force > _LARGE * typical or energy > _LARGE_ENERGY * kT:
@@ -113,7 +113,7 @@ def not_repeatable(
 
 @dataclass(frozen=True)
 class LoadedCalculator:
-    """A calculator by name."""
+    """A calculator found by name."""
 
     name: str  # what the person wrote
     stem: str  # a short word for a folder's name
@@ -125,31 +125,30 @@ class LoadedCalculator:
 
 
 class CalculatorSubject:
-    """A calculator and the structure it is asked about.
+    """A calculator and the structure for which it is audited.
 
-    ASE answers from its cache where no coordinate moved by more than 1e-15 Å, which is several
-    representable distances near an atom at the origin: where the bits differ, the cache is dropped first.
-    Bits that do not differ are answered from the cache, so that energy and forces cost one calculation;
-    `forget` makes the next question a calculation. The calculator is attached to the atoms that it is asked
-    about, as in a run: some answer in no other way. Each question may raise a `CalculatorError`: the
-    calculator raised, or answered with nan, and the structure has been saved.
+    ASE returns its cached answer if no coordinate moved by more than 1e-15 Å, which is several representable
+    distances near an atom at the origin: if the bits differ, the cache is cleared first. If no bit differs,
+    the cache is used, so that energy and forces cost one calculation; `forget` forces the next calculation.
+    The calculator is attached to the atoms, as in a run, since some calculators require it. Each evaluation
+    may raise a `CalculatorError`: the calculator raised an exception or returned nan, and the structure was
+    saved.
 
     Args:
-        name: what the person called it.
-        make: makes a calculator object that remembers nothing.
-        atoms: the structure; constraints are left out, since they change forces and not energies.
-        kT: energy that a jump is compared with, eV; that of 300 K.
-        folder: where structures are saved on which the calculator fails; a new temporary one if None.
-        units: what lengths and energies are in; "eV" and "Å" below are ε and σ for a calculator in reduced
-            units.
+        name: the calculator as the user named it.
+        make: creates a calculator object without any memory.
+        atoms: the structure; constraints are removed, since they change forces but not energies.
+        kT: thermal energy with which a jump is compared, eV; 300 K by default.
+        folder: folder for structures on which the calculator fails; a new temporary folder if None.
+        units: units of length and energy; "eV" and "Å" below are ε and σ for a calculator in reduced units.
 
     Attributes:
-        known: what checks have worked out about the calculator and its structure; shared by all objects.
-        repeats: what was answered to each question, by all objects.
+        known: results about the calculator and its structure that all checks and objects share.
+        repeats: comparison of the answers of all objects.
         meter: counts the calls of all objects.
-        forgets: drop what a calculator's own test for changes calls unchanged, where a bit has changed.
-        renews: make a new object after one that raised: some are of no use afterwards.
-        copies: ask about a copy of the atoms, and not about the object that is given.
+        forgets: clear the cache if a bit has changed and the calculator's own test reports no change.
+        renews: create a new object after an exception, since some objects are unusable afterwards.
+        copies: evaluate a copy of the atoms instead of the given object.
         saving: save structures on which the calculator fails.
     """
 
@@ -177,27 +176,27 @@ class CalculatorSubject:
 
     @property
     def calculator(self) -> Any:
-        """The calculator object, made when first used."""
+        """Calculator object, created at first use."""
         if self._calculator is None:
             self._calculator = self._make()
             self._object, self._seen = next(_objects), 0
         return self._calculator
 
     def fresh(self) -> CalculatorSubject:
-        """The same with a calculator object of its own, which remembers nothing."""
+        """Return a copy of the subject with a new calculator object without memory."""
         other = copy.copy(self)
         other.forgets = other.renews = other.copies = True
         other._calculator = other._last = None
         return other
 
     def used(self) -> CalculatorSubject:
-        """As `fresh`, and left alone: what it takes for unchanged and does after a failure are questions."""
+        """Return a fresh copy without safeguards, to test the object's change detection and recovery."""
         other = self.fresh()
         other.forgets = other.renews = False
         return other
 
     def forget(self) -> None:
-        """Make the next question a calculation, whatever ASE has kept."""
+        """Clear the cache, so that the next evaluation is a new calculation."""
         reset = getattr(self.calculator, "reset", None)
         if callable(reset):
             reset()
@@ -207,13 +206,13 @@ class CalculatorSubject:
         self._seen += 1
 
     def energy(self, atoms: Atoms) -> float:
-        """Potential energy in eV: the one the forces belong to where the calculator knows two."""
+        """Return the potential energy in eV: the one consistent with the forces if the calculator has two."""
         return self.energies(atoms)[0]
 
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:
-        """(the energy that forces belong to, the one that a run logs), eV.
+        """Return (the energy consistent with the forces, the energy that a run logs), eV.
 
-        ASE calls the first `free_energy` and the second `energy`; None where the calculator knows one alone.
+        ASE calls the first `free_energy` and the second `energy`; None if the calculator has only one.
         """
         asked = self._ask(atoms)
         both = self._answer(lambda: self._energies(asked), asked, "energy")
@@ -224,7 +223,7 @@ class CalculatorSubject:
         return energy, other
 
     def forces(self, atoms: Atoms) -> Forces:
-        """Forces in eV/Å; of another shape than the positions they raise as well."""
+        """Return forces in eV/Å; an array of the wrong shape raises an error as well."""
         asked = self._ask(atoms)
         forces = np.array(self._answer(asked.get_forces, asked, "forces"), dtype=np.float64)
         if forces.shape != (len(asked), 3):
@@ -242,11 +241,11 @@ class CalculatorSubject:
         return forces
 
     def both(self, atoms: Atoms) -> tuple[float, Forces]:
-        """Energy and forces."""
+        """Return energy and forces."""
         return self.energy(atoms), self.forces(atoms)
 
     def try_both(self, atoms: Atoms) -> Answered:
-        """Energy and forces, or why there are none, where either is of interest; no structure is saved."""
+        """Return energy and forces, or the error of the calculator; no structure is saved."""
         try:
             with self.trying():
                 return self.both(atoms)
@@ -254,12 +253,12 @@ class CalculatorSubject:
             return error
 
     def answers(self, atoms: Atoms) -> bool:
-        """Whether it has energy and forces for a structure."""
+        """Return whether the calculator gives energy and forces for a structure."""
         return not isinstance(self.try_both(atoms), CalculatorError)
 
     @contextmanager
     def trying(self) -> Iterator[None]:
-        """Failures are expected here (does it take two atoms without a cell?): no structure is saved."""
+        """Save no structures in this block, in which calculator failures are expected."""
         before, self.saving = self.saving, False
         try:
             yield
@@ -267,17 +266,17 @@ class CalculatorSubject:
             self.saving = before
 
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
-        """Asks this object a question that it has answered, of which `repeats` takes note.
+        """Evaluate a structure again with the same object, and record the comparison in `repeats`.
 
-        Only an answer that stands alone is one of chance: where the object that is asked again answers
-        otherwise than a new one does, what it has seen since may be why.
+        Only an isolated deviation counts as random: if the repeated answer also differs from that of a new
+        object, the history of this object may be the reason.
 
         Args:
-            energy: that was answered, eV; at least one of both.
-            forces: that were answered, eV/Å.
+            energy: the earlier energy, eV; at least one of both is required.
+            forces: the earlier forces, eV/Å.
 
         Returns:
-            Whether the answer is another one by more than rounding.
+            Whether the answer differs by more than rounding.
         """
         chance = self.repeats.chance
         if chance.times >= _MOST_AGAIN or chance.differ:
@@ -314,7 +313,7 @@ class CalculatorSubject:
         return asked
 
     def _nearly(self, atoms: Atoms) -> bool:
-        """Whether ASE would take these atoms for the ones before, although a bit differs."""
+        """Return whether ASE would treat these atoms as unchanged although a bit differs."""
         check = getattr(self.calculator, "check_state", None)
         if not callable(check):
             return False
@@ -384,7 +383,7 @@ class CalculatorSubject:
 
 
 def exact_extxyz(atoms: Atoms) -> str:
-    """A structure as text without losing a bit: symbols, positions, initial charges and magnetic moments."""
+    """Return a structure as exact text: symbols, positions, initial charges and magnetic moments."""
     return to_extxyz(atoms, ("initial_charges", "initial_magmoms"))
 
 
@@ -394,7 +393,7 @@ def _projection(size: int) -> np.ndarray:
 
 
 def largest(values: np.ndarray) -> float:
-    """The largest absolute value; 0 of none."""
+    """Return the largest absolute value; 0 for an empty array."""
     return float(np.max(np.abs(values), initial=0.0))
 
 
@@ -404,12 +403,12 @@ def rms(forces: np.ndarray) -> float:
 
 
 def bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
-    """Positions, numbers, cell and periods, which stay as they are where the atoms change."""
+    """Return copies of positions, numbers, cell and periodicity, independent of later changes."""
     return atoms.positions.copy(), atoms.numbers.copy(), np.array(atoms.cell), atoms.pbc.copy()
 
 
 def _question(atoms: Atoms) -> bytes:
-    """A digest of all that a calculator may read: charges, tags and info as well as the structure."""
+    """Return a digest of all calculator input: charges, tags and info as well as the structure."""
     parts = {**atoms.arrays, "cell": np.asarray(atoms.cell), "pbc": atoms.pbc}
     info = {key: value for key, value in atoms.info.items() if isinstance(value, _PLAIN)}
     text = b"|".join(name.encode() + parts[name].tobytes() for name in sorted(parts))
@@ -417,7 +416,7 @@ def _question(atoms: Atoms) -> bytes:
 
 
 def _bare(atoms: Atoms) -> Atoms:
-    """A copy with no calculator and no constraints, in float64."""
+    """Return a copy without calculator and constraints, in float64."""
     copy = atoms.copy()
     copy.calc = None
     copy.set_constraint()

@@ -1,10 +1,10 @@
-"""What only shows among many: routes through a structure, and an atom that is crowded until something drops.
+"""Search for discontinuities in many-atom environments: moves through a structure, and crowded atoms.
 
-What jumps for two atoms may jump otherwise among many (an embedding, an angle), and what is smooth for two
-may not be: triples, and atoms of the structure, are walked through what two atoms have shown and beyond. A
-cap on neighbors shows where one more atom is brought past all neighbors of a crowded center: exactly as far
-as the k-th of them, a calculator that keeps k neighbors exchanges one for the other, and something jumps;
-where it keeps the first k in its own order, a permutation of the atoms does the same.
+A jump of two isolated atoms may differ among many atoms (an embedding, an angle), and a pair that is smooth
+in isolation may jump there: triples, and atoms of the structure, are moved through the known pair thresholds
+and beyond. To detect a cap on neighbors, one more atom is moved past all neighbors of a crowded center: when
+it is as far as the k-th neighbor, a calculator that keeps k neighbors exchanges one for the other, and
+something jumps. If the calculator keeps the first k in list order, a permutation of the atoms shows the cap.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 
 
 
 class RouteCrossing(NamedTuple):
-    """A place along a route, length, at which the lead's distance to an atom passes a threshold."""
+    """A point along a route, length, at which the lead atom's distance to an atom passes a threshold."""
 
     at: float
     threshold: PairThreshold
@@ -56,7 +56,7 @@ class RouteCrossing(NamedTuple):
 
 @dataclass(frozen=True)
 class Route:
-    """A structure in which some atoms move along a line."""
+    """A structure in which some atoms move along a straight line."""
 
     name: str
     atoms: Atoms  # the structure at 0
@@ -65,13 +65,13 @@ class Route:
     direction: Float[np.ndarray, "3"]  # unit vector
 
     def at(self, along: float) -> Atoms:
-        """The structure with those atoms moved."""
+        """Return the structure with the moving atoms displaced along the line."""
         atoms = self.atoms.copy()
         atoms.positions[self.moving] += along * self.direction
         return atoms
 
     def curve(self, subject: CalculatorSubject) -> Curve:
-        """Energy, and force along the line on what moves."""
+        """Energy along the route, and the force on the moving atoms along the line."""
 
         def at(along: float) -> tuple[float, float]:
             energy, forces = subject.both(self.at(along))
@@ -80,9 +80,9 @@ class Route:
         return Curve(at)
 
     def crossings(self, thresholds: Sequence[PairThreshold], low: float, high: float) -> list[RouteCrossing]:
-        """Every place between low and high at which the lead's distance to an atom passes a threshold.
+        """Return the points between low and high at which a distance of the lead atom passes a threshold.
 
-        The distance along a line is a hyperbola, so the places are roots of a quadratic.
+        The distance along a line is a hyperbola, so the points are roots of a quadratic equation.
         """
         found: list[RouteCrossing] = []
         symbols = np.array(self.atoms.get_chemical_symbols())
@@ -100,13 +100,13 @@ class Route:
         return sorted(found, key=lambda one: one.at)
 
     def ties(self, along: float) -> tuple[tuple[int, int], ...]:
-        """(atom, k) where, at a place, an atom's k-th and (k+1)-th neighbors change places."""
+        """Return (atom, k) if the atom's k-th and (k+1)-th neighbors change places at this point."""
         return exchanged(self.at(along - _TIED), self.at(along + _TIED))
 
 
 @dataclass(frozen=True)
 class Event:
-    """A place on a route at which something jumps."""
+    """A point on a route at which the energy or one of its derivatives jumps."""
 
     route: str  # its name
     at: float  # place along it, length
@@ -118,7 +118,7 @@ class Event:
 
 @dataclass(frozen=True)
 class EnvironmentWalks:
-    """What walks through surroundings found."""
+    """Jumps found by moving atoms through many-atom environments."""
 
     events: tuple[Event, ...]  # places at which something jumps
     measured: int  # crossings of known thresholds that were measured
@@ -126,12 +126,12 @@ class EnvironmentWalks:
 
     @property
     def unexplained(self) -> list[Event]:
-        """Events that no pair threshold explains and that jump beyond doubt."""
+        """Significant jumps that no pair threshold explains."""
         return [one for one in self.events if one.threshold is None and one.jump.order < SMOOTH]
 
     @property
     def lower(self) -> list[Event]:
-        """Events at a pair threshold at which a lower derivative jumps than for two atoms alone."""
+        """Events at a pair threshold at which a lower derivative jumps than for two isolated atoms."""
         return [one for one in self.events if one.threshold and one.jump.order < min(one.threshold.order, 2)]
 
 
@@ -142,11 +142,11 @@ def walk_surroundings(
     crossings: int = _CROSSINGS,
     routes: int = _ROUTES,
 ) -> EnvironmentWalks:
-    """Walk triples, and atoms of the structure, through the known thresholds and search for unknown ones.
+    """Move triples and atoms of the structure through the known thresholds, and search for unknown ones.
 
     Args:
-        crossings: of known thresholds in the structure that are measured.
-        routes: through the structure on which others are searched.
+        crossings: number of known threshold crossings in the structure to measure.
+        routes: number of routes through the structure on which unknown thresholds are searched.
     """
     walks = walk_pairs(subject).walks
     thresholds = [one for walk in walks for one in walk.thresholds if one.order < SMOOTH or one.dies]
@@ -184,12 +184,12 @@ def walk_surroundings(
 
 
 def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
-    """What moves together: single atoms, or molecules where the calculator takes nothing less."""
+    """Return the groups that move together: single atoms, or molecules if the calculator requires them."""
     return [np.array([k]) for k in range(len(atoms))] if single else molecules(atoms)
 
 
 def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
-    """The groups nearest to the first, in one piece, in the surroundings of a pair; their order is kept."""
+    """Cut out the groups nearest to the first, unwrapped and in their original order, in a pair's cell."""
     center = _lead(atoms, groups[0])
     offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
@@ -209,7 +209,7 @@ def _lead(atoms: Atoms, group: np.ndarray) -> int:
 def _targeted(
     atoms: Atoms, thresholds: Sequence[PairThreshold], groups: Sequence[np.ndarray]
 ) -> list[tuple[Route, RouteCrossing]]:
-    """For each threshold, a few pairs of the structure near it, moved through it along their line."""
+    """Return a few routes for each threshold that move a nearby pair of atoms through it."""
     of_lead = {_lead(atoms, group): group for group in groups}
     symbols = np.array(atoms.get_chemical_symbols())
     ranked: list[tuple[int, Route, RouteCrossing]] = []
@@ -236,7 +236,7 @@ def _targeted(
 
 
 def _at_crossing(subject: CalculatorSubject, route: Route, crossing: RouteCrossing) -> Event:
-    """What jumps where a known threshold is crossed, to the last representable place if a value does."""
+    """Measure the jump at a known threshold, located to neighboring doubles if a value jumps."""
     curve, side = route.curve(subject), max(_SIDE, 3 * crossing.threshold.located)
     # what is smooth for two may jump among others: the lowest derivative that does, whatever the threshold
     for row in range(2):
@@ -262,7 +262,7 @@ def _event(
 def _scanned(
     subject: CalculatorSubject, thresholds: Sequence[PairThreshold], route: Route, low: float, high: float
 ) -> list[Event]:
-    """Unknown thresholds on a route."""
+    """Search a route for unknown thresholds."""
     curve = route.curve(subject)
     crossings = route.crossings(thresholds, low - 1.0, high + 1.0)
     inside = sum(low <= one.at <= high for one in crossings)
@@ -282,7 +282,7 @@ def _scanned(
 
 
 def _triples(subject: CalculatorSubject) -> list[tuple[Route, float, float]]:
-    """A third atom brought toward one of a bonded pair, beside their line: (route, from, to)."""
+    """Return routes (route, from, to) on which a third atom approaches a bonded pair, beside its axis."""
     found: list[tuple[Route, float, float]] = []
     for walk in walk_pairs(subject).walks[:_MOST_TRIPLES]:
         bond = float(walk.distance[int(np.argmin(walk.energy))])
@@ -299,7 +299,7 @@ def _triples(subject: CalculatorSubject) -> list[tuple[Route, float, float]]:
 
 
 def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tuple[Route, float, float]]:
-    """Routes of some atoms in arbitrary directions."""
+    """Return routes on which randomly chosen atoms move in random directions."""
     rng = np.random.default_rng(0)
     found: list[tuple[Route, float, float]] = []
     for k in rng.permutation(len(groups))[:count]:
@@ -312,7 +312,7 @@ def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tupl
 
 
 def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
-    """Whether an event is no more than a step of answers that are rounded to decimals."""
+    """Return whether an event is no more than a rounding step of answers rounded to decimals."""
     if not any(quantum):
         return False
     small = abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]
@@ -323,7 +323,7 @@ def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
 
 
 class CrowdOrder(NamedTuple):
-    """How the order of the atoms of a crowd matters."""
+    """How the order of the atoms in a crowd changes energy and forces."""
 
     # number of neighbors at which it starts to matter, None if it never does
     start: int | None = None
@@ -335,7 +335,7 @@ class CrowdOrder(NamedTuple):
 
 @dataclass(frozen=True)
 class Crowd:
-    """A center with many neighbors, none as far as another, and what came of crowding it."""
+    """A center with many neighbors at distinct distances, and the jumps found by crowding it."""
 
     species: str  # of all atoms
     radius: float  # cutoff that the crowd is inside of, length
@@ -350,13 +350,13 @@ class Crowd:
 
 
 def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int = _MOST) -> list[Crowd]:
-    """Crowd an atom of each species that the calculator takes alone.
+    """Surround one atom of each species with many neighbors, and measure whether the calculator caps them.
 
     Args:
         most: neighbors given to the center.
 
     Returns:
-        one for each species of the structure; none for a calculator that takes no single atoms.
+        one for each species of the structure; none for a calculator that does not support single atoms.
     """
     alike = [
         walk
@@ -378,10 +378,10 @@ def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int 
 
 
 def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndarray, "neighbors"]]:
-    """A center at the origin and count atoms around it at different distances: (atoms, distances).
+    """Return a center at the origin with `count` atoms around it, and their distinct distances.
 
-    The neighbors fill the shell evenly (a golden spiral in angle, equal volumes in distance), so that no two
-    are as near to one another as chance would put them. Sorted by distance, the center first.
+    The neighbors fill the shell evenly (golden spiral in angle, equal volumes in distance), so that no two
+    are as close to each other as random positions would be. They are sorted by distance, after the center.
     """
     k = np.arange(count)
     share = (k + 0.5) / count
@@ -397,7 +397,7 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
 
 
 def gap(atoms: Atoms) -> Float[np.ndarray, "3"]:
-    """The direction from the center that stays farthest from every neighbor."""
+    """Return the direction from the center that is farthest from every neighbor."""
     tried = np.random.default_rng(1).normal(size=(2000, 3))
     tried /= np.linalg.norm(tried, axis=1)[:, None]
     offsets = atoms.positions[1:] - atoms.positions[0]
@@ -418,10 +418,10 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     side = _SIDE_OF_TIE * float(np.spacing(np.float32(max(np.abs(atoms.positions).max(), radius))))
 
     def change(place: float, without: int | None = None) -> tuple[float, Float[np.ndarray, "atoms"]]:
-        """Changes from place - side to place + side that a smooth function has not; one atom may be left out.
+        """Nonsmooth changes from place - side to place + side; one atom may be left out.
 
-        (|change of the energy beyond the force's work|, for each atom |change of its force beyond the mean of
-        those over the stretches of that length before and after|).
+        (|change of the energy minus the force's work|, for each atom |change of its force minus the mean
+        change over the adjacent intervals of the same length|).
         """
         first, before = subject.both(walker(place - side, without))
         second, after = subject.both(walker(place + side, without))
@@ -466,7 +466,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
 
 
 def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int) -> CrowdOrder:
-    """From how many neighbors on permuting atoms changes anything, by how much, and if by their number."""
+    """Find the number of neighbors from which the atom order matters, and how large its effect is."""
     low, high, changed = 1, None, (0.0, 0.0)
     larger = iter([*(count for count in (4, 16, 64) if count < most), most])
     while count := next(larger, None) if high is None else (low + high) // 2 * (high - low > 1):
@@ -487,10 +487,10 @@ def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int)
 def _permuted(
     subject: CalculatorSubject, walk: PairWalk, radius: float, count: int, aside: bool = False
 ) -> tuple[float, float] | None:
-    """Changes of energy and force with the order of atoms; None if another order of sums explains them.
+    """Changes of energy and force on reordering the atoms; None if they are rounding of a reordered sum.
 
     Args:
-        aside: the last neighbor is out of reach of all others.
+        aside: move the last neighbor out of reach of all others.
     """
     atoms, _ = cluster(walk.pair, radius, count)
     if aside:

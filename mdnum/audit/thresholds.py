@@ -1,7 +1,7 @@
-"""Where a calculator's pair interactions change their program: found from its answers, never asked for.
+"""Locate the distances at which a calculator's pair interactions change form, from its answers alone.
 
-Two of each species are walked from far apart to as near as 1000 kT lets them. What only shows among many (an
-angle's own cutoff, a cap on neighbors) is for the walks through whole environments.
+Two atoms of each pair of species are moved from far apart to a distance that costs 1000 kT. Thresholds that
+appear only among many atoms (an angle's own cutoff, a cap on neighbors) are searched in surroundings.py.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _NOTHING = 1e-7  # of kT: where no more than this is left to be lost, the search
 
 @dataclass(frozen=True)
 class PairThreshold:
-    """A distance at which the energy or one of its derivatives jumps, or beyond which nothing is left."""
+    """A distance at which the energy or one of its derivatives jumps, or at which the interaction ends."""
 
     radius: float  # the distance, length
     species: tuple[str, str]  # of the two atoms (of the reference atoms of two molecules)
@@ -72,7 +72,7 @@ class PairThreshold:
 
 @dataclass(frozen=True)
 class Beyond:
-    """What was found past the scan."""
+    """Thresholds found beyond the range of the scan."""
 
     thresholds: tuple[PairThreshold, ...]  # changes and the end, by distance
     # (last distance at which the two feel one another, next one), None without an end
@@ -84,7 +84,7 @@ class Beyond:
 
 @dataclass(frozen=True)
 class PairWalk:
-    """Two particles brought from far apart to as near as they come."""
+    """Result of moving two particles from far apart to close contact."""
 
     pair: Pair
     thresholds: tuple[PairThreshold, ...]  # by distance
@@ -110,7 +110,7 @@ class PairWalk:
 
 @dataclass(frozen=True)
 class PairWalks:
-    """What walking pairs found."""
+    """Results of walking all pairs."""
 
     walks: tuple[PairWalk, ...]  # one for each pair that was walked
     ways: Ways  # all pairs that there are to walk, and what was left out
@@ -120,14 +120,14 @@ class PairWalks:
 
 
 def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
-    """Every distance at which a pair interaction changes its program, found once for a subject."""
+    """Return all distances at which a pair interaction changes form, computed once per subject."""
     if "thresholds" not in subject.known:  # a resumed audit knows them without a walk
         subject.known["thresholds"] = [one for walk in walk_pairs(subject).walks for one in walk.thresholds]
     return subject.known["thresholds"]
 
 
 def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWalks:
-    """Walk every pair of species through its distances, by calls of their own; remembered for the subject."""
+    """Walk every pair of species through its distances, with extra calls; cached in the subject."""
     if "walks" not in subject.known:
         with subject.meter.apart(WALKING_CALLS):
             subject.known["walks"] = _walked(subject, progress)
@@ -165,13 +165,13 @@ def _walked(subject: CalculatorSubject, progress: Progress) -> PairWalks:
 
 
 def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairWalk:
-    """Walk one pair.
+    """Scan one pair over its distances.
 
     Args:
-        calls: after so many, only the place that stands out most of the scan is zoomed into.
+        calls: number of calls after which only the most prominent place of the scan is examined.
 
     Raises:
-        CalculatorError: the calculator fails at distances at which it had answered before.
+        CalculatorError: the calculator fails at distances at which it worked before.
     """
     curve, kT = pair.curve(subject), subject.kT
     coarse, far = coarse_scan(subject, curve)
@@ -247,10 +247,9 @@ def _seen(
     rounding: float,
     known: Sequence[float],
 ) -> tuple[float, float, float, float] | None:
-    """(from, to, step of the force that is found at half of the places, step that is found at all).
+    """Return (from, to, force step found at half of the places, force step found at all places).
 
-    Beside a threshold that is known, another is hidden: those places do not count, nor do those beyond the
-    end.
+    Close to a known threshold another would be hidden; such places are not counted, nor those beyond the end.
     """
     felt = places < end
     for radius in known:
@@ -264,7 +263,7 @@ def _seen(
 
 
 def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThreshold | None:
-    """A threshold at which more jumps than the rounding of answers; of the last one, that it is there."""
+    """Return a threshold whose jump exceeds rounding; the end of an interaction is kept without its jump."""
     large = any(abs(jump) > STEPS * size for jump, size in zip(threshold.jumps[:2], quantum, strict=True))
     if threshold.order <= 1 and large:
         return threshold
@@ -272,7 +271,7 @@ def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThresh
 
 
 def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairThreshold]) -> bool:
-    """Whether it is companions of the two that pass another threshold there."""
+    """Return whether companion atoms of the pair pass another threshold at this distance."""
     others = pair.others(threshold.radius)
     radii = [one.radius for one in thresholds if one is not threshold]
     return len(others) > 0 and any(np.abs(others - radius).min() < 1e-5 for radius in radii)
@@ -284,10 +283,10 @@ def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairTh
 def _end_of(
     coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]
 ) -> tuple[float, float] | None:
-    """Neighboring distances, the last at which anything is felt and the next; None where nothing ever is.
+    """Return the last distance with an interaction and the next double; None if there is no interaction.
 
-    A smooth switch may be lost in rounding, here and there, before it ends: whatever is felt beyond what
-    was found moves the search outward.
+    A smooth switch may vanish in rounding at some distances before it ends; any interaction farther out moves
+    the search outward.
     """
     last = next((k for k in range(len(coarse) - 2, -1, -1) if alive(float(coarse[k]))), None)
     if last is None:
@@ -307,7 +306,7 @@ def _end_of(
 def _with_end(
     pair: Pair, curve: Curve, edge: tuple[float, float], found: list[PairThreshold], near: float
 ) -> list[PairThreshold]:
-    """The thresholds with the one beyond which nothing is left, measured as such."""
+    """Return the thresholds together with the measured end of the interaction."""
     inner = [one.radius for one in found if one.radius < edge[0] - 1e-3]
     room = min(edge[0] - max([near, *inner]), 0.5)
     jump = measure(curve, *edge, room, exact=True)
@@ -340,10 +339,10 @@ def _with_end(
 
 
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
-    """Where a force that falls with this power of the distance to its end would vanish.
+    """Extrapolate the end of an interaction whose force falls with this power of the distance to it.
 
-    The edge itself where it is no further off than the error of such an extrapolation: it falls to the power
-    only in the limit, while the edge is known to the last bit unless the force was lost in rounding.
+    Returns the edge itself if it is within the error of the extrapolation: the power law holds only in the
+    limit, while the edge is known to the last bit unless the force was lost in rounding.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])
     far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
@@ -363,10 +362,10 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
 def _beyond(
     subject: CalculatorSubject, pair: Pair, start: float, noise: Float[np.ndarray, "2"], calls: float
 ) -> Beyond | None:
-    """Look outward from a distance, as far as something is left that could be lost at a cutoff.
+    """Search outward from a distance, as long as the remaining energy could be lost at a cutoff.
 
-    None where no place could be asked about: in a periodic cell, where images of the two come near, or where
-    the calculator fails.
+    Returns None if no distance could be evaluated: in a periodic cell, where images of the particles come
+    near, or if the calculator fails.
     """
     if pair.periodic:
         return None
@@ -423,7 +422,7 @@ def _at(low: float, high: float) -> Float[np.ndarray, "nodes"]:
 def _rough(
     curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 ) -> Iterator[tuple[float, float]]:
-    """Narrow parts of an interval in which the force is no smooth decay, or the energy is not its work."""
+    """Yield narrow intervals in which the force is not smooth, or the energy differs from its work."""
     if high <= low or _smooth(curve, low, high, noise):
         return
     if high - low < _NARROW:
@@ -446,7 +445,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 
 
 def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
-    """Energy that a power of the distance loses from the last place on; inf where it falls too slowly."""
+    """Energy change from the last point to infinity by a power law; inf if the force falls too slowly."""
     first, last = abs(float(forces[0])), abs(float(forces[-1]))
     if not last or not first:
         return np.inf
@@ -455,7 +454,7 @@ def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"])
 
 
 def _expected(curve: Curve, place: float) -> float:
-    """The force at a place by the power of the distance with which it falls a little before."""
+    """Extrapolate the force at a distance by the power law with which it falls slightly before."""
     near, far = place - 0.5, place - 0.25
     first, last = (abs(curve(one)[1]) for one in (near, far))
     if not first or not last:
