@@ -1,4 +1,4 @@
-"""All checks of a calculator by name: one file each here, and those that other packages add."""
+"""Registry of all calculator checks: one module each in this package, and those of other packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Atoms without a neighbor feel no force, and energies of parts far apart add up."""
+"""Check that isolated atoms feel no force, and that energies of distant fragments add up."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ _EPS = np.finfo(float).eps
 
 
 class AloneCheck(AuditCheck):
-    """Do atoms without neighbors feel nothing, and do energies of parts far apart add up?
+    """Do atoms without neighbors feel no force, and do the energies of distant fragments add up?
 
     Attributes:
-        rows: a row for each structure that was answered for.
-        refused: what was not, and why.
-        takes_atoms: whether the calculator answers for anything that is no whole molecule.
+        rows: a row for each structure that the calculator supports.
+        refused: structures on which the calculator failed, and why.
+        takes_atoms: whether the calculator supports anything other than whole molecules.
     """
 
     name, title, order, calls = "alone", "Atoms alone", 48, 240
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Single atoms, and an atom far from a cluster."""
+        """Evaluate single atoms, and an atom far from a cluster."""
         with subject.meter.limited():
             self.look(subject, *settled(subject.fresh(), np.random.default_rng(self.seed)))
         found = list(self.findings())
@@ -54,7 +54,7 @@ class AloneCheck(AuditCheck):
         )
 
     def look(self, subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> None:
-        """Ask, by a new object each, about parts of a structure; molecules where nothing less is taken."""
+        """Evaluate fragments of a structure with new objects; whole molecules if nothing smaller works."""
         self.rows: list[dict[str, Any]] = []
         self.floor = noise.allowed
         self.refused: list[tuple[str, CalculatorError]] = []
@@ -63,7 +63,7 @@ class AloneCheck(AuditCheck):
         def energy(
             what: str, there: Atoms, expected: float | None = None, lone: slice = slice(None), size: int = 1
         ) -> float | None:
-            """Takes note of the energy, and of the forces on lone atoms (groups of this size, as a whole)."""
+            """Record the energy, and the net force on lone groups of `size` atoms."""
             answer = subject.fresh().try_both(there)
             if isinstance(answer, CalculatorError):
                 self.refused.append((what, answer))
@@ -120,7 +120,7 @@ class AloneCheck(AuditCheck):
             energy(f"two {name} {_AWAY} apart", _apart(one, one), total(alone, alone), size=size)
 
     def findings(self) -> Iterator[Observed]:
-        """What is wrong with atoms alone."""
+        """Yield findings about isolated atoms."""
         for what, why in [one for one in self.refused if one[1].cause is None][:1]:
             yield finding("LONELY_NOT_FINITE", "error", what=what, why=why.message)
         for what, why in [one for one in self.refused if one[1].cause is not None and self.takes_atoms][:1]:
@@ -136,14 +136,14 @@ class AloneCheck(AuditCheck):
 
 
 def _boxed(part: Atoms) -> Atoms:
-    """A part in a cell that does not repeat."""
+    """Return a fragment in a cell that is not periodic."""
     there = Atoms(part.numbers, part.positions - part.positions.min(axis=0) + [1.0, 2.0, 3.0])
     there.set_cell([_BOX + float(np.ptp(there.positions, axis=0).max())] * 3)
     return there
 
 
 def _apart(part: Atoms, other: Atoms) -> Atoms:
-    """A part, and another one beyond its reach."""
+    """Return a fragment together with another one beyond its cutoff."""
     there = other.copy()
     there.positions += [part.positions[:, 0].max() + _FAR - there.positions[:, 0].min(), 2.0, 3.0]
     return part + there

@@ -1,4 +1,4 @@
-"""What a calculator does to its caller: atoms, arrays and random numbers that are not its own."""
+"""Check that a calculator notices in-place changes and does not modify its caller's data."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _INFO = {"charge": 1, "spin": 2, "total_charge": 1, "multiplicity": 2}
 
 
 class CallerCheck(AuditCheck):
-    """Does a calculator see what its caller changes, and leave alone what is the caller's?
+    """Does a calculator notice what its caller changes, and leave the caller's data unchanged?
 
-    One `Atoms` object that is edited in place, as dynamics edits it; arrays that were returned; generators of
-    random numbers.
+    Tested with an `Atoms` object that is edited in place, as in dynamics; with arrays that were returned; and
+    with random number generators.
     """
 
     name, title, order, calls = "caller", "Caller", 30, 280
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Every question, each with an object of its own."""
+        """Answer every question with a new object."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
             atoms, noise = settled(subject.fresh(), rng)
@@ -63,7 +63,7 @@ class CallerCheck(AuditCheck):
 
 
 def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Callable[[Atoms], Any]]]:
-    """(what is changed, what changes it in an `Atoms` object)."""
+    """Yield (name of the changed quantity, function that changes it in an `Atoms` object)."""
     moves = 0.02 * rng.uniform(-1, 1, (len(atoms), 3))
     yield "positions", lambda there: np.add(there.positions, moves, out=there.positions)
     if len(set(atoms.numbers)) > 1:
@@ -81,7 +81,7 @@ def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Call
 def _edited(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, what: str, change: Callable[[Atoms], Any]
 ) -> Iterator[Observed]:
-    """One calculator and one `Atoms` object, before a change and after it, beside new ones."""
+    """Compare one calculator before and after an in-place change of its `Atoms` object with new objects."""
 
     def asked() -> tuple[tuple[float, Forces], tuple[float, Forces]]:
         used, there = subject.used(), atoms.copy()
@@ -105,7 +105,7 @@ def _edited(
 
 
 def _buffers(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """Arrays that were returned stay what they were, and writing to them changes no later answer."""
+    """Test that returned arrays do not change, and that writing to them does not change later answers."""
     used, there = subject.fresh(), atoms.copy()
     used.copies = False
     used.both(there)
@@ -130,7 +130,7 @@ def _buffers(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
 
 
 def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """Generators that belong to all of a process, before and after a call: drawn from, or seeded."""
+    """Test whether a call draws from, or reseeds, the global random number generators of the process."""
     generators: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], Callable[[int], Any]]] = {
         "numpy.random": (np.random.get_state, np.random.set_state, np.random.seed),
         "random": (random.getstate, random.setstate, random.seed),
@@ -167,7 +167,7 @@ def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
 
 
 def _written(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """What the calculator does to the atoms that it is handed, and not a copy of; many wrap them."""
+    """Test whether the calculator modifies its `Atoms` argument; many calculators wrap positions."""
     outside = displaced(atoms, np.tile((atoms.pbc * 1.0) @ atoms.cell.array, (len(atoms), 1)))
     for given, what in ((atoms, "the structure"), (outside, "the structure one cell further")):
         other, there = subject.fresh(), given.copy()

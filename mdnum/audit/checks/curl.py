@@ -1,4 +1,4 @@
-"""Work around small closed loops: a force that has an energy does none."""
+"""Check the work around small closed loops, which is zero for a force that derives from an energy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Displacement = Float[np.ndarray, "atoms 3"]
 
 @dataclass(frozen=True)
 class Loop:
-    """A force carried around a circle in the space of all coordinates."""
+    """Work of a force around a circle in the space of all coordinates."""
 
     plane: str  # in words
     radius: float  # Å, of the displacement of all atoms together
@@ -41,18 +41,18 @@ class Loop:
 
     @property
     def share(self) -> float:
-        """Antisymmetric over symmetric part."""
+        """Antisymmetric part of the force derivative, relative to the symmetric part."""
         return abs(self.curl) / self.stiffness if self.stiffness else (float("inf") if self.curl else 0.0)
 
 
 class CurlCheck(AuditCheck):
-    """Do the forces work around closed loops?"""
+    """Do the forces do work around closed loops?"""
 
     name, title, order, basic, calls = "curl", "Curl", 20, True, 500
     needed_to = ("differentiate",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """The circulation of the forces in planes of all kinds."""
+        """Compute the circulation of the forces in several planes of coordinate space."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
         radii, ways = _RADII[:1] if self.brief else _RADII, Ways()
@@ -98,9 +98,9 @@ class CurlCheck(AuditCheck):
 
 
 def agreed(tried: Sequence[Loop]) -> Loop:
-    """The loop with the smallest error, which is raised where a loop of another radius disagrees.
+    """Return the loop with the smallest error, increased if a loop of another radius disagrees.
 
-    A curl is the same on every small circle; what a jump of the forces does to the work around one is not.
+    A curl is the same on every small circle; the work due to a jump of the forces is not.
     """
     best = min(tried, key=lambda one: one.error)
     others = [one.curl for one in tried if _SIGNIFICANT * one.error < abs(best.curl)]
@@ -111,7 +111,7 @@ def agreed(tried: Sequence[Loop]) -> Loop:
 def _planes(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator
 ) -> Iterator[tuple[str, Displacement, Displacement]]:
-    """Two orthonormal displacements each: of all atoms, of one atom, of an atom and one that it feels."""
+    """Yield planes of two orthonormal displacements: of all atoms, of one atom, of two interacting atoms."""
     count = len(atoms)
     if count > 1:
         for number in range(3):
@@ -150,10 +150,10 @@ def around(
     noise: NoiseFloor,
     plane: str = "",
 ) -> Loop:
-    """The work of the forces around x + radius (u cos t + v sin t), in the plane of orthogonal unit vectors.
+    """Compute the work of the forces around x + radius (u cos t + v sin t), for orthogonal unit vectors.
 
     Error:
-        what a part of the points gives otherwise, and the noise of the forces.
+        the spread over subsets of the points, and the noise of the forces.
     """
     angles = 2 * np.pi * np.arange(_POINTS) / _POINTS
     forces = [

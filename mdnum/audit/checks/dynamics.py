@@ -1,6 +1,6 @@
-"""A short run at constant energy: how much of its energy drifts away, and to what it is due.
+"""Check the energy drift of a short run at constant energy, and find its sources.
 
-ASE's velocity Verlet; molecules of rigid models keep their shape.
+Runs use ASE's velocity Verlet; molecules of rigid models keep their shape.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ _SOURCES = ("integrator", "flips", "elsewhere", "rest")
 
 
 class DynamicsCheck(AuditCheck):
-    """Does a short run at constant energy keep its energy, and if not, why?
+    """Does a short run at constant energy conserve its energy, and if not, why?
 
-    Drift of the energy with a block error, separated into integrator, flips and the rest. What is left of
-    the drift when flips and the work of the forces are taken out is the integrator's, and must fall to a
+    Reports the energy drift with a block error, separated into integrator, flips and the rest. The drift that
+    remains after subtracting flips and the work of the forces is due to the integrator, and must fall to a
     quarter with half the time step, which a second run tests.
     """
 
@@ -58,7 +58,7 @@ class DynamicsCheck(AuditCheck):
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Two runs and where their energy went."""
+        """Run twice, with the full and with half the time step, and compute the energy balance."""
         with subject.meter.limited():
             return self._ask(subject, progress)
 
@@ -112,7 +112,7 @@ class DynamicsCheck(AuditCheck):
 
 
 def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor) -> tuple[float, float]:
-    """Largest difference of a run's energies from those of new objects, and what noise allows, eV."""
+    """Largest energy difference between a run and new objects, and the difference allowed by noise, eV."""
     places = np.unique(np.linspace(0, len(ran.potential) - 1, count).astype(int))
     again = [subject.fresh().energy(ran.at(ran.positions[n])) for n in places]
     rounding = NoiseFloor(np.finfo(float).eps * largest(ran.potential), 0.0)
@@ -120,7 +120,7 @@ def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor
 
 
 def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult:
-    """What a few steps tell: that they were answered, and by what does not depend on the steps before."""
+    """Return the result of a short run, which tests whether answers depend on earlier steps."""
     (differs, allowed), steps = stale, len(ran.potential) - 1
     change = 1e3 * largest(ran.total - ran.total[0]) / ran.positions.shape[1]
     seen = Measured(differs, "energy", allowed)
@@ -131,7 +131,7 @@ def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult
 
 
 def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
-    """Thresholds, or why none are known."""
+    """Return the pair thresholds, or the reason why none are known."""
     try:
         # one at which no more than a third derivative jumps leaves no trace in a run
         found = [one for one in find_thresholds(subject) if one.order < SMOOTH or one.dies]
@@ -142,7 +142,7 @@ def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
 
 @dataclass(frozen=True)
 class TwoRuns:
-    """Two runs and where their energy went."""
+    """Two runs, with full and half the time step, and their energy balance."""
 
     subject: CalculatorSubject
     # whole, half: the run, and the one with half its time step
@@ -157,7 +157,7 @@ class TwoRuns:
     period: float  # of the fastest vibration, internal time
 
     def shares(self) -> dict[str, Drift]:
-        """Drift of all, of flips, of the rest, and of the integrator by either way, meV/atom/ps."""
+        """Drift of the total, of flips, of the rest, and of the integrator by two methods, meV/atom/ps."""
         one, other = self.whole, self.half
         rest, elsewhere = self.balance.filled, self.balance.elsewhere
         flips = wandering(one.time, self.balance.jumps)
@@ -186,7 +186,7 @@ class TwoRuns:
         return {name: share.times(factor) for name, share in found.items()}
 
     def outcome(self, unknown: str) -> CheckResult:
-        """What the check found; `unknown` says why there is no threshold."""
+        """Return the result of the check; `unknown` is the reason why there is no threshold."""
         shares = self.shares()
         numbers = self._numbers(shares)
         crossed, measured = len(self.balance.crossed), len(self.balance.measured)
@@ -324,7 +324,7 @@ class TwoRuns:
         return Chart(title, f"time ({units.time})", f"change (m{ENERGY}/atom)", time.tolist(), curves)
 
     def energy_rows(self) -> dict[str, list[Any]]:
-        """Rows of energies.parquet."""
+        """Return the columns of energies.parquet."""
         jumps, elsewhere = self.balance.jumps, self.balance.elsewhere
         unknown = np.full(len(self.half.potential), np.nan)
         parts: list[dict[str, Any]] = []
@@ -344,7 +344,7 @@ class TwoRuns:
         return {name: np.concatenate([part[name] for part in parts]).tolist() for name in parts[0]}
 
     def crossing_rows(self) -> dict[str, list[Any]]:
-        """Rows of crossings.parquet."""
+        """Return the columns of crossings.parquet."""
         crossed, measured = self.balance.crossed, self.balance.measured
         names = ("step", "i", "j", "rank", "entered", "distance", "margin")
         return {
@@ -359,7 +359,7 @@ class TwoRuns:
 
 
 class _Bridge(Calculator):
-    """The calculator under audit as an ASE calculator, so that a failure saves its structure."""
+    """ASE calculator that wraps the audited one, so that a structure on which it fails is saved."""
 
     implemented_properties = ["energy", "forces"]  # noqa: RUF012
 
@@ -380,7 +380,7 @@ def prepared(
     period: float,
     rng: np.random.Generator,
 ) -> Atoms:
-    """A structure with thermal velocities; `period` is that of its fastest vibration, internal time."""
+    """Return a structure with thermal velocities; `period` is of its fastest vibration, internal time."""
     from ase import units
 
     # atoms at rest in their places take half of the kinetic energy into vibrations
@@ -399,7 +399,7 @@ def prepared(
 def fitting_timestep(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, iterations: int = _POWER_ITERATIONS
 ) -> tuple[float, float]:
-    """A time step for a structure, internal time, and the period of its fastest vibration (inf for none)."""
+    """Estimate a time step and the period of the fastest vibration (inf for none), internal time."""
     roots = np.sqrt(atoms.get_masses())[:, None]
     mode = direction(len(atoms), rng)
     mode /= np.linalg.norm(mode)
@@ -429,7 +429,7 @@ def run(
     """Run at constant energy with one calculator object.
 
     Args:
-        start: with velocities and constraints; left as it is.
+        start: structure with velocities and constraints; not modified.
         timestep: internal time.
 
     Returns:
@@ -461,10 +461,10 @@ def run(
 
 @dataclass
 class RigidGroups:
-    """Distances within equal groups of atoms stay what they are: an ASE constraint.
+    """ASE constraint that keeps all distances within equal groups of atoms fixed.
 
-    As ASE's FixBondLengths, which takes one bond at a time in Python; here one bond of every group at once,
-    a hundred times faster for water.
+    ASE's FixBondLengths treats one bond at a time in Python; this class treats one bond of every group at
+    once, which is a hundred times faster for water.
 
     Source:
         H. C. Andersen, Rattle: a velocity version of the Shake algorithm, J. Comput. Phys. 52, 24 (1983).
@@ -476,11 +476,11 @@ class RigidGroups:
     lengths: Float[np.ndarray, "bonds groups"]  # Å
 
     def get_removed_dof(self, atoms: Atoms) -> int:
-        """Degrees of freedom that are gone."""
+        """Return the number of constrained degrees of freedom."""
         return int(self.first.size)
 
     def adjust_positions(self, atoms: Atoms, new: Float[np.ndarray, "atoms 3"]) -> None:
-        """Move atoms along their bonds until all lengths are right."""
+        """Move atoms along their bonds until all bond lengths are restored."""
         old, share = atoms.positions, 1 / atoms.get_masses()
 
         def settled(i: np.ndarray, j: np.ndarray, length: np.ndarray) -> bool:
@@ -494,7 +494,7 @@ class RigidGroups:
         self._sweep(settled)
 
     def adjust_momenta(self, atoms: Atoms, momenta: Float[np.ndarray, "atoms 3"]) -> None:
-        """Take out what would stretch a bond."""
+        """Remove the momentum components that would stretch a bond."""
         share = 1 / atoms.get_masses()
         size = float(np.max(np.abs(momenta), initial=0.0)) * float(np.max(share))
 
@@ -517,15 +517,15 @@ class RigidGroups:
                 return
 
     def adjust_forces(self, atoms: Atoms, forces: Float[np.ndarray, "atoms 3"]) -> None:
-        """Nothing: a run adjusts momenta instead."""
+        """Leave the forces unchanged; a run adjusts momenta instead."""
 
     def todict(self) -> dict[str, Any]:
-        """As ASE's own constraints describe themselves."""
+        """Return the constraint as a dictionary, in the form of ASE's own constraints."""
         return {"name": "RigidGroups", "kwargs": {}}
 
 
 def rigid(atoms: Atoms) -> RigidGroups | None:
-    """Holds all distances within the molecules of a structure; None where species do not repeat in groups."""
+    """Return a constraint on all distances within molecules; None for a structure without molecules."""
     size = group(atoms)
     if size is None:
         return None

@@ -1,4 +1,4 @@
-"""Forces against differences of the energy, with a step that the calculator's own noise decides."""
+"""Compare forces with finite differences of the energy, with a step chosen from the calculator's noise."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ Displacement = Float[np.ndarray, "atoms 3"]
 
 @dataclass(frozen=True)
 class Slope:
-    """The derivative of the energy along a direction, by differences and from the forces."""
+    """Derivative of the energy along a direction, from finite differences and from the forces."""
 
     direction: str  # in words
     difference: float  # by differences of the energy, eV/Å
@@ -67,28 +67,28 @@ class Slope:
 
     @property
     def gap(self) -> float:
-        """|difference - force|, eV/Å."""
+        """Deviation |difference - force|, eV/Å."""
         return abs(self.difference - self.force)
 
     @property
     def agrees(self) -> bool:
-        """Whether force and difference are the same within the error of the difference."""
+        """Whether force and finite difference agree within the error of the difference."""
         return self.gap <= _SIGNIFICANT * self.error
 
 
 class ForcesCheck(AuditCheck):
-    """Are the forces the derivative of the energy, and of which one?
+    """Are the forces the derivative of the energy, and of which energy?
 
     The error of a difference is |D(h) - D(h/4)| after extrapolation plus the measured noise over the step; of
-    a ladder of steps the one with the smallest error is taken. A difference that grows like 1/h is a step of
-    the energy, not a wrong force, and is reported as such.
+    a ladder of steps the one with the smallest error is used. A difference that grows like 1/h indicates a
+    step of the energy, not a wrong force, and is reported as such.
     """
 
     name, title, order, basic, calls = "forces", "Forces", 10, True, 500
     needed_to = ("run", "differentiate")
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Forces against central differences, extrapolated, and sums that must vanish."""
+        """Compare forces with extrapolated central differences, and compute sums that must vanish."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
         ways = Ways()
@@ -185,7 +185,7 @@ class ForcesCheck(AuditCheck):
 
 
 def _fewer(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> tuple[Atoms, NoiseFloor]:
-    """The atoms that are nearest to one of them, without periods, and the noise there."""
+    """Return a nonperiodic cluster of the atoms nearest to the first one, and its noise level."""
     away = atoms.get_distances(0, range(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.sort(np.argsort(np.linalg.norm(away, axis=1))[:_CLUSTER])
     there = Atoms(atoms.numbers[nearest], away[nearest])
@@ -199,7 +199,7 @@ def _worst(slopes: list[Slope]) -> Slope:
 
 
 def _directions(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Displacement]]:
-    """Displacements of all atoms at random, and of a few atoms along each axis; the furthest moves by 1."""
+    """Yield displacements of length at most 1: of all atoms at random, and of a few along each axis."""
     for number in range(_DIRECTIONS):
         yield f"all atoms at random, {number + 1}", direction(len(atoms), rng)
     for who in sorted(rng.permutation(len(atoms))[:_ATOMS]):
@@ -217,7 +217,7 @@ def slope(
     noise: NoiseFloor,
     what: str = "",
 ) -> Slope:
-    """The derivative of the energy along a line by differences, with its error, beside that of the forces.
+    """Derivative of the energy along a line by finite differences, with its error, and by the forces.
 
     Args:
         line: displacement per Å of step; `what` names it.
@@ -257,14 +257,14 @@ def slope(
 def _best(
     gaps: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
 ) -> tuple[int, float]:
-    """(the step that counts, the error there): the smallest error's, unless others do not bear it out.
+    """Return the index and error of the step of smallest error, unless other steps contradict it.
 
-    Where the energy jumps at flips, two steps may hold the same jumps by chance, and agree on a wrong slope.
-    A wrong force is as wrong at every step that can tell, and at the shorter ones above all.
+    If the energy jumps at flips, two steps may contain the same jumps by chance, and agree on a wrong slope.
+    A wrong force is equally wrong at every step that resolves it, in particular at the shorter ones.
 
     Args:
         gaps: difference minus force at each step, the longest first.
-        error: of the differences, estimated; rounding: the part of it that noise explains.
+        error: of the differences, estimated; rounding: the contribution of noise to this error.
     """
     best = int(np.argmin(error))
     wrong = abs(gaps[best])
@@ -280,7 +280,7 @@ def _best(
 
 
 def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dict[str, Any]]:
-    """Net force, and net torque where nothing repeats: by symmetry of space both are zero."""
+    """Net force, and net torque of a nonperiodic structure; both are zero by symmetry of space."""
     size = float(np.sum(np.abs(forces)))
     allowed = noise.allowed.force * np.sqrt(len(atoms)) + 40 * np.finfo(float).eps * size
     net = float(np.linalg.norm(forces.sum(axis=0)))
@@ -295,7 +295,7 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
 def _drowned(
     worker: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, known: float, scale: float
 ) -> list[Observed]:
-    """A finding where forces, or what differences can tell of them, are lost in noise that is no rounding."""
+    """Return a finding if forces, or their finite differences, are lost in noise that is not rounding."""
     stairs = steps(worker, atoms)  # which are another finding
     size = max(noise.force, 0.0 if stairs.energy else known)
     if size <= max(_DROWNED * scale, stairs.force):
@@ -341,7 +341,7 @@ def _row(one: Slope) -> dict[str, Any]:
 
 
 def _chart(slopes: list[Slope]) -> Chart:
-    """Difference of forces and differences by step: a valley where all is well, a plateau where it is not."""
+    """Chart of the force deviation against step: a valley for correct forces, a plateau for wrong ones."""
     shown = slopes[:_DIRECTIONS]
     shown += [one for one in [_worst(slopes)] if one not in shown]
     lines = {one.direction: one.gaps[::-1].tolist() for one in shown}
@@ -356,13 +356,13 @@ def _chart(slopes: list[Slope]) -> Chart:
 def _two_energies(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, line: Displacement, along: Slope
 ) -> Iterator[Observed]:
-    """A finding where `energy` and `free_energy` differ by what is not constant.
+    """Yield a finding if `energy` and `free_energy` differ by more than a constant.
 
-    Every other check is about the free energy, which forces belong to by ASE's definition; where the two
-    differ by a constant at most, what they find holds for both.
+    All other checks examine the free energy, to which forces belong by ASE's definition; if the two energies
+    differ by at most a constant, their findings hold for both.
 
     Args:
-        along: the slope along the line, a displacement per Å of a structure away from thresholds.
+        along: derivative along `line`, a displacement per Å of a structure away from thresholds.
     """
     free, logged = subject.energies(atoms)
     if logged is None:

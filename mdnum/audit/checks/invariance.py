@@ -1,4 +1,4 @@
-"""Whether energy and forces depend on how a structure is written down."""
+"""Check whether energy and forces depend on how a structure is represented."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _SEPARATE = {
 
 @dataclass(frozen=True)
 class Same:
-    """A structure that is the same as another, written down otherwise."""
+    """Another representation of the same structure."""
 
     what: str  # how it differs
     code: str  # of the finding when the calculator gives it another answer
@@ -55,13 +55,13 @@ class Same:
 
 
 def _same(code: str, base: Atoms, what: str, there: Atoms, factor: float = 1.0, **more) -> Same:
-    """The atoms of a structure in its order, rounded like its coordinates."""
+    """Return a representation with the atoms in their order, rounded like the coordinates."""
     return Same(what, code, there, np.arange(len(there)), **{"rounding": factor * ulp(there, base), **more})
 
 
 @dataclass(frozen=True)
 class _Difference:
-    """What two ways of writing down one structure differ by, and may differ by."""
+    """Differences between two representations of one structure, and the differences allowed."""
 
     same: Same
     energy: float
@@ -85,18 +85,18 @@ class _Difference:
 
 
 class InvarianceCheck(AuditCheck):
-    """Do energy and forces of one structure depend on how it is written down?
+    """Do energy and forces of a structure depend on its representation?
 
-    What may differ is measured: noise of the calculator along a line, and the largest change under random
-    moves of the size of the rounding of coordinates. A transformation that the calculator does not support
-    is left out. `structures` holds both ways of writing down wherever their answers differ.
+    Allowed differences are measured: the calculator's noise along a line, and the largest change under random
+    displacements of the size of coordinate rounding. A transformation that the calculator does not support is
+    skipped. `structures` holds both representations if their answers differ.
     """
 
     name, title, order, calls = "invariance", "Invariance", 40, 450
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """One structure, written down in many ways."""
+        """Evaluate many representations of one structure."""
         rng = np.random.default_rng(self.seed)
         judge = _Judge(subject, rng)
         same = _in_turns(self.ways(judge.atoms, subject.atoms, rng))
@@ -140,7 +140,7 @@ class InvarianceCheck(AuditCheck):
         )
 
     def ways(self, atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-        """Other ways to write a structure down; arguments as for `all_of`."""
+        """Yield other representations of a structure; arguments as for `all_of`."""
         return all_of(atoms, given, rng)
 
     def _findings(
@@ -183,7 +183,7 @@ class InvarianceCheck(AuditCheck):
     def _without_topology(
         self, wrong: dict[str, list[_Difference]], judge: _Judge
     ) -> dict[str, list[_Difference]]:
-        """Differences without those that belong to what the calculator is: a topology made from the order."""
+        """Return the differences that are not explained by a molecular topology made from the atom order."""
         rng = np.random.default_rng(self.seed + 1)
         grouped = by_molecule(judge.atoms, rng)
         try:
@@ -208,7 +208,7 @@ class InvarianceCheck(AuditCheck):
 
 
 class _Judge:
-    """Compares, and measures once for each size of rounding what a comparison may give."""
+    """Compares representations; the allowed difference is measured once per size of rounding."""
 
     def __init__(self, subject: CalculatorSubject, rng: np.random.Generator):
         self.subject, self.worker, self._rng = subject, subject.fresh(), rng
@@ -252,7 +252,7 @@ class _Judge:
         ), answer
 
     def reference(self, base: Atoms, rounding: float) -> tuple[float, Forces, NoiseFloor]:
-        """Energy and forces of a structure, and what rounding of this size makes of them."""
+        """Return energy and forces of a structure, and the differences allowed for rounding of this size."""
         power = int(np.ceil(np.log2(rounding))) if rounding > 0 else -9999
         key = id(base), power
         if key not in self._known:
@@ -272,7 +272,7 @@ class _Judge:
 
 
 def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]:
-    """Ways of writing the structure down that nobody may fail on, and answers that are not numbers."""
+    """Yield findings about unsupported basic representations, and about answers that are not finite."""
     empty = [one for one in refused if one[1].cause is None]
     raised = [one for one in refused if one[1].cause is not None and one[0].code in _MUST_ANSWER]
     for code, cases in (("NOT_FINITE", empty), ("FAILS", raised)):
@@ -285,7 +285,7 @@ def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]
 
 
 def _in_turns(ways: Iterable[Same]) -> list[Same]:
-    """One of each kind, then another of each: a slow calculator is asked all kinds of questions."""
+    """Order representations so that one of each kind comes first, then a second of each kind."""
     seen: dict[str, int] = {}
     turns = []
     for same in ways:
@@ -298,11 +298,11 @@ def _in_turns(ways: Iterable[Same]) -> list[Same]:
 
 
 def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Every way that applies to a structure.
+    """Yield every representation that applies to a structure.
 
     Args:
-        atoms: no distance of it on a threshold by design.
-        given: the structure as it was given, where one may be.
+        atoms: a structure without distances exactly on a threshold.
+        given: the structure as the user gave it, possibly with such distances.
     """
     yield from translated(atoms, rng)
     yield from imaged(atoms, rng)
@@ -317,7 +317,7 @@ def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Sam
 
 
 def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """All atoms moved together, by lattice vectors and by anything."""
+    """Yield structures with all atoms translated together, by lattice vectors and by arbitrary vectors."""
     same = partial(_same, "TRANSLATION", atoms)
     if atoms.pbc.any():
         for count, words in ((1, "one lattice vector"), (-3, "three lattice vectors back")):
@@ -337,7 +337,7 @@ def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Each atom in a box of its own choice: unwrapped trajectories look like this."""
+    """Yield structures with each atom in an arbitrary periodic image, as in unwrapped trajectories."""
     if not atoms.pbc.any():
         return
     same = partial(_same, "IMAGES", atoms)
@@ -349,7 +349,7 @@ def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """One atom on the face of the cell, a hair outside, and on the opposite face."""
+    """Yield structures with one atom on a face of the cell, slightly outside, and on the opposite face."""
     if not atoms.pbc.any():
         return
     axes, cell = np.flatnonzero(atoms.pbc), atoms.cell.array
@@ -374,7 +374,7 @@ def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Atoms in another order."""
+    """Yield structures with the atoms in another order."""
     if len(atoms) < 2:
         return
     for _ in range(2):
@@ -389,7 +389,7 @@ def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | None:
-    """Whole molecules in another order, and moved by lattice vectors of their own, where there are some."""
+    """Return whole molecules reordered, and in other periodic images; None without molecules."""
     size = group(atoms)
     if size is None:
         return None
@@ -404,7 +404,7 @@ def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | N
 
 
 def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
-    """The cell an ulp larger and smaller, atoms where they were."""
+    """Yield cells one ulp larger and smaller, with the atoms in place."""
     if not atoms.pbc.any():
         return
     for what, base in (("", atoms), (", of the structure as it was given", given)):
@@ -419,7 +419,7 @@ def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
 
 
 def repeated(atoms: Atoms) -> Iterator[Same]:
-    """Supercells."""
+    """Yield supercells of a structure."""
     wanted = [tuple(2 if n == axis else 1 for n in range(3)) for axis in np.flatnonzero(atoms.pbc)]
     if len(wanted) > 1 and len(atoms) <= 64:
         wanted.append(tuple(2 if repeats else 1 for repeats in atoms.pbc))
@@ -432,10 +432,11 @@ def repeated(atoms: Atoms) -> Iterator[Same]:
 
 
 def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """A cell of four atoms as near to one another as in the structure, beside its supercell.
+    """Yield the supercell of a dense four-atom cell, for comparison with the cell itself.
 
-    A structure with room for two cutoffs never asks for a second image of a pair. Two species in equal
-    numbers, as in a salt; of more, what a calculator makes of them in such a cell is another question.
+    A structure at least two cutoffs wide never needs a second image of a pair. Structures of one or two
+    species are used, in equal numbers as in a salt; with more species the result in such a cell would be
+    ambiguous.
     """
     species = list(dict.fromkeys(atoms.symbols))
     nearest = nearest_distance(atoms)
@@ -452,7 +453,7 @@ def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def skewed(atoms: Atoms) -> Iterator[Same]:
-    """The same lattice from other lattice vectors, a left-handed cell among them."""
+    """Yield the same lattice with other lattice vectors, some of them left-handed."""
     if not atoms.pbc.all():
         return
     for what, matrix in (
@@ -468,7 +469,7 @@ def skewed(atoms: Atoms) -> Iterator[Same]:
 
 
 def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Structure and cell turned together, by anything, by axes, and mirrored."""
+    """Yield structure and cell rotated together, arbitrarily and by exchanging axes, and mirrored."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     anyhow = q * np.sign(np.diag(r))
     anyhow *= np.sign(np.linalg.det(anyhow))
@@ -487,7 +488,7 @@ def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def without_periods(atoms: Atoms) -> Iterator[Same]:
-    """A cluster in cells that do not repeat: what is written in them must not matter."""
+    """Yield a cluster in several nonperiodic cells, which must not change the answer."""
     base = modified(atoms, cell=np.zeros((3, 3)), pbc=False)
     span = np.ptp(base.positions, axis=0).max() + 30.0
     for what, cell in (
@@ -506,7 +507,7 @@ def _wrapped(atoms: Atoms) -> Atoms:
 
 
 def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
-    """A direction along the axes that do not repeat, of unit length, and across those that do."""
+    """Return a unit vector along the nonperiodic axes, perpendicular to the periodic ones."""
     if free.all():
         return np.array([1.0, -0.7, 0.4]) / np.linalg.norm([1.0, -0.7, 0.4])
     if not atoms.cell.array[~free].any():
@@ -517,6 +518,6 @@ def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
 
 
 def ulp(*structures: Atoms) -> float:
-    """An ulp of the largest coordinate or cell entry of some structures, Å."""
+    """Return one ulp of the largest coordinate or cell entry of some structures, Å."""
     parts = (part for one in structures for part in (one.positions, one.cell.array))
     return float(np.spacing(max(map(largest, parts))))

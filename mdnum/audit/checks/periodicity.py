@@ -1,4 +1,4 @@
-"""Structures of which some axes repeat and others do not: only what repeats may be felt again."""
+"""Check structures with periodic and nonperiodic axes: only periodic axes may create images."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _SHORT = 1.3  # of the nearest distance: length of a free vector with which atom
 
 
 class PeriodicityCheck(InvarianceCheck):
-    """Is nothing felt along axes that do not repeat, and everything along those that do?
+    """Do atoms interact with images along periodic axes, and only along those?
 
-    A slab and a wire of the structure, with long, short, zero and leaning vectors along their free axes.
+    Tests a slab and a wire of the structure, with long, short, zero and skewed vectors along their free axes.
     """
 
     name, title, order, calls = "periodicity", "Mixed periodicity", 45, 250
 
     def ways(self, atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-        """Slab and wire, written down in many ways."""
+        """Yield many representations of a slab and a wire."""
         axes = np.flatnonzero(atoms.pbc)
         if not len(axes) and len(atoms):  # a molecule that repeats along x
             apart = float(np.ptp(atoms.positions[:, 0])) + 1.2 * (nearest_distance(atoms) or 4.0)
@@ -35,7 +35,7 @@ class PeriodicityCheck(InvarianceCheck):
 
 
 def mixed(atoms: Atoms, periodic: np.ndarray, rng: np.random.Generator) -> Iterator[Same]:
-    """A structure that repeats along some of its axes, in cells that differ along the others."""
+    """Yield a structure that is periodic along some axes, in cells that differ along the others."""
     rows, axes = atoms.cell.array[periodic], np.flatnonzero(periodic)
     normals = np.linalg.svd(rows)[2][len(rows) :]
     extents = np.ptp(atoms.positions @ normals.T, axis=0)
@@ -69,7 +69,7 @@ def mixed(atoms: Atoms, periodic: np.ndarray, rng: np.random.Generator) -> Itera
 
 
 def _with(atoms: Atoms, periodic: np.ndarray, free: np.ndarray) -> Atoms:
-    """The structure with other vectors along its free axes, in a right-handed cell."""
+    """Return the structure with other vectors along its free axes, in a right-handed cell."""
     cell = atoms.cell.array.copy()
     cell[~periodic] = free
     if np.linalg.det(cell) < 0:

@@ -1,4 +1,4 @@
-"""Is the energy smooth wherever atoms can go? Pairs, triples and surroundings through every threshold."""
+"""Check the smoothness of the energy: pairs, triples and many-atom environments through every threshold."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SmoothnessCheck(AuditCheck):
     neighbors, routes = 160, 2
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Walk and crowd."""
+        """Walk pairs and triples through thresholds, and crowd atoms with neighbors."""
         walks = walk_pairs(subject, progress)
         if not walks.walks and subject.meter.deadline.passed:
             raise TimeUp
@@ -85,7 +85,7 @@ _energy, _length = partial(Measured, unit="energy"), partial(Measured, unit="len
 
 
 def place(threshold: PairThreshold) -> Measured:
-    """Its distance."""
+    """Return the distance of a threshold with its error."""
     return _length(threshold.radius, floor=threshold.located)
 
 
@@ -97,7 +97,7 @@ def _two(threshold: PairThreshold) -> str:
 def figures(
     walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
 ) -> tuple[tuple[list[str], dict[str, Any]], dict[str, Any]]:
-    """(names of sentences and their values, numbers)."""
+    """Return (names of sentences and their values, numbers) for the summary."""
     # (lowest derivative that jumps, jump of the energy, of the force) wherever something does
     seen = [(one.order, *one.jumps[:2]) for one in _all(walks)]
     seen += [(one.jump.order, one.jump.energy, one.force) for one in around.events]
@@ -149,13 +149,13 @@ def figures(
 
 
 def _rounded_up(value: float) -> float:
-    """One digit that does not promise more than is known."""
+    """Round a detection limit up to one significant digit."""
     digit = 10.0 ** np.floor(np.log10(value))
     return float(np.ceil(value / digit) * digit)
 
 
 def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Findings of pair thresholds, by the lowest derivative that jumps."""
+    """Yield findings about pair thresholds, by the lowest derivative that jumps."""
     for order, code in enumerate(("ENERGY_JUMP", "FORCE_JUMP", "CURVATURE_JUMP")):
         same = [one for one in _all(walks) if one.order == order]
         if not same:
@@ -184,7 +184,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
 
 
 def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """A finding where more jumps at a pair threshold among the others than for two atoms alone."""
+    """Yield a finding if a jump at a pair threshold is of lower order among many atoms than for two."""
     if not around.lower:
         return
     worst = min(
@@ -206,7 +206,7 @@ def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
 
 
 def _logged(subject: CalculatorSubject, walks: PairWalks) -> Iterator[Observed]:
-    """A finding where `energy`, which a run logs, jumps at a threshold where `free_energy` does not."""
+    """Yield a finding if `energy`, which a run logs, jumps at a threshold where `free_energy` does not."""
     jumps: list[tuple[float, float, str, str]] = []
     for walk in walks.walks:
         for one in walk.thresholds:
@@ -241,7 +241,7 @@ def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) 
 
 
 def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
-    """Findings of a crowd: caps where it is the number of neighbors that matters, otherwise what was seen."""
+    """Yield findings about crowded atoms: a neighbor cap if their number matters, else the jump."""
     values: dict[str, Any] = {"species": one.species, "radius": one.radius}
     if one.kept:
         values |= {"kept": one.kept, "distance": one.distance, "force": one.force}
@@ -263,7 +263,7 @@ def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
 
 
 def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
-    """Findings of one walk: no end, a steep end, more places than were zoomed into."""
+    """Yield findings about one pair walk: no cutoff, a steep switch, places that were not examined."""
     further = walk.further
     if walk.cutoff is None and np.abs(walk.energy).max() > 0:
         # what was searched for an end, and no more
@@ -283,7 +283,7 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
 
 
 def _steepness(walk: PairWalk) -> tuple[float, float] | None:
-    """(largest curvature beyond the well over that at its bottom, where); None without a well."""
+    """Return (largest curvature beyond the well over that at its bottom, distance); None without a well."""
     curvature = -np.gradient(walk.force, walk.distance)
     bottom = int(np.argmin(walk.energy))
     if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:
@@ -300,7 +300,7 @@ def _steepness(walk: PairWalk) -> tuple[float, float] | None:
 
 
 def _first_to_jump(event: Event) -> str:
-    """The lowest derivative that jumps; where none up to the curvature does, that of the pair."""
+    """Name of the lowest derivative that jumps; the pair's own if none up to the curvature does."""
     order = event.jump.order
     return ORDERS[max(order, event.threshold.order) if order == SMOOTH and event.threshold else order]
 
@@ -369,7 +369,7 @@ def _charts(walks: PairWalks, subject: CalculatorSubject) -> list[Chart]:
 
 
 def _energies(walk: PairWalk, kT: float) -> Chart:
-    """The energy of two, where it is small enough to see what happens at the thresholds."""
+    """Chart of the pair energy, limited to values at which jumps at thresholds are visible."""
     depth = max(-float(walk.energy.min()), 2 * kT)
     shown = walk.energy < 2 * depth
     first = len(shown) - int(np.argmin(shown[::-1])) if not shown.all() else 0
@@ -383,7 +383,7 @@ def _energies(walk: PairWalk, kT: float) -> Chart:
 
 
 def _close_up(walk: PairWalk, threshold: PairThreshold, subject: CalculatorSubject) -> Chart:
-    """Energy or force at the last representable distances before a jump and the first ones beyond it."""
+    """Chart of energy or force at the representable distances on both sides of a jump."""
     below, above = [threshold.inside], [threshold.outside]
     for _ in range(_ULPS - 1):
         below.append(float(np.nextafter(below[-1], -np.inf)))

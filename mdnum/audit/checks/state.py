@@ -1,4 +1,4 @@
-"""What a calculator object remembers: one question has one answer, whatever was asked before."""
+"""Check the memory of a calculator object: its answer must not depend on earlier structures."""
 
 from __future__ import annotations
 
@@ -27,16 +27,17 @@ _EPS = np.finfo(float).eps
 
 
 class StateCheck(AuditCheck):
-    """Does an answer depend on what the calculator object was asked before?
+    """Does an answer depend on the structures that the calculator object evaluated before?
 
-    Repeated calls, and one object through structures that grow, shrink, move and strain, beside new ones.
+    Tests repeated calls, and one object on structures that grow, shrink, move and strain, against new
+    objects.
     """
 
     name, title, order, basic, calls = "state", "Memory", 60, True, 500
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """One object, asked again and again, beside new ones."""
+        """Compare one object that is used repeatedly with new objects."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
             atoms, noise = settled(subject.fresh(), rng, brief=self.brief)
@@ -105,7 +106,7 @@ class StateCheck(AuditCheck):
         )
 
     def _brief(self, subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> CheckResult:
-        """Repeats alone."""
+        """Test repeated calls only."""
         repeats = _repeated(subject, atoms, brief=True)
         return CheckResult(
             says=([_how(repeats)], {}),
@@ -136,7 +137,7 @@ class StateCheck(AuditCheck):
 
 @dataclass
 class Comparison:
-    """An answer of an object in use, beside that of a new one."""
+    """Answer of a used object, and that of a new object for the same structure."""
 
     sequence: str  # in which it was asked
     what: str  # happened to the structure
@@ -153,7 +154,7 @@ class Comparison:
 
     @property
     def refused(self) -> CalculatorError | None:
-        """The failure; of both, what the new object says."""
+        """Failure of the new object, or else of the used one; None if both succeeded."""
         return next((one for one in (self.new, self.old) if isinstance(one, CalculatorError)), None)
 
     @property
@@ -169,7 +170,7 @@ class Comparison:
 
 
 def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
-    """Sequences of two atoms at the cutoff; what could not be, and why."""
+    """Return sequences of two atoms at the cutoff, and what was skipped."""
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)
@@ -186,7 +187,7 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep
 def _through(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, name: str
 ) -> Iterator[Comparison]:
-    """One object through a sequence: each answer, compared with that of a new object."""
+    """Evaluate a sequence with one object, and yield each answer with that of a new object."""
     used = subject.used()
     before: Atoms | None = None
     known: dict[int, Answered] = {}
@@ -223,7 +224,7 @@ def _through(
 def _again(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, worst: Comparison
 ) -> bool:
-    """Whether another object, on the way on which the worst difference showed, answers as that one did."""
+    """Return whether another object reproduces the largest difference in the same sequence."""
     end = next(k for k, one in enumerate(sequence) if (one.what, one.atoms) == (worst.what, worst.atoms))
     way = [step._replace(compared=place == end) for place, step in enumerate(sequence[: end + 1])]
     (again,) = _through(subject, way, noise, worst.sequence)
@@ -236,14 +237,14 @@ def _again(
 
 
 def _how(repeats: Mapping[str, Any]) -> str:
-    """The name of the sentence about repeated calls."""
+    """Return the name of the sentence about repeated calls."""
     if not repeats["bit-identical"]:
         return "state_not_repeated"
     return "state_repeated" if repeats["bit-identical between objects"] else "state_not_between"
 
 
 def _repeated(subject: CalculatorSubject, atoms: Atoms, brief: bool = False) -> dict[str, Any]:
-    """The same structure again: of one object, with another structure between, and of new objects."""
+    """Evaluate one structure repeatedly: with one object, after another structure, with new objects."""
     used = subject.fresh()
     aside = displaced(atoms, np.full((len(atoms), 3), 0.011))
     at_once, between, new = (2, 1, 2) if brief else (_AT_ONCE, _BETWEEN, _NEW)
@@ -293,10 +294,10 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
 
 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Å by which an atom, or an edge of the cell, can move while an answer stays to the last bit, or 0.
+    """Largest move of an atom or cell edge after which an answer stays the same to the last bit, Å, or 0.
 
-    Only where the answer ought to have changed by many of its last digits: what it changes by over the
-    longest of the moves, in proportion.
+    Only moves that should change many of the last digits count; the expected change is in proportion to that
+    over the longest move.
     """
     # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate
     line = np.zeros((len(atoms), 3))
@@ -310,7 +311,7 @@ def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _kept_within(subject: CalculatorSubject, sizes: np.ndarray, at: Callable[[float], Atoms]) -> float:
-    """The longest of some moves in a row after which one object has given its last answer again."""
+    """Return the longest of several successive moves after which one object repeats its last answer."""
     used = subject.fresh()
     used.forgets = False
     places = np.array([0.0, *np.cumsum(sizes)])
@@ -333,5 +334,5 @@ def _kept_within(subject: CalculatorSubject, sizes: np.ndarray, at: Callable[[fl
 
 
 def _grain(atoms: Atoms) -> float:
-    """The last digit of the largest coordinate in single precision, Å."""
+    """Return the spacing of single-precision numbers at the largest coordinate, Å."""
     return float(np.spacing(np.float32(np.max(np.abs(atoms.positions), initial=1.0))))
