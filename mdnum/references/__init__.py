@@ -1,6 +1,6 @@
-"""Referees: ASE, other neighbor searches and plain numpy, and mdnum as an ASE calculator.
+"""Reference implementations: ASE, other neighbor searches, plain numpy, and mdnum as an ASE calculator.
 
-Nothing here is imported before it is used: ASE, MDAnalysis and jax each cost a second or more.
+Modules are imported at first use: ASE, MDAnalysis and jax each take a second or more to import.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""ASE's calculators, adapted to what a simulation says of its cutoff, its species and its list."""
+"""ASE's calculators, adapted to a simulation's cutoff, species and neighbor list."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from mdnum.references.independent import ClassicalCalculator, PairForm, edges_of
 
 
 class StepAtCutoff(ClassicalCalculator):
-    """One of ASE's calculators with a constant added for each pair inside the cutoff.
+    """An ASE calculator with a constant energy added for each pair inside the cutoff.
 
     Args:
         inner: the calculator.
-        form: which pairs count as inside.
-        step: energy of a pair.
+        form: defines which pairs are inside.
+        step: energy added per pair.
     """
 
     def __init__(self, inner: Calculator, form: PairForm, step: float, **kwargs: Any):
@@ -43,7 +43,7 @@ class StepAtCutoff(ClassicalCalculator):
 
 
 class SpeciesSum(ClassicalCalculator):
-    """A mixture from calculators that know one species: unlike pairs a-b are all minus a-a minus b-b.
+    """A mixture of single-species calculators: pairs a-b are all pairs minus pairs a-a and b-b.
 
     Args:
         parts: (calculator, species a, species b) for every pair of species present.
@@ -77,7 +77,7 @@ class SpeciesSum(ClassicalCalculator):
 
 
 def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, Any]:
-    """energy, forces, energies where there are any and, as six numbers, stress of atoms."""
+    """Return energy, forces, energies if available and, as six numbers, the stress of atoms."""
     bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
     names = ["energy", "forces", *(["stress"] if stress else [])]
     if "energies" in calculator.implemented_properties:  # ASE's EAM has the total only
@@ -87,7 +87,7 @@ def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, An
 
 
 def evaluate(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
-    """energy, forces, stress (3, 3) and energies of atoms; None for what there is not."""
+    """Return energy, forces, stress (3, 3) and energies of atoms; None for quantities not available."""
     # ASE gives a stress for a molecule in a box, of the box's volume
     results = _results(calculator, atoms, atoms.cell.rank == 3 and bool(atoms.pbc.all()))
     if "stress" in results:
@@ -102,7 +102,7 @@ def lennard_jones(form: PairForm, **options: Any) -> Calculator:
 
 
 def _inside_list(form: PairForm) -> Callable[..., Any]:
-    """A neighbor list for ASE's MorsePotential that lists what the system file calls inside, no more."""
+    """Return a neighbor list for ASE's MorsePotential with only the pairs inside the system file's cutoff."""
 
     def listed(quantities: str, atoms: Atoms, cutoff: float) -> tuple[ndarray, ...]:
         edges = edges_of(atoms, form.r_cut)
@@ -122,7 +122,7 @@ def morse(form: PairForm, begin: float, end: float) -> Calculator:
 
 
 def short_listed_eam(file: Path) -> Calculator:
-    """ASE's EAM with a list of the length it needs: its own reaches 2 (cutoff + skin) and takes minutes."""
+    """Return ASE's EAM with a shorter neighbor list; its own reaches 2 (cutoff + skin) and takes minutes."""
     from ase.calculators.eam import EAM
     from ase.neighborlist import NeighborList
 
@@ -139,9 +139,10 @@ def short_listed_eam(file: Path) -> Calculator:
 
 
 class EnergyOnNeighborList(ClassicalCalculator):
-    """An energy function on ASE's neighbor list, compiled for itself alone.
+    """ASE calculator for an energy function on ASE's neighbor list, compiled separately.
 
-    It judges lists, decisions and the loop, not the function and its derivatives, which are jax's here too.
+    This reference tests neighbor lists, decisions and the rollout, but not the function and its derivatives,
+    which are jax's here too.
     """
 
     implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012

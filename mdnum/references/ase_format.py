@@ -1,6 +1,7 @@
-"""Run folders as a format of ASE, which imports this module with its own formats.
+"""Run folders of mdnum as an ASE file format; ASE imports this module together with its own formats.
 
-It is no part of `ase_plugin`: ASE's plugins import its formats, and that module would be empty then.
+The format is separate from `ase_plugin`: ASE's plugins import its formats, at which time that module would
+still be empty.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ ioformat = ExternalIOFormat(desc="Run folder of mdnum", code="+S", module="mdnum
 
 
 def read_mdnum(folder: str, index: Any = -1) -> Iterator[Atoms]:
-    """Frames of a run folder, for `ase.io.read(folder, index, format="mdnum")`; in float64 as they were kept.
+    """Yield frames of a run folder, for `ase.io.read(folder, index, format="mdnum")`; in float64 as stored.
 
     Raises:
-        FolderError: it is no folder of mdnum's, or its run kept no frames.
+        FolderError: the folder is not a run folder of mdnum, or the run stored no frames.
     """
     from ase.io.trajectory import read_traj
 

@@ -1,6 +1,6 @@
-"""Which reference a simulation is compared with: the class of ASE that corresponds to it, else plain numpy.
+"""Choose the reference for a simulation: the corresponding ASE class, or else plain numpy.
 
-What differs between the codes, and what is done about it:
+Differences between the codes, and the conversions that remove them:
 
 | system file | ASE | conversion |
 |---|---|---|
@@ -15,7 +15,7 @@ What differs between the codes, and what is done about it:
 | an energy function | no ASE class | the function on ASE's neighbor list, and labeled so |
 | all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), and labeled so |
 
-ASE's LennardJones keeps a pair at r == rc (r² > rc² is dropped), its neighbor lists do not (r < rc). In the
+ASE's LennardJones keeps a pair at r == rc (r² > rc² is dropped); its neighbor lists do not (r < rc). In the
 shifted and switched forms such a pair has no energy, so only its force can differ.
 """
 
@@ -62,7 +62,7 @@ ITSELF, ENERGY = (
 
 @dataclass(frozen=True)
 class Reference:
-    """A calculator to compare with."""
+    """A reference calculator, with its label and the conversions it needs."""
 
     label: str  # what it is, for people: "ASE LennardJones" or "plain numpy on ASE's neighbor list"
     is_ase: bool  # whether the numbers come from a class of ASE
@@ -71,10 +71,10 @@ class Reference:
 
 
 def reference(subject: Simulation | System) -> Reference:
-    """The best judge there is for a simulation: ASE where it has the class, else plain numpy.
+    """Return the best available reference for a simulation: ASE if it has the class, else plain numpy.
 
     Args:
-        subject: a `Simulation`, or a `System`, whose box need not have room for its skin.
+        subject: a `Simulation`, or a `System`, whose box may be too small for its skin.
     """
     simulation = _objects(subject)
     species, model = simulation.symbols, simulation.model
@@ -101,7 +101,7 @@ def reference(subject: Simulation | System) -> Reference:
 
 
 def independent(subject: Simulation | System) -> Reference:
-    """A judge in plain numpy, for every kind but eam: a third opinion where ASE is the second."""
+    """Return a plain-numpy reference for any potential except eam: a third calculation next to ASE's."""
     simulation = _objects(subject)
     model, compare = simulation.model, simulation.decider.compare
     if isinstance(model, EnergyFunction):
@@ -120,7 +120,7 @@ def independent(subject: Simulation | System) -> Reference:
 
 
 def _written_again(model: Any) -> StillingerWeberModel | TersoffModel:
-    """The formulas of a potential of many bodies in plain numpy, with its constants."""
+    """Return a many-body potential implemented in plain numpy, with its constants."""
     kind = TersoffModel if isinstance(model, tetrahedral.Tersoff) else StillingerWeberModel
     names = (one.name for one in fields(kind) if hasattr(model, one.name))
     return kind(**{name: float(getattr(model, name)) for name in names})

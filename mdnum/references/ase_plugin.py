@@ -1,4 +1,4 @@
-"""The calculator for ASE's list of plugins, which imports this module; nothing of mdnum is imported here."""
+"""Plugin entry for ASE, which imports this module; it imports nothing of mdnum."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""mdnum as an ASE calculator, for anything in ASE that wants one."""
+"""An ASE calculator that computes energies and forces with mdnum."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SAID = {"potential", "cutoff", "terms", "units"}
 
 
 class _Recipe(NamedTuple):
-    """How a simulation is made for atoms."""
+    """How to build a simulation for given atoms."""
 
     make: Callable[[Atoms], Simulation]  # without a skin: the evaluator keeps what the box has room for
     skin: float  # length
@@ -48,7 +48,7 @@ def _of_system(system: Simulation | System) -> _Recipe:
 
 
 def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
-    """From objects, or from the tables of a system file."""
+    """Return a recipe from potential objects, or from the tables of a system file."""
     if isinstance(potential, Mapping):
         made = interaction(potential, cutoff)
         end, model = made.cutoff, lambda atoms: model_of(made, atoms, Path())
@@ -74,24 +74,24 @@ def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
 
 
 class MdnumCalculator(ClassicalCalculator):
-    """What mdnum computes for a potential, wherever ASE takes a calculator.
+    """ASE calculator that evaluates an mdnum potential.
 
-    For relaxing with ase.optimize, for stress and equations of state, and for holding mdnum's forces
-    against ASE's own tools. A Verlet list is kept between calls until motion and box strain have used its
-    skin; for molecular dynamics use mdnum's rollout, which records its flips.
+    Use it to relax with ase.optimize, to compute stress and equations of state, and to compare mdnum's forces
+    with ASE's own tools. A Verlet list is kept between calls until motion and box strain have used its skin;
+    for molecular dynamics use mdnum's rollout, which records its flips.
 
     Args:
-        system: a `Simulation`, a `System`, or the name or path of a system file; the atoms may be others.
+        system: a `Simulation`, a `System`, or the name or path of a system file; the atoms may differ from
+            it.
         overrides: keys of the system file to change, as `--set` does.
         potential, cutoff: instead of a system: objects as for `mdnum.simulation`, or the tables of a system
             file as dictionaries.
         units: "metal" (Å, eV) or "lj".
     Raises:
-        InputError: neither or both of system and potential; tables that a system file could not hold. At the
-            first use: species without constants, a cell narrower than two cutoffs; a coordinate that is not
-            finite.
+        InputError: neither or both of system and potential; invalid tables. At the first use: species without
+            constants, a cell narrower than two cutoffs, a coordinate that is not finite.
         NumericalError: an energy or a force that is not finite, as of two atoms at one place.
-        TypeError: another keyword.
+        TypeError: an unknown keyword.
 
     Example:
         >>> argon = MdnumCalculator(
@@ -129,14 +129,14 @@ class MdnumCalculator(ClassicalCalculator):
 
     @property
     def simulation(self) -> Simulation | None:
-        """What was evaluated last; None before the first call."""
+        """Simulation evaluated last; None before the first call."""
         return None if self._evaluator is None else self._evaluator.simulation
 
     def set(self, **changes: Any) -> dict[str, Any]:
-        """Changes nothing: another potential is another calculator.
+        """Reject changes of parameters: create another calculator for another potential.
 
         Raises:
-            TypeError: something is to be changed.
+            TypeError: a parameter was given.
         """
         if changes:
             raise TypeError(f"MdnumCalculator cannot change {', '.join(changes)}; make another calculator")
@@ -168,7 +168,7 @@ class MdnumCalculator(ClassicalCalculator):
         return results
 
     def _made_for(self, atoms: Atoms) -> Evaluator:
-        """What evaluates these atoms, wherever they are and in whatever box."""
+        """Return an evaluator for these atoms, at any positions and in any cell."""
         # only what the forces depend on: constraints and the like stay with ASE
         bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
         if self._given is not None:

@@ -1,4 +1,4 @@
-"""`mdnum check energy` and `mdnum check dynamics`: mdnum against ASE, frame by frame and step by step."""
+"""Compare mdnum with ASE frame by frame (`mdnum check energy`) and step by step (`mdnum check dynamics`)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ROUNDINGS = 5.0  # that narrower precision must meet, of those expected of a typ
 
 @dataclass(frozen=True)
 class FrameComparison:
-    """One frame, evaluated twice."""
+    """Comparison of one frame between mdnum and a reference."""
 
     frame: str  # which
     # energy, energy_reference: total energies (eV or ε)
@@ -73,7 +73,7 @@ class FrameComparison:
 
 @dataclass(frozen=True)
 class EnergyReport:
-    """Energies, forces and stresses against a reference."""
+    """Comparison of energies, forces and stresses with a reference."""
 
     system: str  # name
     reference: str  # what it was compared with; says so when it is not ASE
@@ -91,7 +91,7 @@ class EnergyReport:
 
     @property
     def worst(self) -> dict[str, Any]:
-        """The worst of all frames, in the names of summary.json's `ase`."""
+        """Largest deviations over all frames, under the names of summary.json's `ase`."""
         stress = [frame.stress_max for frame in self.frames if frame.stress_max is not None]
         names = ("energy_rel", "force_max", "force_scale")
         worst = {name: max(getattr(frame, name) for frame in self.frames) for name in names}
@@ -99,7 +99,7 @@ class EnergyReport:
         return worst if self.sampled is None else {**worst, "sampled": self.sampled}
 
     def rows(self) -> list[dict[str, Any]]:
-        """A row per frame."""
+        """Return a table row per frame."""
         narrow = {"energy, roundings": "energy_roundings", "force, roundings": "force_roundings"}
         columns = {
             "energy": "energy", "energy, relative": "energy_rel", "force, largest": "force_max",
@@ -121,19 +121,19 @@ def check_energy(
     judge: Reference | None = None,
     lammps: bool = False,
 ) -> EnergyReport:
-    """Compare energies, forces and stresses with ASE (or, where ASE has no class, with plain numpy).
+    """Compare energies, forces and stresses with ASE (or with plain numpy if ASE has no such class).
 
     Args:
-        subject: a `Simulation`, or what `mdnum.build` makes one from.
-        frames: positions and cells to compare at, by name or in order, or names and frames as they come;
-            default the initial frame and one some steps later, which a crystal needs to have forces at all.
-        judge: instead of the reference chosen by `ase_models.reference`.
-        lammps: whether a person's pair function is evaluated by LAMMPS too, where that is installed; it must
+        subject: a `Simulation`, or any argument of `mdnum.build`.
+        frames: positions and cells to compare, by name or in order, or an iterator of names and frames;
+            default the initial frame and a later one, since the forces of a perfect crystal vanish.
+        judge: reference to use instead of the one chosen by `ase_models.reference`.
+        lammps: whether a user's pair function is also evaluated by LAMMPS, if installed; the results must
             agree.
 
-    Of more than `SAMPLED` atoms with a pair potential, energies and forces of a few hundred are compared, at
-    random places by `neighborhoods`: an exact statement about those. Each frame has its own places, so that
-    two frames show twice the atoms.
+    For a pair potential with more than `SAMPLED` atoms, energies and forces of a few hundred atoms at random
+    places are compared, chosen by `neighborhoods`: an exact statement about those atoms. Each frame has its
+    own places, so that two frames cover twice the atoms.
 
     Raises:
         InputError: the system cannot be built.
@@ -173,13 +173,13 @@ def check_energy(
 
 
 def narrowest(simulation: Simulation, roles: Sequence[str] = ("state", "force", "accumulate")) -> str:
-    """The narrowest float type among some roles; default those that energies and forces depend on."""
+    """Return the narrowest float type of some roles; by default those that affect energies and forces."""
     kinds = (carrier(getattr(simulation.policy, role)) for role in roles)
     return max(map(str, kinds), key=unit_roundoff)
 
 
 def _places(simulation: Simulation) -> str:
-    """The narrowest float type of places: a force in sixteen bits has the displacements of the decision."""
+    """Return the narrowest float type of positions: 16-bit forces use the displacements of the decision."""
     wide = simulation.policy.force in WIDE
     return narrowest(simulation) if wide else narrowest(simulation, ("state", "decision"))
 
@@ -202,7 +202,7 @@ def _named(frames: Any, simulation: Any) -> Iterable[tuple[str, Atoms]]:
 
 
 def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Evaluation]:
-    """A frame as the state can hold it, and what mdnum makes of it."""
+    """Return a frame rounded to the precision of the state, and mdnum's evaluation of it."""
     positions = atoms.get_positions()
     if simulation.policy.state == "float32":
         positions = positions.astype(np.float32).astype(np.float64)  # both are to see what the state can hold
@@ -211,7 +211,7 @@ def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Eval
 
 
 def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:
-    """Of an evaluation of the whole, what concerns the first atoms of a cluster; pairs are the cluster's."""
+    """Return the evaluation of a cluster's first atoms, taken from the whole; the pairs are the cluster's."""
     edges = edges_of(cluster, r_cut)
     once = edges.i < edges.j
     pairs = edges.i[once], edges.j[once], edges.r[once]
@@ -249,14 +249,14 @@ def _compare(
 
 
 def _off(mine: Evaluation, other: Mapping[str, Any], scale: float) -> tuple[float, float]:
-    """(relative difference of the energies, largest of a force component)."""
+    """Return (relative difference of the energies, largest difference of a force component)."""
     energy, force = float(mine.energy), np.abs(np.asarray(mine.forces) - other["forces"])
     relative = _over(abs(energy - other["energy"]), max(abs(other["energy"]), 1e-3 * scale))
     return relative, float(force.max(initial=0.0))
 
 
 def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
-    """Energy and forces of the first atoms alone, where there are more."""
+    """Return energy and forces of the first atoms only."""
     if len(results["forces"]) == count:
         return results
     energies = results["energies"][:count]
@@ -265,16 +265,16 @@ def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
 
 
 def _over(difference: float, scale: float) -> float:
-    """difference / scale, where equal is 0 whatever the scale."""
+    """Return difference / scale, which is 0 for a zero difference at any scale."""
     return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
 
 
 @dataclass(frozen=True)
 class _Scales:
-    """What differences are measured against.
+    """Scales against which differences are measured.
 
     energy: sum of |energies|; force: largest force on an atom or along a pair; stress: virial without
-    cancellation over the volume; *_expected: what rounding lets expect.
+    cancellation over the volume; *_expected: differences expected from rounding.
     """
 
     energy: float
@@ -286,7 +286,7 @@ class _Scales:
 
     @classmethod
     def of(cls, simulation: Simulation, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]) -> _Scales:
-        """Scales of a frame; pair by pair where there are pairs, else from the totals."""
+        """Return the scales of a frame; pair by pair for a pair potential, else from the totals."""
         unit, places = unit_roundoff(narrowest(simulation)), unit_roundoff(_places(simulation))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
@@ -330,7 +330,7 @@ class _Scales:
 
 
 def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
-    """Pairs within rounding of their cutoff, counted as inside or not."""
+    """Return the number of pairs within rounding error of their cutoff, on either side."""
     bound = rounding_bound(atoms.get_positions(), np.asarray(atoms.cell), model.reach, unit_roundoff=unit)
     # as the judges asked for it, where that has the room: the list is made once
     edges = edges_of(atoms, model.reach + (bound if bound > SLACK / 2 * model.reach else 0.0))
@@ -343,7 +343,7 @@ def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
 
 
 def _rollout(simulation: Any, steps: int) -> Iterator[tuple[ndarray, ndarray, float]]:
-    """Unwrapped positions, velocities (atoms, 3) and potential energy of every step from 0 on."""
+    """Yield unwrapped positions, velocities (atoms, 3) and potential energy of every step from 0 on."""
     from mdnum.rollout.engine import Engine, unwrapped
 
     for segment in Engine(simulation, steps).segments():
@@ -364,7 +364,7 @@ _SUDDEN = 100.0  # growth of the deviation within one step that chaos cannot do
 
 @dataclass(frozen=True)
 class DynamicsReport:
-    """Two trajectories from one start."""
+    """Comparison of two trajectories from the same initial state."""
 
     system: str  # name
     reference: str  # whose forces ASE's VelocityVerlet used
@@ -384,7 +384,7 @@ class DynamicsReport:
     ok: bool  # within tolerance at the last step
 
     def rows(self) -> list[dict[str, Any]]:
-        """A row for about ten of the steps."""
+        """Return a table row for about ten of the steps."""
         shown = np.unique(np.linspace(0, self.steps, 11).round().astype(int)).tolist()
         return [
             {
@@ -398,12 +398,12 @@ class DynamicsReport:
 def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
     """Compare a rollout with ASE's velocity Verlet, from the same positions and velocities.
 
-    A system with a thermostat is run without it. A hard cutoff has the forces of ASE's shifted one, so the
-    trajectories must agree although the energies have different zeros.
+    A thermostat is switched off. A hard cutoff has the same forces as ASE's shifted one, so the trajectories
+    must agree although the zeros of energy differ.
 
     Args:
-        subject: a `Simulation`, or what `mdnum.build` makes one from.
-        judge: whose forces; default ASE's class, or plain numpy where ASE has none or needs minutes.
+        subject: a `Simulation`, or any argument of `mdnum.build`.
+        judge: source of the forces; default ASE's class, or plain numpy where ASE has none or takes minutes.
     """
     # its optimizers come with it, and a run that is only compared needs none
     from ase.md.verlet import VelocityVerlet
@@ -435,7 +435,7 @@ def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = 
 
 
 def _forces(simulation: Simulation) -> Reference:
-    """ASE's class where a step takes it a tenth of a second; Tersoff and sums over species take more."""
+    """Return ASE's class where it is fast enough; Tersoff and sums over species use plain numpy."""
     judge = reference(simulation)
     slow = isinstance(simulation.model, Tersoff) or len(simulation.symbols) > 1
     return independent(simulation) if slow and not isinstance(simulation.potential, EmbeddedAtom) else judge
@@ -447,7 +447,7 @@ def _sudden(position: Sequence[float], floor: float) -> int | None:
 
 
 def _growth(position: Sequence[float]) -> float:
-    """Factor per step, from a line through log(deviation) over the second half."""
+    """Return the growth factor per step, from a line fit to log(deviation) over the second half."""
     tail = np.array(position[len(position) // 2 :])
     if len(tail) < 3 or not (tail > 0).all():
         return 1.0
@@ -462,20 +462,20 @@ PLACES, ATOMS = 8, 32  # places at random, and atoms nearest to each whose energ
 def neighborhoods(
     atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
 ) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
-    """Groups of atoms at random places, each with every atom within reach of one of them, as a free cluster.
+    """Yield free clusters around random places: groups of atoms with every atom within their reach.
 
-    What a pair potential of that reach gives the chosen atoms in the cluster is what it gives them in the
-    whole system, so a difference there is one of the whole. Found by distance among the atoms and their
-    images, which shares nothing with mdnum's cell lists.
+    For a pair potential of that reach, the chosen atoms have the same energies and forces in the cluster as
+    in the whole system, so a difference in the cluster is a difference in the whole. Neighbors are found by
+    distance among the atoms and their images, without mdnum's cell lists.
 
     Args:
-        atoms: the whole, of any cell; coordinates may lie outside of it.
+        atoms: the whole system, with any cell; coordinates may lie outside the cell.
         reach: no interaction is longer, length.
-        places, count: how many groups, and atoms in each at most, all within reach of its place.
-        seed: of the random places, each an atom.
+        places, count: number of groups, and largest number of atoms in each, all within reach of its center.
+        seed: random seed for the centers, each an atom.
 
     Yields:
-        (a cluster without periodicity, whose first atoms are the chosen ones; their numbers in the whole).
+        (a cluster without periodicity, whose first atoms are the chosen ones; their indices in the whole).
     """
     x, origin = with_images(atoms, reach)
     # coordinates as they are after a lattice vector is added carry rounding: a little more does no harm

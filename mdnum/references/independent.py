@@ -1,10 +1,10 @@
 """Energies, forces and stress in plain numpy on ASE's neighbor list, from the formulas alone.
 
-Nothing here is shared with what a run evaluates (a cutoff has a `reference` of its own in numpy): it is
-the judge where ASE has no class for a potential or a cutoff, and the third opinion where it has one.
+This code is independent of the code used in a run (each cutoff has its own numpy `reference`): it is the
+reference if ASE has no class for a potential or a cutoff, and a third calculation if ASE has one.
 
-A model sees directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
-the total energy with respect to every d. Forces and stress follow from that gradient in one place:
+A model gets directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
+the total energy with respect to every d. Forces and stress follow from this gradient in one function:
 F_i += g, F_j -= g, stress = sum(g outer d) / volume.
 """
 
@@ -31,7 +31,7 @@ from mdnum.md.potentials import Channels, CutPotential, LennardJones, Morse, Pai
 
 @dataclass(frozen=True)
 class Edges:
-    """A full neighbor list: both directions of every pair."""
+    """A full neighbor list, with both directions of every pair."""
 
     symbols: ndarray  # chemical symbol of each atom
     i: ndarray  # atom an edge starts from, ascending
@@ -44,11 +44,11 @@ SLACK = 1e-12  # what `edges_of` adds to the length it is asked for, relative
 
 
 def edges_of(atoms: Atoms, reach: float) -> Edges:
-    """Both directions of every pair within reach and a little more, from ASE.
+    """Return both directions of every pair within slightly more than `reach`, from ASE.
 
-    ASE's PrimitiveNeighborList, the one under its own pair calculators: 30 times faster at 500 atoms than
-    its neighbor_list. It is strict (r < reach), and whether the end counts is the model's to say, so it is
-    asked for slightly more, by SLACK.
+    ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster at 500 atoms than its
+    neighbor_list. It is strict (r < reach), while the model decides whether the cutoff itself is inside, so
+    the list reaches slightly farther, by SLACK.
     """
     arrays = (atoms.positions, atoms.numbers, atoms.cell.array, atoms.pbc)
     key = (*(array.tobytes() for array in arrays), reach)
@@ -79,20 +79,20 @@ def _edges(atoms: Atoms, reach: float) -> Edges:
 
 
 class Model(ABC):
-    """What `OnNeighborList` evaluates."""
+    """Interaction model that `OnNeighborList` evaluates."""
 
     @property
     @abstractmethod
     def reach(self) -> float:
-        """No edge longer than this matters."""
+        """Length beyond which an edge has no effect."""
 
     @abstractmethod
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
-        """(energy of each atom, gradient of the total energy with respect to each displacement)."""
+        """Return (energy of each atom, gradient of the total energy with respect to each displacement)."""
 
 
 class ClassicalCalculator(Calculator):
-    """An ASE calculator with energies, forces and stress, and no electrons: the free energy is the energy."""
+    """An ASE calculator for energies, forces and stress without electrons: the free energy is the energy."""
 
     implemented_properties = ["energy", "energies", "free_energy", "forces", "stress"]  # noqa: RUF012
     nolabel = True
@@ -104,12 +104,12 @@ class ClassicalCalculator(Calculator):
         self.results = {"free_energy": results["energy"], **results}
 
     def evaluated(self, atoms: Atoms, changes: Sequence[str]) -> dict[str, Any]:
-        """Results of atoms, given what changed since the last ones."""
+        """Return the results for atoms, given the changes since the last call."""
         raise NotImplementedError
 
 
 class OnNeighborList(ClassicalCalculator):
-    """An ASE calculator for a model of edges, on ASE's neighbor list."""
+    """ASE calculator for a `Model`, on ASE's neighbor list."""
 
     def __init__(self, model: Model, **kwargs: Any):
         super().__init__(**kwargs)
@@ -130,7 +130,7 @@ class OnNeighborList(ClassicalCalculator):
 
 @dataclass(frozen=True)
 class PairForm:
-    """The interaction of one pair of species."""
+    """Interaction of one pair of species."""
 
     species: tuple[str, str]  # the two symbols
     potential: PairPotential  # of all pairs
@@ -141,34 +141,34 @@ class PairForm:
     compare: str  # what inside means: "r2 <", "r2 <=", "r <" or "r <="
 
     def inside(self, distance: Float[ndarray, "pairs"]) -> Bool[ndarray, "pairs"]:
-        """Whether distances count as inside, in the space and with the comparison of the system file."""
+        """Return whether distances are inside the cutoff, by the comparison of the system file."""
         space, comparison = self.compare.split()
         quantity, threshold = (distance**2, self.r_cut**2) if space == "r2" else (distance, self.r_cut)
         return quantity <= threshold if comparison == "<=" else quantity < threshold
 
     def bare(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
-        """u(r) and u'(r) without any cutoff."""
+        """Return u(r) and u'(r) without a cutoff."""
         # by class: a function of somebody's own may be called like one of them
         return _BARE.get(type(self.potential), self.potential.reference)(r, **self.constants)
 
     def __call__(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
-        """Energy and its derivative with respect to r, cut off, for pairs that are inside."""
+        """Return the energy with the cutoff applied, and its derivative with respect to r, of pairs inside."""
         at = AtCutoff(self.r_cut, self.r_onset, *self.at_cutoff)
         return CUTOFFS.parse(self.cutoff).reference(r, *self.bare(r), at)
 
     @property
     def at_cutoff(self) -> tuple[float, float]:
-        """u and u' at the cutoff, without it."""
+        """The values u and u' of the bare potential at the cutoff."""
         u, du = self.bare(np.array([self.r_cut]))
         return float(u[0]), float(du[0])
 
 
 def pair_forms(model: CutPotential, symbols: Sequence[str], compare: str) -> dict[tuple[str, str], PairForm]:
-    """The interaction of every two species, both orders.
+    """Return the interaction of every two species, in both orders.
 
     Args:
         symbols: of the species, sorted.
-        compare: what inside means, as in a system file.
+        compare: comparison that defines inside, as in a system file.
     """
     forms = {}
     for kind, (a, b) in enumerate(combinations_with_replacement(symbols, 2)):
@@ -209,14 +209,14 @@ _BARE: dict[type, Callable[..., tuple[ndarray, ndarray]]] = {
 
 @dataclass(frozen=True)
 class PairModel(Model):
-    """Any pair potential with any cutoff, species by species, or a sum of several."""
+    """Any pair potential with any cutoff, for each pair of species, or a sum of several."""
 
     #: of each term its forms (see `pair_forms`) and the weights of the atoms, None for 1
     terms: Sequence[tuple[Mapping[tuple[str, str], PairForm], Any]]
 
     @classmethod
     def of(cls, model: CutPotential | Channels, symbols: Sequence[str], compare: str) -> PairModel:
-        """Of a cut potential; arguments as for `pair_forms`."""
+        """Return the model of a cut potential; arguments as for `pair_forms`."""
         parts = model.terms.values()
         weights = [np.asarray(part.weights[0]) if part.weights else None for part in parts]
         forms = [pair_forms(part, symbols, compare) for part in parts]
@@ -227,7 +227,7 @@ class PairModel(Model):
         return max(form.r_cut for forms, _ in self.terms for form in forms.values())
 
     def groups(self, edges: Edges) -> Iterator[tuple[PairForm, ndarray, Any]]:
-        """The edges inside the cutoff, by the form that applies: (form, edge numbers, factors)."""
+        """Yield the edges inside the cutoff for each form: (form, edge indices, factors)."""
         first, second = edges.symbols[edges.i], edges.symbols[edges.j]
         for forms, weights in self.terms:
             for a, b in product(sorted(set(edges.symbols.tolist())), repeat=2):
@@ -248,7 +248,7 @@ class PairModel(Model):
 
 
 def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
-    """Ordered pairs (e, f), e != f, of edges that start from the same atom."""
+    """Return ordered pairs (e, f), e != f, of edges that start from the same atom."""
     starts = np.searchsorted(edges.i, np.arange(len(edges.symbols) + 1))
     first, second = [], []
     for begin, end in pairwise(starts):
@@ -260,7 +260,7 @@ def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
 
 
 def _cosines(edges: Edges, e: ndarray, f: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """cos of the angle between edges e and f, with its gradients with respect to d_e and d_f."""
+    """Return cos of the angle between edges e and f, with its gradients with respect to d_e and d_f."""
     re, rf = edges.r[e], edges.r[f]
     ne, nf = edges.d[e] / re[:, None], edges.d[f] / rf[:, None]
     cosine = np.einsum("ta,ta->t", ne, nf)
@@ -273,11 +273,11 @@ def _add_rows(target: ndarray, rows: ndarray, values: ndarray) -> None:
 
 
 class _OneSpecies(Model):
-    """A model of the edges within its reach, of whatever species."""
+    """A model of all edges within its reach, regardless of species."""
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:
-        """Energies and gradient as of a `Model`, of edges within reach, with their directions."""
+        """Return energies and gradient as for a `Model`, from edges within reach and their unit vectors."""
 
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
         gradient, inside = np.zeros_like(edges.d), edges.r < self.reach
@@ -288,7 +288,7 @@ class _OneSpecies(Model):
 
 @dataclass(frozen=True)
 class StillingerWeberModel(_OneSpecies):
-    """Stillinger and Weber's silicon (Phys. Rev. B 31, 5262, 1985, equations 2.1 to 2.5).
+    """Stillinger-Weber silicon (Phys. Rev. B 31, 5262, 1985, equations 2.1 to 2.5).
 
     Attributes: the constants of the paper; epsilon in eV, sigma in Å.
     """
@@ -336,7 +336,7 @@ class StillingerWeberModel(_OneSpecies):
 
 @dataclass(frozen=True)
 class TersoffModel(_OneSpecies):
-    """Tersoff's bond order for one species (Phys. Rev. B 38, 9902, 1988), in LAMMPS's names.
+    """Tersoff's bond-order potential for one species (Phys. Rev. B 38, 9902, 1988), in LAMMPS notation.
 
     Attributes: the 14 constants of a LAMMPS or ASE entry; the default is Tersoff's T3 silicon.
     """

