@@ -152,7 +152,7 @@ class PairForm:
         return _BARE.get(type(self.potential), self.potential.reference)(r, **self.constants)
 
     def __call__(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
-        """Return the energy with the cutoff applied, and its derivative with respect to r, of pairs inside."""
+        """Return the cut-off energy of pairs inside, and its derivative with respect to r."""
         at = AtCutoff(self.r_cut, self.r_onset, *self.at_cutoff)
         return CUTOFFS.parse(self.cutoff).reference(r, *self.bare(r), at)
 

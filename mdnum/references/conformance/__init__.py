@@ -1,7 +1,7 @@
-"""A conformance suite for neighbor lists: anybody's pair search against an exact oracle.
+"""A conformance suite that compares any neighbor list with an exact brute-force search.
 
-`examine` puts a list through all questions; `load` finds one by name; `NeighborListConformance` is a class to
-subclass in a library's own tests; `cases` and `boxes` are hypothesis strategies for tests of one's own.
+`examine` tests a list with all cases; `load` finds a list by name; `NeighborListConformance` is a class to
+subclass in a library's own tests; `cases` and `boxes` are hypothesis strategies for custom tests.
 """
 
 from __future__ import annotations

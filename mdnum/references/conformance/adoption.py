@@ -1,4 +1,4 @@
-"""The suite in a library's own tests: a class to subclass, with a test for each area.
+"""The conformance suite for a library's own tests: a class to subclass, with one test per area.
 
     from mdnum.references.conformance import ListLimits, NeighborListConformance
     from mylibrary import neighbor_list
@@ -26,7 +26,7 @@ from mdnum.references.conformance.suite import Examiner, examine
 
 
 class NeighborListConformance:
-    """Tests of a neighbor list; subclass it under a name that pytest collects, and say which list."""
+    """Tests of a neighbor list; subclass it under a name that pytest collects, and set `pairs`."""
 
     # a function of (positions, cell, pbc, r_cut) in `staticmethod`, a class or an object with `allocate` and
     # `update` (`KeptList`), or a word that `load` knows
@@ -40,14 +40,14 @@ class NeighborListConformance:
     large: ClassVar[bool] = False  # ask about 5,000 atoms, too, and 100,000 unless that would take too long
 
     def subject(self) -> PairList:
-        """The list with what the class says about it."""
+        """Return the neighbor list with the properties declared in the class."""
         if self.pairs is None:
             pytest.skip("no list: set `pairs` in a subclass")
         found = load(self.pairs) if isinstance(self.pairs, str) else from_object(self.pairs)
         return found.with_options(full=self.full, unit=self.unit, superset=self.superset, limits=self.limits)
 
     def asked(self, tested: PairList, area: str) -> list[Case]:
-        """The cases of one area."""
+        """Return the cases of one area."""
         if area == "large":
             return list(questions.lattices()) if self.large else []
         count = self.cases if area == "random" else 0
@@ -57,7 +57,7 @@ class NeighborListConformance:
 
     @pytest.mark.parametrize("area", AREAS)
     def test_neighbor_list(self, area: str) -> None:
-        """The list gives the right pairs in the cases of an area."""
+        """Test that the list returns the correct pairs in the cases of an area."""
         tested = self.subject()
         cases = self.asked(tested, area)
         if not cases:
@@ -78,7 +78,7 @@ class NeighborListConformance:
 
     @staticmethod
     def _answers(tested: PairList) -> bool:
-        """Whether it answers the plainest of questions, as far as it claims to."""
+        """Return whether the list answers the simplest cases within its declared limits."""
         plain = [once("a gas", "few", gas(20, 6.0, 0), 6.0), once("a free gas", "few", gas(20, 3.0, 0))]
         report = examine(tested, asked=questions.as_kept(tested, plain), large=False, shrink=False)
         return not report.asked or bool(report.failed) or report.conforms

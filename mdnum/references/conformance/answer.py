@@ -1,6 +1,6 @@
-"""The pairs that a neighbor list gave, whatever form they have, as arrays by name.
+"""Convert the pairs returned by a neighbor list, in any supported form, to named arrays.
 
-The scripts that reproduce a failure contain this file as it is: it needs numpy alone.
+This file is copied into the scripts that reproduce a failure; it requires only numpy.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _ROWS = "pairs one by one are to be tuples (i, j) in a list, or rows of an array
 
 
 class Malformed(Exception):
-    """An answer that is no list of pairs; the message says why."""
+    """An answer that is not a list of pairs; the message gives the reason."""
 
 
 @dataclass(frozen=True)
 class ListAnswer:
-    """The rows that a list gave."""
+    """Rows returned by a neighbor list."""
 
     # i, j: atoms, shape (rows,)
     i: np.ndarray
@@ -43,21 +43,22 @@ class ListAnswer:
         return len(self.i)
 
     def same(self, other: ListAnswer) -> bool:
-        """Whether another answer has the same rows in the same order."""
+        """Return whether another answer has the same rows in the same order."""
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
 
 def read(given: Any) -> ListAnswer:
-    """The rows of what a list returned.
+    """Return the rows of a neighbor list's return value.
 
-    It may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance, vector), or any of
-    these without the parts in between: a part of one number a row is a distance, the first of three whole
-    numbers a row the shift, another of three the vector. Or a mapping, or an object with attributes, by the
-    names i, j, shift, distance and vector. Or the pairs one by one: a list of tuples (i, j), or one array
-    with a row (i, j) for each pair. A list of lists is parts, never pairs: some would look like both.
+    A list may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance, vector), or any
+    of these without the parts in between: a part with one number per row is a distance, the first part with
+    three integers per row is the shift, another with three numbers is the vector. It may return a mapping, or
+    an object with attributes, named i, j, shift, distance and vector. It may also return single pairs: a list
+    of tuples (i, j), or one array with a row (i, j) for each pair. A list of lists is read as parts, never as
+    pairs, since some would be ambiguous.
 
     Raises:
-        Malformed: it is none of these.
+        Malformed: the value has none of these forms.
     """
     given = parts(given)
     i, j = _indices(given["i"], "i"), _indices(given["j"], "j")
@@ -77,10 +78,10 @@ def read(given: Any) -> ListAnswer:
 
 
 def parts(given: Any) -> dict[str, Any]:
-    """What was returned, by the names of `ListAnswer`, with i and j at least.
+    """Return the parts of an answer under the names of `ListAnswer`, with at least i and j.
 
     Raises:
-        Malformed: it is no list of pairs.
+        Malformed: the value is not a list of pairs.
     """
     if given is None:
         raise Malformed("it returned None")
@@ -99,7 +100,7 @@ def parts(given: Any) -> dict[str, Any]:
 
 
 def _one_by_one(given: Any) -> dict[str, Any]:
-    """Rows (i, j)."""
+    """Return i and j from rows (i, j)."""
     table = _array(given, "the answer")
     if table.size == 0 and table.ndim:
         table = np.zeros((0, 2), np.int64)
@@ -112,7 +113,7 @@ def _one_by_one(given: Any) -> dict[str, Any]:
 
 
 def _in_order(arrays: list[np.ndarray]) -> dict[str, Any]:
-    """Parts of a tuple by their places and shapes."""
+    """Identify the parts of a tuple by position and shape."""
     if not 2 <= len(arrays) <= 5:
         raise Malformed(f"it returned {len(arrays)} parts, not (i, j), (i, j, shift), ...; {_ROWS}")
     first, second = arrays[:2]

@@ -1,4 +1,4 @@
-"""One question to a neighbor list: atoms in a box, once or several times in a row."""
+"""Test cases for neighbor lists: atoms in a box, at one moment or in a sequence."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ Length = Annotated[FiniteFloat, Ge(0)]
 
 @dataclass(frozen=True)
 class Still:
-    """Where the atoms are at one moment."""
+    """Positions of the atoms at one moment."""
 
     positions: Rows  # length, shape (atoms, 3)
     cell: Vectors  # lattice vectors as rows, length; rows of axes that do not repeat may hold anything finite
@@ -61,7 +61,7 @@ class Still:
 
 @dataclass(frozen=True)
 class Case:
-    """Atoms in a box at one moment or several, a cutoff, and what is to be learned from them."""
+    """A test case: atoms in a box at one or several moments, and a cutoff."""
 
     name: str  # what is special, in words
     area: str  # a key of `AREAS`
@@ -77,20 +77,20 @@ class Case:
 
     @property
     def atoms(self) -> int:
-        """Number of atoms, the largest where it changes."""
+        """Number of atoms, the largest if it changes."""
         return max(len(still.positions) for still in self.stills)
 
     @property
     def steps(self) -> int:
-        """Number of times that the list is asked."""
+        """Number of calls of the neighbor list."""
         return len(self.stills)
 
     def until(self, steps: int) -> Case:
-        """Its first steps."""
+        """Return the first steps of the case."""
         return replace(self, stills=self.stills[:steps])
 
     def only(self, atoms: ndarray) -> Case:
-        """The same with these atoms alone, in this order; where a still lacks some, the others."""
+        """Return the case with only these atoms, in this order; atoms missing from a still are skipped."""
         stills = tuple(
             replace(still, positions=still.positions[atoms[atoms < len(still.positions)]])
             for still in self.stills
@@ -98,14 +98,14 @@ class Case:
         return replace(self, stills=stills, known=None if self.known is None else _among(self.known, atoms))
 
     def changed(self, positions: Any = None, cell: Any = None, **other: Any) -> Case:
-        """The same with a function of the positions, and one of the cell, applied at every step."""
+        """Return the case with functions applied to the positions and to the cell of every step."""
         same = lambda rows: rows  # noqa: E731
         x, box = positions or same, cell or same
         stills = tuple(replace(one, positions=x(one.positions), cell=box(one.cell)) for one in self.stills)
         return replace(self, **{"stills": stills, "known": None, **other})
 
     def equals(self, other: Case) -> bool:
-        """Whether another case has the same numbers."""
+        """Return whether another case has the same numbers."""
         return (self.pbc, self.r_cut, self.skin) == (other.pbc, other.r_cut, other.skin) and all(
             np.array_equal(a.positions, b.positions) and np.array_equal(a.cell, b.cell)
             for a, b in zip(self.stills, other.stills, strict=True)
@@ -113,7 +113,7 @@ class Case:
 
 
 def matrix(cell: Any) -> ndarray:
-    """Lattice vectors as rows, of a matrix, of three edges or of the edge of a cube."""
+    """Return lattice vectors as rows, from a matrix, three edges or the edge of a cube."""
     cell = np.asarray(cell, np.float64)
     return np.diag(cell * np.ones(3)) if cell.ndim < 2 else cell
 
@@ -132,7 +132,7 @@ def once(
     r_cut: float = 1.0,
     known: PairSet | None = None,
 ) -> Case:
-    """A case of a single still; without a cell, free atoms."""
+    """Return a case of a single still; without a cell, the atoms are free."""
     if cell is None:
         cell, pbc = np.zeros((3, 3)), False
     return Case(name, area, (Still(positions, matrix(cell)),), _axes(pbc), float(r_cut), known=known)
@@ -147,14 +147,14 @@ def sequence(
     skin: float = 0.3,
     pbc: bool | Sequence[bool] = True,
 ) -> Case:
-    """A case of several stills: positions, or (positions, cell), one after the other."""
+    """Return a case of several successive stills, given by positions or (positions, cell)."""
     places = (place if isinstance(place, tuple) else (place, cell) for place in path)
     stills = tuple(Still(positions, matrix(box)) for positions, box in places)
     return Case(name, area, stills, _axes(pbc), float(r_cut), float(skin))
 
 
 def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
-    """The pairs of some of the atoms, by their new numbers."""
+    """Return the pairs among some of the atoms, with new indices."""
     most = int(max(atoms.max(initial=-1), pairs.i.max(initial=-1), pairs.j.max(initial=-1))) + 1
     new = np.full(most, -1)
     new[atoms] = np.arange(len(atoms))
@@ -165,10 +165,10 @@ def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
 
 
 def gas(count: int, cell, seed: int, low: float = 0.0, high: float = 1.0) -> ndarray:
-    """Coordinates drawn evenly from a range of fractions of a cell."""
+    """Return coordinates drawn uniformly from a range of fractions of a cell."""
     return np.random.default_rng(seed).uniform(low, high, (count, 3)) @ matrix(cell)
 
 
 def grid(count: int) -> ndarray:
-    """Integer places, count along each edge."""
+    """Return all integer coordinates of a cube with `count` points along each edge."""
     return np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), -1).reshape(-1, 3)

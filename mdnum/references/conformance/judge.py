@@ -1,4 +1,4 @@
-"""An answer against the truth: missing, extra, duplicated, misplaced, mismeasured; and the tally of many."""
+"""Compare a list's answers with the exact pairs, classify the errors, and count the results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SILENT = ("CRASHED", "NO_ANSWER", "RAISED")  # those of cases in which nothing c
 
 @dataclass(frozen=True)
 class Truth(PairSet):
-    """Pairs in and around the cutoff at one still, out to the reach that was asked for."""
+    """Exact pairs at one still, inside the cutoff and out to the requested reach."""
 
     # positions, cell: as the list was given them; rows of axes that do not repeat are zero
     positions: ndarray
@@ -46,21 +46,21 @@ class Truth(PairSet):
     reach: float  # pairs as far as this may be listed, length; the cutoff unless a list holds a skin
 
     def needed(self, unit: float) -> ndarray:
-        """The pairs that a list of this roundoff cannot be excused for lacking."""
+        """Return which pairs a list with this unit roundoff must contain."""
         return self.distance < self.r_cut - unit * self.scale
 
     def allowed(self, unit: float) -> ndarray:
-        """The pairs that it may have."""
+        """Return which pairs a list with this unit roundoff may contain."""
         return self.distance <= self.reach + unit * self.scale
 
 
 def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DOUBLE) -> Truth:
-    """The pairs of one still of a case.
+    """Compute the exact pairs of one still of a case.
 
     Args:
-        reach: how far pairs may be listed, length; the cutoff by default.
-        unit: the coarsest roundoff that will be asked about.
-    Error: decisions within rounding of the cutoff are those of rational arithmetic; see `all_pairs`.
+        reach: largest distance of listed pairs, length; the cutoff by default.
+        unit: the largest unit roundoff that will be used.
+    Error: decisions within rounding of the cutoff use rational arithmetic; see `all_pairs`.
     """
     still, pbc = case.stills[step], np.array(case.pbc)
     positions, r_cut = still.positions, case.r_cut
@@ -81,10 +81,10 @@ def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DO
 
 
 def conditioning(cell: ndarray, pbc: ndarray) -> float:
-    """What going through fractional coordinates and back can multiply a rounding error by; at least 1.
+    """Factor by which conversion to fractional coordinates and back can amplify rounding errors; at least 1.
 
     Source: Higham, Accuracy and Stability, 2nd ed., section 7.1: the condition number of the periodic lattice
-    vectors, each scaled to length 1 because lengths alone cost nothing.
+    vectors, each scaled to length 1 because lengths alone have no effect.
     """
     if not pbc.any():
         return 1.0
@@ -93,9 +93,9 @@ def conditioning(cell: ndarray, pbc: ndarray) -> float:
 
 
 def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tuple) -> list[ndarray]:
-    """One whole number for each row, equal where rows are: of these rows and of others, (i, j, shift) each.
+    """Return an integer key for each row (i, j, shift), equal for equal rows, for these rows and `others`.
 
-    Of `count` atoms; without shifts rows are told by their atoms alone.
+    `count` is the number of atoms; without shifts, rows are identified by their atoms alone.
     """
     sets = [(i, j, shift), *others]
     lengths = np.cumsum([0, *(len(rows[0]) for rows in sets)])
@@ -118,7 +118,7 @@ def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tup
 
 @dataclass(frozen=True)
 class Conventions:
-    """What kind of list it is, which is nobody's mistake."""
+    """Conventions of a neighbor list, all of which are acceptable."""
 
     full: bool = True  # every pair from both of its atoms (True), or once (False)
     sign: int = 1  # +1 where shifts are added to atom j, -1 where they are added to atom i
@@ -128,7 +128,7 @@ class Conventions:
 
 @dataclass(frozen=True)
 class Failure:
-    """One way in which an answer is wrong."""
+    """One error in an answer."""
 
     code: Code  # one of `CODES`
     text: str  # what was seen, with atoms and numbers
@@ -136,24 +136,24 @@ class Failure:
 
     @property
     def kind(self) -> tuple[str, str]:
-        """What a smaller case has to show: the code; of an exception or a crash also its words."""
+        """Signature that a smaller case must reproduce: the code, and the message of an exception or crash."""
         text = self.text if self.code in ("RAISED", "CRASHED", "MALFORMED") else ""
         return self.code, without_numbers(text)
 
 
 def without_numbers(text: str) -> str:
-    """What messages about different numbers have in common."""
+    """Replace the numbers in a message, so that messages with different numbers compare equal."""
     return re.sub(r"[-+\d.e]+", "#", text)
 
 
 def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Everything that is wrong with an answer; nothing where it conforms.
+    """Return all errors of an answer; an empty list if it conforms.
 
-    A pair within rounding of the cutoff (`Truth.scale` times the roundoff of the list) may be there or not,
-    but from both of its atoms alike.
+    A pair within rounding of the cutoff (`Truth.scale` times the roundoff of the list) may be present or
+    absent, but consistently for both of its atoms.
 
     Args:
-        truth: listed as far as the answer may reach.
+        truth: exact pairs, listed as far as the answer may reach.
         how: conventions of the list.
     """
     n = len(truth.positions)
@@ -176,7 +176,7 @@ def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
 
 
 def _compare(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """What is wrong with the rows of an answer, matched with those of the truth."""
+    """Return the errors found by matching the rows of an answer with the exact rows."""
     i, j, shifts = answer.i, answer.j, answer.shift is not None
     shift = how.sign * answer.shift if answer.shift is not None else np.zeros((len(i), 3), np.int64)
     right = _both(truth) if how.full else (truth.i, truth.j, truth.shift)
@@ -241,19 +241,19 @@ def _compare(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure
 
 
 def _through(shift: ndarray) -> str:
-    """The image, where it is not the atom itself."""
+    """Return the image shift as text; empty for the atom itself."""
     return f" + ({', '.join(str(int(part)) for part in shift)})" if np.any(shift) else ""
 
 
 def _both(truth: Truth) -> tuple[ndarray, ndarray, ndarray]:
-    """Every pair of the truth from both of its atoms."""
+    """Return every exact pair from both of its atoms."""
     columns = (truth.i, truth.j), (truth.j, truth.i), (truth.shift, -truth.shift)
     i, j, shift = map(np.concatenate, columns)
     return i, j, shift
 
 
 def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Every row the way the truth names it: i < j, or the leading one of two opposite shifts."""
+    """Orient every row as the exact pairs are: i < j, or the leading one of two opposite shifts."""
     a, b, c = shift.T if len(shift) else np.zeros((3, 0), np.int64)
     leading = (a > 0) | ((a == 0) & ((b > 0) | ((b == 0) & (c > 0))))
     turn = (i > j) | ((i == j) & ~leading)
@@ -261,7 +261,7 @@ def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, 
 
 
 def _shift_hint(answer: ListAnswer, truth: Truth, how: Conventions) -> str:
-    """What the shifts may have been meant for."""
+    """Suggest which convention would explain wrong shifts."""
     assert answer.shift is not None
     if not _compare(answer, truth, replace(how, sign=-how.sign)):
         return "; added to the other atom they are right"
@@ -273,7 +273,7 @@ def _shift_hint(answer: ListAnswer, truth: Truth, how: Conventions) -> str:
 
 
 def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Distances and vectors of rows that are all right."""
+    """Return errors of distances and vectors, for rows with correct pairs."""
     if answer.distance is None and answer.vector is None:
         return []
     # a bound for a length near the cutoff; a code may form it from squares of its coordinates' differences
@@ -309,14 +309,14 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """The error of an answer that is right in float32, as in `CaseResult.single`; None of another."""
+    """Error of an answer that is correct in float32, as in `CaseResult.single`; None if it is not."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))
 
 
 def measures_well(answer: ListAnswer, truth: Truth, how: Conventions) -> bool:
-    """Whether an answer has distances or vectors, and they are as good as the conventions say."""
+    """Return whether an answer has distances or vectors that are as accurate as the conventions state."""
     given = answer.distance is not None or answer.vector is not None
     n = len(truth.positions)
     named = bool(((answer.i >= 0) & (answer.i < n) & (answer.j >= 0) & (answer.j < n)).all())
@@ -324,7 +324,7 @@ def measures_well(answer: ListAnswer, truth: Truth, how: Conventions) -> bool:
 
 
 def _nearest(mine: ndarray, told: ndarray, theirs: ndarray, length: ndarray) -> ndarray:
-    """Distance of every number from the nearest of those with the same key."""
+    """Return the difference of every number from the nearest number with the same key."""
     order = np.lexsort((length, theirs))
     theirs, length = theirs[order], length[order]
     first, last = np.searchsorted(theirs, mine, "left"), np.searchsorted(theirs, mine, "right")
@@ -341,7 +341,7 @@ def _nearest(mine: ndarray, told: ndarray, theirs: ndarray, length: ndarray) -> 
 
 @dataclass(frozen=True)
 class CaseResult:
-    """What became of a question."""
+    """Result of one test case."""
 
     case: str  # its name
     failures: tuple[Failure, ...] = ()  # what was wrong at the first step at which anything was
@@ -356,7 +356,7 @@ class CaseResult:
 
 @dataclass(frozen=True)
 class Failed:
-    """A case that a list failed, on a few atoms where it was shrunk."""
+    """A failed test case, reduced to a few atoms if it was shrunk."""
 
     case: Case  # up to the step that failed; its name and area are those of the question
     failures: tuple[Failure, ...]  # what was wrong at that step
@@ -371,27 +371,27 @@ class Failed:
 
     @property
     def worst(self) -> Failure:
-        """The failure that is reported."""
+        """Most severe failure, which is reported."""
         return min(self.failures, key=lambda failure: CODES.index(failure.code))
 
     @property
     def code(self) -> str:
-        """Its code."""
+        """Code of the most severe failure."""
         return self.worst.code
 
 
 @dataclass
 class CaseAnswers:
-    """Everything that a list was asked, by the number of the question, and what was shrunk of its failures.
+    """Results of all test cases, by case number, and the shrunk failures.
 
-    Questions are drawn again when an examination is resumed, the same for the same seed; so none is kept.
+    An examination that is resumed draws the same cases from the same seed, so the cases are not stored.
     """
 
     cases: dict[str, CaseResult] = field(default_factory=dict)
     shrunk: dict[str, Failed] = field(default_factory=dict)
 
     def of(self, number: int, case: Case) -> CaseResult | None:
-        """What became of a question; None where it was not asked yet. InputError where it was another one."""
+        """Return the result of a case; None if it has not run yet. Raises InputError for a different case."""
         result = self.cases.get(str(number))
         if result is None:
             return None
@@ -408,7 +408,7 @@ class CaseAnswers:
 
 @dataclass(frozen=True)
 class RefusalKind:
-    """A kind of question that a list refuses."""
+    """A kind of case that a list rejects."""
 
     exception: str  # in words
     case: Case  # the smallest question that met it, up to the step that was refused
@@ -421,7 +421,7 @@ class RefusalKind:
 
 @dataclass
 class AreaTally:
-    """What became of the questions of one area."""
+    """Counts of results in one area."""
 
     # asked, refused, skipped: cases; refused by the list itself, skipped because of its limits
     asked: int = 0
@@ -432,23 +432,23 @@ class AreaTally:
 
     @property
     def failed(self) -> int:
-        """Cases answered wrongly, or not at all."""
+        """Number of cases with a wrong answer, or none."""
         return sum(self.codes.values())
 
     @property
     def silent(self) -> int:
-        """Failed cases in which nothing came back that could be wrong."""
+        """Number of failed cases without any answer."""
         return sum(self.codes.get(code, 0) for code in SILENT)
 
     @property
     def passed(self) -> int:
-        """Cases answered correctly."""
+        """Number of cases answered correctly."""
         return self.asked - self.failed - self.refused
 
 
 @dataclass
 class Report:
-    """What the suite found out about a list."""
+    """Results of the conformance suite for one list."""
 
     tested: PairList  # the list
     how: Conventions = field(default_factory=Conventions)  # its conventions, as declared or found out
@@ -480,13 +480,13 @@ class Report:
     whole: bool = True  # all failures were shrunk as far as they are
 
     def skip(self, case: Case, why: str) -> None:
-        """Counts a case that is not asked."""
+        """Count a case that is skipped."""
         tally = self.areas.setdefault(case.area, AreaTally())
         tally.skipped += 1
         tally.why[why] = tally.why.get(why, 0) + 1
 
     def take(self, case: Case, result: CaseResult) -> None:
-        """Counts what became of a case."""
+        """Count the result of a case."""
         tally = self.areas.setdefault(case.area, AreaTally())
         tally.asked += 1
         self.ties = (self.ties[0] + result.ties[0], self.ties[1] + result.ties[1])
@@ -512,34 +512,34 @@ class Report:
             tally.why[result.refused[1]] = tally.why.get(result.refused[1], 0) + 1
 
     def reach(self, case: Case) -> float:
-        """How far the pairs may be that a list with pairs beyond the cutoff gives, length.
+        """Largest distance of the pairs that a list with pairs beyond the cutoff may return, length.
 
-        What is listed may have come as far as the skin lets it, from either side.
+        Either atom of a listed pair may have moved as far as the skin allows.
         """
         usual = case.r_cut + 2 * case.skin if case.skin else 1.5 * case.r_cut
         own = 0.3 * (self.padding or 1.0)  # asked with a skin of 0.3 cutoffs
         return usual if own < 0.31 else max(usual, (1 + 2 * own) * case.r_cut)
 
     def total(self, count: str) -> int:
-        """Cases of all areas by an attribute of their tallies."""
+        """Sum an attribute of the tallies over all areas."""
         return sum(getattr(tally, count) for tally in self.areas.values())
 
     @property
     def asked(self) -> int:
-        """Cases that were asked."""
+        """Number of cases that ran."""
         return self.total("asked")
 
     @property
     def left(self) -> int:
-        """Cases that were neither asked nor skipped."""
+        """Number of cases that neither ran nor were skipped."""
         return self.questions - self.asked - self.total("skipped")
 
     @property
     def wrong(self) -> int:
-        """Cases that failed."""
+        """Number of failed cases."""
         return self.total("failed")
 
     @property
     def conforms(self) -> bool:
-        """Whether it was asked and no case failed."""
+        """Whether the list was tested and no case failed."""
         return self.wrong == 0 and self.asked > self.total("refused")

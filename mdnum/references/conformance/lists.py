@@ -1,4 +1,4 @@
-"""A neighbor list under test: how it is called, what it does not claim to do, and what makes one."""
+"""Neighbor lists under test: how they are called, what they do not support, and how they are created."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from mdnum.registry import Registry
 
 
 class KeptList(Protocol):
-    """A list that is kept and brought up to date. Both calls return pairs as `answer.read` takes them.
+    """A neighbor list that is kept and updated; both methods return pairs that `answer.read` accepts.
 
-    `allocate` starts anew and may be called again on the same object; `update` is given where the atoms are
-    now. The pairs that are returned must hold every pair within r_cut of the positions of this call; pairs
-    somewhat further may be there, as the skin leaves them. A list that keeps a padding of its own, whatever
-    skin it is given, has it in an attribute `skin` (length) that is read after each `allocate`.
+    `allocate` builds a new list and may be called again on the same object; `update` gets the current
+    positions. The returned pairs must include every pair within r_cut at the positions of this call, and may
+    include pairs slightly farther apart, within the skin. A list with its own padding, independent of the
+    given skin, states it in an attribute `skin` (length), which is read after each `allocate`.
     """
 
     def allocate(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float, skin: float) -> Any:
-        """The pairs of a new list."""
+        """Build a new list and return its pairs."""
         ...
 
     def update(self, positions: ndarray, cell: ndarray) -> Any:
-        """The pairs of the list in use at these positions.
+        """Return the pairs of the current list at these positions.
 
-        The arrays may be those of the call before with other numbers in them: keep numbers, not arrays.
+        The arrays may be those of the previous call with new contents: store copies, not references.
         """
         ...
 
@@ -47,7 +47,7 @@ _WANTED = f"Give a function of ({', '.join(_GIVEN)}) that returns (i, j)"
 
 @dataclass(frozen=True)
 class ListLimits:
-    """What a list does not claim to do; such cases are not asked, and are counted."""
+    """Cases that a list does not support; they are skipped, and counted."""
 
     minimum_image: bool = False  # one image of a pair at most: no cell narrower than two cutoffs (and skins)
     orthorhombic: bool = False  # no cell with other than right angles
@@ -68,11 +68,11 @@ class ListLimits:
     roomy: float = np.inf  # no box of more cells of r_cut than this along all axes together
 
     def refusal(self, case: Case) -> str | None:
-        """Why a case is not asked, or None when it is."""
+        """Return why a case is skipped, or None if it is not."""
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
-        """(whether a case is beyond a limit, the limit in words), the cheap ones first."""
+        """Yield (whether a case exceeds a limit, the limit as text), the fastest tests first."""
         pbc, cells = np.array(case.pbc), [still.cell for still in case.stills]
         least = min(len(still.positions) for still in case.stills)
         yield least < self.atoms, f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"
@@ -138,17 +138,17 @@ class PairList:
 
     @property
     def version(self) -> str | None:
-        """Installed version of its package, or None."""
+        """Installed version of the list's package, or None."""
         return self.package and version(self.package)
 
     @property
     def lacks(self) -> list[str]:
-        """Distributions that it needs and that are not installed."""
+        """Required distributions that are not installed."""
         needed = (*((self.package,) if self.package else ()), *self.needs)
         return [name for name in needed if version(name) is None]
 
     def with_options(self, **options: Any) -> PairList:
-        """The same with other declarations; None leaves one as it is."""
+        """Return the list with other declared properties; None leaves a property unchanged."""
         return replace(self, **{name: value for name, value in options.items() if value is not None})
 
 
@@ -158,7 +158,7 @@ LISTS: Registry[PairList] = Registry("neighbor list", "mdnum.neighbor_lists")
 
 
 def source_of(made: Any) -> str:
-    """The lines that define a function or class, without decorators; nothing where they are not available."""
+    """Return the source of a function or class without decorators; empty if it is not available."""
     try:
         lines = inspect.getsource(made).splitlines(keepends=True)
     except (OSError, TypeError):
@@ -168,13 +168,13 @@ def source_of(made: Any) -> str:
 
 
 def from_object(made: Any, name: str | None = None, source: str | None = None) -> PairList:
-    """A list from a function, from a class of lists that are kept, or from such a list.
+    """Return a list from a function, from a class of kept lists, or from a kept list.
 
-    What it is declared to be is read from attributes of it, where it has them: `full` (bool), `unit`
-    (roundoff), `superset` (bool), `limits` (`ListLimits`).
+    Declared properties are read from attributes of the object, if present: `full` (bool), `unit` (roundoff),
+    `superset` (bool), `limits` (`ListLimits`).
 
     Raises:
-        InputError: it is none of these.
+        InputError: the object is none of these.
     """
     if isinstance(made, PairList):
         return made
@@ -203,7 +203,7 @@ def from_object(made: Any, name: str | None = None, source: str | None = None) -
 
 
 def _check_signatures(made: Any, name: str, kept: bool) -> None:
-    """Raises InputError where a signature cannot take what the suite gives; what has none is let pass."""
+    """Raise InputError if a known signature does not accept the suite's arguments."""
     is_class = inspect.isclass(made)
     calls: list[tuple[str, Any, tuple[str, ...]]] = []
     if is_class or not kept:

@@ -1,12 +1,12 @@
-"""Sequences of motion for lists that are kept: those that have caught stale lists, and the smallest ones.
+"""Motion sequences for kept neighbor lists, including the smallest motions that a rebuild rule must detect.
 
 A pair that was beyond r_cut + padding when the list was built is inside the cutoff once its two atoms have
-come closer by the padding, and no motion that takes it there is smaller than the straight one. A rule that
-asks whether two atoms could have used up the padding rebuilds before that, whichever way they went, however
-they shared it and whatever the others did. So each of `motions` closes a pair by the padding and a hair:
-along axes, diagonals and no axis; by both atoms or one, or shared in any proportion; alone, among atoms at
-rest, among hundreds that move little, among others that do the same or in a common drift; at once, creeping,
-and back and forth.
+approached by the padding; the smallest motion that achieves this is along their line. A rule that tests
+whether two atoms could have used up the padding rebuilds before that, for any direction, any division of the
+motion between the atoms and any motion of the others. So each of `motions` closes a pair by slightly more
+than the padding: along axes, diagonals and random directions; by both atoms or one, in any proportion; alone,
+among atoms at rest, among hundreds that move little, among others with the same motion or a common drift; in
+one step, slowly, and back and forth.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are spread evenly
 
 
 def movers() -> Iterator[Case]:
-    """Scripts for a list that is kept, the short ones first."""
+    """Yield sequences for a kept list, the short ones first."""
     for area, scripts in (
         ("motion", _pairs),
         ("motion", _many),
@@ -50,7 +50,7 @@ def movers() -> Iterator[Case]:
 
 
 def sequences() -> Iterator[Case]:
-    """Scripts for a list that starts from nothing each time: what it keeps to itself must not matter."""
+    """Yield sequences for a list built from scratch at each call: its internal state must have no effect."""
     for case in _reuse():
         yield replace(case, skin=0.0)
 
@@ -61,7 +61,7 @@ def _two(apart: float, middle: ndarray = _MIDDLE) -> ndarray:
 
 
 def _beside(apart: float) -> ndarray:
-    """An atom, and another that moves toward it or away."""
+    """Return an atom, and another at a given distance that will approach or recede."""
     return np.array([_MIDDLE, _MIDDLE + np.array([apart, 0, 0])])
 
 
@@ -169,7 +169,7 @@ def _strain() -> Script:
 
 
 def _narrow() -> Iterator[Case]:
-    """Boxes in which a pair has several images within the cutoff, and an atom is near its own."""
+    """Yield boxes so narrow that pairs have several images within the cutoff and atoms see their own."""
     skewed = np.array([[0.9, 0, 0], [0.5, 0.8, 0], [-0.4, 0.3, 0.85]])
     for word, count, cell, pbc in (
         ("an atom alone, edges of 0.8 cutoffs", 1, 0.8, True),
@@ -208,7 +208,7 @@ def _reuse() -> Iterator[Case]:
 
 
 def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = None) -> Case:
-    """Every still is another question to the same list, or those are for which a skin is given."""
+    """Return a case in which every still, or every still with a given skin, starts a new list."""
     case = sequence(name, "reuse", path, _L, _R, max(filter(None, skins)) if skins else _SKIN)
     starts = zip(case.stills, skins or [None] * len(path), strict=True)
     stills = (replace(still, fresh=skin is not None or not skins, skin=skin) for still, skin in starts)
@@ -216,11 +216,11 @@ def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = Non
 
 
 def motions(padding: float | None = None) -> Iterator[Case]:
-    """Scripts of motions, the short ones first; `Case.motions` counts them.
+    """Yield sequences of small motions, the short ones first; `Case.motions` counts the motions.
 
     Args:
-        padding: that the list was seen to have, or says that it has, in units of the skin that it is given;
-            None where neither: what it is given is tried first, and a ladder of others.
+        padding: measured or stated padding of the list, in units of the given skin; None if unknown: the
+            given skin is tried first, then a series of other values.
     """
     room = _SKIN * (padding or 1.0)
     edge = max(6.0, 2.6 * (_R + room))
@@ -267,7 +267,7 @@ def motions(padding: float | None = None) -> Iterator[Case]:
 
 
 def _ways() -> list[ndarray]:
-    """Unit vectors: axes, diagonals of faces and of the cube, and three of no kind."""
+    """Return unit vectors: axes, diagonals of faces and of the cube, and three random ones."""
     ways = [np.array(way, float) for way in itertools.product((-1, 0, 1), repeat=3) if way > (0, 0, 0)]
     ways.sort(key=lambda way: (np.count_nonzero(way), tuple(-way)))
     ways += list(np.random.default_rng(140).normal(size=(3, 3)))
@@ -275,12 +275,12 @@ def _ways() -> list[ndarray]:
 
 
 def _closing(room: float) -> float:
-    """What takes a pair from beyond the list to inside the cutoff, by a hair each."""
+    """Return the approach that takes a pair from just beyond the list to just inside the cutoff."""
     return (1 + 2 * HAIR) * room
 
 
 def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
-    """Pairs that start beyond the list, by a hair: all first atoms, then all second ones."""
+    """Return pairs that start just beyond the list: all first atoms, then all second ones."""
     half = (_R + (1 + HAIR) * room) / 2 * way
     return np.vstack([middle - half, middle + half])
 
@@ -288,16 +288,17 @@ def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
 def _walk(
     room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float] = (0.0, 1.0)
 ) -> list[ndarray]:
-    """Two atoms somewhere, closed by so many of the smallest motion."""
+    """Return the path of two atoms that approach by given fractions of the smallest motion."""
     start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
 
 
 def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
-    """Two atoms of many come together, and the others rest or move little; each time they share it otherwise.
+    """Return a path in which two of many atoms approach, and the others rest or move little.
 
-    Places in the file of what moves most are spread evenly over it, those of its partner at random.
+    The division of the motion between the two atoms depends on `n`. The index of the
+    atom that moves most is spread evenly over all indices; that of its partner is random.
     """
     rng = np.random.default_rng(170 + n)
     most = int(count * (1.0 - (n + 1) * _GOLDEN % 1.0))
@@ -311,7 +312,7 @@ def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: f
 
 
 def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:
-    """The same among ten atoms, all of which drift: across the motion, along it, by much and by little."""
+    """Return a path of a pair among ten atoms that all drift, across or along the pair's motion."""
     start, end = _with(gas(12, edge, 180 + n), [4, 5], _walk(room, way, 0.5, edge, n))
     across = np.cross(way, np.roll(way, 1) + np.array([0.3, -0.2, 0.1]))
     across /= np.linalg.norm(across)
@@ -319,7 +320,7 @@ def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:
 
 
 def _with(others: ndarray, atoms: list[int], path: list[ndarray]) -> list[ndarray]:
-    """A path of some atoms among others at rest."""
+    """Return a path of some atoms among others at rest."""
     stills = [others.copy() for _ in path]
     for still, place in zip(stills, path, strict=True):
         still[atoms] = place
@@ -327,14 +328,14 @@ def _with(others: ndarray, atoms: list[int], path: list[ndarray]) -> list[ndarra
 
 
 def _dozen(room: float, way: ndarray, share: float, n: int) -> list[ndarray]:
-    """Twelve pairs in places of their own, all of which do the same."""
+    """Return a path of twelve pairs at different places with the same motion."""
     start = _around(_places(12, 12.0, n), room, way)
     moves = _closing(room) * np.repeat([share * way, (share - 1.0) * way], 12, axis=0)
     return [start, start + moves]
 
 
 def _in_turn(room: float, ways: list[ndarray]) -> Case:
-    """25 pairs, whose 50 atoms go one after the other: who is not looked at is found."""
+    """Return a case of 25 pairs whose 50 atoms move in turn, to detect atoms that a rule ignores."""
     count = 25
     way = np.array([ways[n % len(ways)] for n in range(count)])
     start = _around(_places(count, 15.0, 0), room, way)
@@ -352,7 +353,7 @@ def _in_turn(room: float, ways: list[ndarray]) -> Case:
 
 
 def _ladder(room: float, way: ndarray, n: int) -> Case:
-    """Pairs from near and far creep together: each comes inside when its own start is just used up."""
+    """Return a case in which pairs from various distances approach slowly until each is inside."""
     start = _around(_places(len(_RUNGS), 12.0, n), room * _RUNGS[:, None], way)
     inward = np.repeat([0.5 * way, -0.5 * way], len(_RUNGS), axis=0)
     path = [start + _closing(room) * closed * inward for closed in (0.0, *_RUNGS)]
@@ -361,7 +362,7 @@ def _ladder(room: float, way: ndarray, n: int) -> Case:
 
 
 def _one_by_one(room: float, way: ndarray, share: float, n: int) -> Case:
-    """The same pair by pair, each back to its place before the next: by one atom of it, or by both."""
+    """Return a case in which pairs from various distances approach and return, one pair at a time."""
     count = len(_RUNGS)
     start = _around(_places(count, 12.0, n + 1), room * _RUNGS[:, None], way)
     path = [start]
@@ -382,13 +383,13 @@ def _direction(way: ndarray) -> str:
 
 
 def _places(count: int, edge: float, n: int) -> ndarray:
-    """Places of their own for pairs, in an order that is not that of space."""
+    """Return separate places for pairs, in an order unrelated to space."""
     side = int(np.ceil(count ** (1 / 3)))
     return edge * np.random.default_rng(200 + n).permutation((grid(side) + 0.5) / side)[:count]
 
 
 def _sequence(name: str, paths: Iterable[list[ndarray]], cell: float | ndarray, skin: float = _SKIN) -> Case:
-    """Motions one after the other: between them all atoms go elsewhere, which no rule overlooks."""
+    """Return a case of successive motions, between which all atoms move far, so that any rule rebuilds."""
     paths = list(paths)
     case = sequence(name, "rule", [still for path in paths for still in path], cell, _R, skin)
     return replace(case, motions=len(paths))

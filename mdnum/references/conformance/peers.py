@@ -1,8 +1,8 @@
-"""Libraries' neighbor searches by name, and from a word to a list: theirs, or anybody's `module:function`.
+"""Neighbor searches of libraries, by name, and lookup of any list by name or `module:function`.
 
-Every function and class here imports what it needs and names nothing outside itself, because its lines are
-printed in scripts that reproduce a failure without mdnum. It calls its library as a user would and mends
-nothing: atoms outside the box, odd cells and few atoms go in as they are.
+Every function and class here imports what it needs and uses nothing defined outside it, because its source is
+printed in scripts that reproduce a failure without mdnum. It calls its library as a user would and corrects
+nothing: atoms outside the box, unusual cells and few atoms are passed on unchanged.
 """
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalCall=false
@@ -34,11 +34,11 @@ def _declared(name: str) -> dict[str, Any]:
 
 
 def peer(*names: str, helpers: Sequence[Any] = ()) -> Callable[[Any], Any]:
-    """Decorates a function, or a class of lists that are kept, which `LISTS` then has by these names.
+    """Decorator that registers a function, or a class of kept lists, in `LISTS` under these names.
 
     Args:
         names: of peers.toml.
-        helpers: what its lines need beside themselves, for a script without mdnum.
+        helpers: other objects that its source needs, for a script without mdnum.
     """
 
     def register(made: Any) -> Any:
@@ -65,7 +65,7 @@ def peer(*names: str, helpers: Sequence[Any] = ()) -> Callable[[Any], Any]:
 
 @peer("numpy-r2", "numpy")
 def numpy_pairs(positions, cell, pbc, r_cut, squared=False):
-    """Plain numpy, one image of every pair."""
+    """Brute-force search in plain numpy, one image of every pair."""
 
     import numpy as np
 
@@ -82,7 +82,7 @@ def numpy_pairs(positions, cell, pbc, r_cut, squared=False):
 
 @peer("ase")
 def ase_neighbor_list(positions, cell, pbc, r_cut):
-    """ase.neighborlist.neighbor_list."""
+    """ASE's function ase.neighborlist.neighbor_list."""
 
     from ase import Atoms
     from ase.neighborlist import neighbor_list
@@ -94,7 +94,7 @@ def ase_neighbor_list(positions, cell, pbc, r_cut):
 
 @peer("ase-skin")
 class AseSkinList:
-    """ase.neighborlist.NeighborList with a skin, which each of two atoms may use up."""
+    """ASE's class ase.neighborlist.NeighborList, with a skin that each of two atoms may use up."""
 
     kept = pbc = None
 
@@ -129,13 +129,13 @@ class AseSkinList:
 
 @peer("ase-primitive", helpers=[AseSkinList])
 def ase_primitive_list(positions, cell, pbc, r_cut):
-    """the list under ASE's LennardJones, EAM and Tersoff."""
+    """ASE's PrimitiveNeighborList, used by its LennardJones, EAM and Tersoff calculators."""
     return AseSkinList("PrimitiveNeighborList").allocate(positions, cell, pbc, r_cut, 0.0)
 
 
 @peer("vesin", "vesin-half")
 def vesin_cells(positions, cell, pbc, r_cut, half=False):
-    """vesin's cell list, every pair from both atoms."""
+    """Cell list of vesin, every pair from both atoms."""
 
     from vesin import NeighborList
 
@@ -147,7 +147,7 @@ def vesin_cells(positions, cell, pbc, r_cut, half=False):
 
 @peer("matscipy")
 def matscipy_list(positions, cell, pbc, r_cut):
-    """matscipy.neighbours.neighbour_list."""
+    """Function matscipy.neighbours.neighbour_list of matscipy."""
 
     from ase import Atoms
     from matscipy.neighbours import neighbour_list  # type: ignore
@@ -159,7 +159,7 @@ def matscipy_list(positions, cell, pbc, r_cut):
 
 @peer("pymatgen")
 def pymatgen_points(positions, cell, pbc, r_cut):
-    """pymatgen's find_points_in_spheres."""
+    """Function find_points_in_spheres of pymatgen."""
 
     import numpy as np
     from pymatgen.core import Lattice  # type: ignore
@@ -180,7 +180,7 @@ def pymatgen_points(positions, cell, pbc, r_cut):
 
 @peer("mdanalysis", "mdanalysis-brute")
 def mdanalysis_pairs(positions, cell, pbc, r_cut, method="nsgrid"):
-    """MDAnalysis, nsgrid."""
+    """MDAnalysis's nsgrid search."""
 
     import numpy as np
     from MDAnalysis.lib.distances import self_capped_distance
@@ -193,7 +193,7 @@ def mdanalysis_pairs(positions, cell, pbc, r_cut, method="nsgrid"):
 
 @peer("scipy")
 def scipy_tree(positions, cell, pbc, r_cut):
-    """scipy.spatial.KDTree.query_pairs."""
+    """SciPy's k-d tree search, scipy.spatial.KDTree.query_pairs."""
 
     import numpy as np
     from scipy.spatial import KDTree
@@ -206,7 +206,7 @@ def scipy_tree(positions, cell, pbc, r_cut):
 
 @peer("freud")
 def freud_query(positions, cell, pbc, r_cut):
-    """freud.locality.AABBQuery."""
+    """Class freud.locality.AABBQuery of freud."""
 
     import freud  # type: ignore
     import numpy as np
@@ -225,7 +225,7 @@ def freud_query(positions, cell, pbc, r_cut):
 
 @peer("torch-sim")
 def torch_sim_pairs(positions, cell, pbc, r_cut):
-    """torch-sim's linked cells."""
+    """Linked-cell search of torch-sim."""
 
     import torch  # type: ignore
     from torch_sim.neighbors import torch_nl_linked_cell  # type: ignore
@@ -244,7 +244,7 @@ def torch_sim_pairs(positions, cell, pbc, r_cut):
 
 @peer("nvalchemi-ops")
 def nvalchemi_pairs(positions, cell, pbc, r_cut, room=64):
-    """nvalchemi-ops' cell_list."""
+    """Function cell_list of nvalchemi-ops."""
 
     import torch  # type: ignore
     from nvalchemiops.torch.neighbors import NeighborOverflowError, cell_list  # type: ignore
@@ -260,7 +260,7 @@ def nvalchemi_pairs(positions, cell, pbc, r_cut, room=64):
 
 @peer("jax-md-kept")
 class JaxMdList:
-    """jax-md's partition.neighbor_list, allocated and updated, as its documentation shows."""
+    """Function partition.neighbor_list of jax-md, allocated and updated as in its documentation."""
 
     found = neighbor = step = None
     skewed = free = False
@@ -325,13 +325,13 @@ class JaxMdList:
 
 @peer("jax-md", helpers=[JaxMdList])
 def jax_md_pairs(positions, cell, pbc, r_cut):
-    """jax-md's partition.neighbor_list, allocated each time."""
+    """Function partition.neighbor_list of jax-md, allocated at each call."""
     return JaxMdList().allocate(positions, cell, pbc, r_cut, 0.0)
 
 
 @peer("mdnum-verlet")
 class MdnumVerletList:
-    """mdnum's own list with a skin: rebuilt before it is used up, box strain counted."""
+    """Verlet list of mdnum, rebuilt before motion and box strain use up its skin."""
 
     listed = built = pbc = None
 
@@ -359,7 +359,7 @@ class MdnumVerletList:
 
 @peer("mdnum", helpers=[MdnumVerletList])
 def mdnum_host_list(positions, cell, pbc, r_cut):
-    """mdnum's own cell list."""
+    """Cell list of mdnum."""
     return MdnumVerletList().allocate(positions, cell, pbc, r_cut, 0.0)
 
 
@@ -367,7 +367,7 @@ def mdnum_host_list(positions, cell, pbc, r_cut):
 
 
 def known() -> tuple[PairList, ...]:
-    """Every list that has a name here, installed or not."""
+    """Return every named list, installed or not."""
 
     def named(name: str) -> PairList:
         listed = LISTS[name]
@@ -380,17 +380,17 @@ def known() -> tuple[PairList, ...]:
 
 
 def installed() -> tuple[PairList, ...]:
-    """Those whose packages are there."""
+    """Return the named lists whose packages are installed."""
     return tuple(listed for listed in known() if not listed.lacks)
 
 
 def load(word: str) -> PairList:
-    """The list that a word names.
+    """Return the neighbor list with this name.
 
     Args:
         word: a name from `known()`, `package.module:function`, or `path/to/file.py:function`; see
-            `mdnum.references.load`. The function takes (positions, cell, pbc, r_cut) and returns pairs as
-            `answer.read` takes them; a class or an object with `allocate` and `update` is a list that is kept
+            `mdnum.references.load`. The function takes (positions, cell, pbc, r_cut) and returns pairs in a
+            form that `answer.read` accepts; a class or an object with `allocate` and `update` is a kept list
             (`KeptList`).
 
     Raises:

@@ -1,7 +1,7 @@
-"""The cases that a list is asked: named ones that lists have failed, crowds, lattices, and random ones.
+"""Test cases for neighbor lists: named cases that lists have failed, crowds, lattices, and random cases.
 
-For a library's own tests: `@given(cases())` gives cases of boxes of every kind, atoms in every place and
-cutoffs on and off the shells; `boxes()` gives (cell, pbc, words) alone.
+For a library's own tests: `@given(cases())` gives cases with boxes of every kind, atoms in all positions and
+cutoffs on and off the neighbor shells; `boxes()` gives (cell, pbc, description) alone.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _TURN = np.array([[2.0, -2.0, 1.0], [1.0, 2.0, 2.0], [2.0, 1.0, -2.0]]) / 3.0
 
 
 def catalog() -> Iterator[Case]:
-    """Every named case at one moment: those that are computed, and those of questions.toml."""
+    """Yield every named single-moment case: computed cases, and cases from questions.toml."""
     computed = {"boxes": _boxes(), "axes": _axes(), "outside": _outside(), "ties": _ties()}
     for area in ("few", "boxes", "axes", "images", "outside", "ties", "coincident"):
         yield from (once(name, area, *rest) for name, *rest in computed.get(area, ()))
@@ -48,7 +48,7 @@ def catalog() -> Iterator[Case]:
 
 
 def crowds() -> Iterator[Case]:
-    """Clusters with more neighbors than lists like to give an atom, alone and in a thin gas."""
+    """Yield clusters with very many neighbors per atom, alone and in a thin gas."""
     return (once(name, "crowded", *rest) for name, *rest in _crowds())
 
 
@@ -120,9 +120,9 @@ def _outside() -> Named:
 
 
 def _across_walls() -> ndarray:
-    """Pairs along x whose atoms lie just below a multiple of the cutoff, and a cutoff less a hair below that.
+    """Return pairs along x: one atom just below a multiple of the cutoff, the other almost a cutoff below it.
 
-    A search that puts one of them into the next cell, as float32 does, has two cells between them.
+    A search that assigns one of them to the next cell, as float32 does, has two cells between them.
     """
     hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
     pairs = []
@@ -163,9 +163,9 @@ def _crowds() -> Named:
 
 
 def vast() -> Iterator[Case]:
-    """Few atoms in so much space that a grid of cells over it has no room in memory, or in 32 bits.
+    """Yield cases with few atoms in a volume so large that a cell grid exceeds memory, or 32-bit indices.
 
-    For lists in a process of their own: those that make such a grid end it.
+    They are for lists in a separate process: a list that allocates such a grid terminates its process.
     """
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
     yield once("two pairs thousands of cutoffs apart, free", "axes", apart)
@@ -174,13 +174,14 @@ def vast() -> Iterator[Case]:
 
 
 def lattice(edge: int, seed: int = 0) -> Case:
-    """A cubic lattice of whole numbers with gaps, its atoms in any order and in any image of the box.
+    """Return a cubic lattice of integers with gaps, with atoms in random order and random images.
 
-    Neighbors are the 26 around a place, known by counting modulo the edge: no search and no rounding.
+    The neighbors are the 26 sites around each site, found by indices modulo the edge, without search or
+    rounding.
 
     Args:
-        edge: places along an edge.
-        seed: of gaps, order and images.
+        edge: sites along an edge.
+        seed: random seed for gaps, order and images.
     """
     rng = np.random.default_rng(seed)
     places = grid(edge)
@@ -212,7 +213,7 @@ def lattice(edge: int, seed: int = 0) -> Case:
 
 
 def _sphere(count: int) -> ndarray:
-    """Directions spread evenly over a sphere (Fibonacci's)."""
+    """Return directions spread evenly over a sphere (Fibonacci sphere)."""
     k = np.arange(count) + 0.5
     height, angle = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
     flat = np.sqrt(1 - height**2)
@@ -236,7 +237,7 @@ _FEW_IMAGES = 400  # lattice vectors that the oracle may have to try for a pair
 
 @st.composite
 def boxes(draw: Any, r_cut: float = 1.0) -> tuple[ndarray, Pbc, str]:
-    """(cell, pbc, words): lattice vectors as rows, which of them repeat, and what is special.
+    """Draw (cell, pbc, description): lattice vectors as rows, periodic axes, and the kind of box.
 
     Args:
         r_cut: cutoff that sizes are relative to, length.
@@ -268,7 +269,7 @@ def boxes(draw: Any, r_cut: float = 1.0) -> tuple[ndarray, Pbc, str]:
 
 
 def _edges(size: str, rng: np.random.Generator) -> ndarray:
-    """Lengths of the edges in units of the cutoff."""
+    """Return lengths of the edges in units of the cutoff."""
     edges = rng.uniform(2.05, 6.0, 3)
     axis = rng.integers(3)
     if size == "two cutoffs":
@@ -281,7 +282,7 @@ def _edges(size: str, rng: np.random.Generator) -> ndarray:
 
 @st.composite
 def cases(draw: Any, most: int = 40) -> Case:
-    """A question at one moment, of `most` atoms at most."""
+    """Draw a single-moment case with at most `most` atoms."""
     scale = draw(st.sampled_from((1.0, 1.0, 1.0, 2.5, 6.0, 0.1, 3.405)))
     cell, pbc, words = draw(boxes(scale))
     place = draw(st.sampled_from(PLACES))
@@ -297,7 +298,7 @@ def cases(draw: Any, most: int = 40) -> Case:
 
 
 def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
-    """Lattice vectors within reach of a pair."""
+    """Return the number of lattice vectors within reach of a pair."""
     if not any(pbc):
         return 1
     width = widths(completed(cell, np.array(pbc)))
@@ -307,7 +308,7 @@ def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
 def _positions(
     place: str, count: int, cell: ndarray, pbc: ndarray, r_cut: float, rng: np.random.Generator
 ) -> tuple[ndarray, float]:
-    """Coordinates, and the cutoff: moved onto a distance where that is what is asked about."""
+    """Return coordinates and the cutoff, which is set to a pair distance for atoms "at the cutoff"."""
     full = completed(cell, pbc)
     # free axes have vectors of length 1, which would be no room
     room = np.where(pbc, 1.0, np.maximum(1.0, 3.0 * r_cut / np.linalg.norm(full, axis=1)))
@@ -340,7 +341,7 @@ def _positions(
 
 
 def _rotation(rng: np.random.Generator) -> ndarray:
-    """A rotation drawn evenly."""
+    """Return a uniformly distributed random rotation."""
     turned, upper = np.linalg.qr(rng.normal(size=(3, 3)))
     turned = turned * np.sign(np.diag(upper))
     return turned if np.linalg.det(turned) > 0 else turned[[1, 0, 2]]
@@ -355,16 +356,16 @@ def plan(
     far: bool = False,
     large: bool = False,
 ) -> list[tuple[int, Iterable[Case]]]:
-    """The cases that a list is asked, in order, by parts: (how many, cases, some of which are made late).
+    """Return the cases for a list, in order, by parts: (number of cases, cases, some generated late).
 
-    The first part has `BREADTH` of each area, but for random cases and thousands of atoms.
+    The first part has `BREADTH` cases of each area, except random cases and thousands of atoms.
 
     Args:
-        count: random cases.
+        count: number of random cases.
         seed: of the random cases.
-        padding: of a list that is kept, in skins, where it is known; see `motions`.
-        far: those, too, that end a process which makes a grid of cells over all space.
-        large: 5,000 and 100,000 atoms, too.
+        padding: padding of a kept list, in skins, if known; see `motions`.
+        far: include cases that terminate a process which allocates a cell grid over all space.
+        large: include 5,000 and 100,000 atoms.
     """
     named = [*movers(), *motions(padding)] if tested.kept else []
     named += as_kept(tested, catalog())
@@ -386,23 +387,23 @@ def plan(
 def questions(
     tested: PairList, count: int, seed: int, padding: float | None = None, far: bool = False
 ) -> list[Case]:
-    """All of `plan`, but for those of thousands of atoms."""
+    """Return all cases of `plan`, except those with thousands of atoms."""
     return [case for _, part in plan(tested, count, seed, padding, far=far) for case in part]
 
 
 def lattices() -> Iterator[Case]:
-    """5,000 and 100,000 atoms."""
+    """Yield lattices of 5,000 and 100,000 atoms."""
     return map(lattice, (SMALL_EDGE, LARGE_EDGE))
 
 
 def as_kept(tested: PairList, asked: Iterable[Case]) -> Iterator[Case]:
-    """Questions at one moment, with a skin for a list that is kept."""
+    """Yield single-moment cases, with a skin for a kept list."""
     for case in asked:
         yield replace(case, skin=0.3 * case.r_cut) if tested.kept else case
 
 
 def drawn(count: int, seed: int) -> list[Case]:
-    """Cases that hypothesis draws, the same for the same seed."""
+    """Return cases drawn by hypothesis, the same for the same seed."""
     collected: list[Case] = []
     checks: Any = list(hypothesis.HealthCheck)
 
@@ -424,7 +425,7 @@ def drawn(count: int, seed: int) -> list[Case]:
 
 
 def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
-    """Other ways to put a question: (words, whether it should make no difference, the question)."""
+    """Yield variants of a case: (description, whether the answer must not change, the variant)."""
     yield "when it is asked anew", True, case
     if case.atoms > 1:
         yield "with its atoms in reverse order", True, case.only(np.arange(case.atoms)[::-1])
@@ -446,7 +447,7 @@ def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
 
 
 def _wrapped(still: Still, pbc: ndarray) -> Still:
-    """The same atoms in the images that lie in the box."""
+    """Return the same atoms wrapped into the box."""
     if not pbc.any() or not len(still.positions):
         return still
     matrix = completed(still.cell, pbc)

@@ -1,4 +1,4 @@
-"""A failing case as a Python script that reproduces it without mdnum: the list, the numbers, brute force."""
+"""Write a failing case as a Python script without mdnum: the neighbor list, the numbers, brute force."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ _LINES = beside(__file__)  # parts of a script
 def script(
     tested: PairList, failed: Failed, how: Conventions, superset: bool = False, reach: float | None = None
 ) -> str:
-    """Lines that call the list with the numbers of a failing case and compare it with brute force.
+    """Return a script that calls the list for a failing case and compares it with brute force.
 
-    It needs numpy and the list; it prints what is wrong and exits with 1, or with 0 once the list is right.
-    An exception of the list is left to be seen.
+    The script needs only numpy and the list; it prints the error and exits with 1, or with 0 if the list is
+    correct. An exception of the list is not caught.
 
     Args:
         how: conventions of the list.
-        superset: pairs beyond the cutoff may be listed.
-        reach: how far they may be, length; `Report.reach`.
+        superset: whether pairs beyond the cutoff may be listed.
+        reach: largest distance of such pairs, length; `Report.reach`.
     """
     case, worst = failed.case, failed.worst
     usual = case.r_cut + (2 * case.skin if case.skin else 0.5 * case.r_cut)
@@ -69,7 +69,7 @@ def script(
 
 
 def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
-    """The case as constants."""
+    """Return the case as constants in source code."""
     case, stills = failed.case, []
     several = any(other.skin is not None for other in case.stills)
     for still, fresh, skin in _calls(case):
@@ -100,7 +100,7 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
 
 
 def _calls(case: Case) -> Iterator[tuple[Still, bool, float]]:
-    """(still, whether the list starts anew there, its skin) at every step."""
+    """Yield (still, whether the list is rebuilt from scratch there, its skin) at every step."""
     atoms = None
     for still in case.stills:
         count = len(still.positions)
@@ -118,7 +118,7 @@ _SECONDS = 60.0  # seconds that a script may take
 
 
 def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | None:
-    """Whether the script of a failure shows it when it is run; None where it cannot be run in time."""
+    """Run the script of a failure, and return whether it shows the failure; None if it cannot run in time."""
     tested, code, text = report.tested, failed.code, failed.worst.text
     if not tested.source.strip() or deadline.passed:
         return None
@@ -145,7 +145,7 @@ def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | Non
 
 
 def _array(values: np.ndarray) -> str:
-    """An array as an expression that gives the same bits."""
+    """Return an array as an expression that gives the same bits."""
     if len(values) > _PRINTED:
         sink = io.BytesIO()
         np.save(sink, np.ascontiguousarray(values))

@@ -1,4 +1,4 @@
-"""Calls of a list, in this process or one of its own: what came back, or what became of the call instead."""
+"""Call a neighbor list, in this process or a separate one, and return its answers or errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _BORROWED = frozenset({"numpy", "scipy", "numba", "pandas", "torch", "jax", "jax
 
 @dataclass(frozen=True)
 class CallOutcome:
-    """What became of one call."""
+    """Outcome of one call of a neighbor list."""
 
     answer: ListAnswer | None = None  # the pairs, or None
     # why there is no answer, or None: it crashed, came too late, raised or returned no pairs
@@ -59,7 +59,7 @@ class CallOutcome:
 
 
 class Session:
-    """Calls of one list, a kept one through its life; with `reuse` one object is asked in all cases."""
+    """Calls of one neighbor list; with `reuse`, the same object is used in all cases."""
 
     starts, deadline = 0, Deadline()  # of a process; calls in this one have none
 
@@ -69,11 +69,11 @@ class Session:
         self._returned: list[ndarray] = []
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """The outcome at every still, as far as the list goes: it ends at the first that is no answer."""
+        """Return the outcome at every still, up to the first without an answer."""
         return list(self.outcomes(case))
 
     def outcomes(self, case: Case) -> Iterator[CallOutcome]:
-        """The same, one after the other."""
+        """Yield the outcome at every still, up to the first without an answer."""
         if self._made is None or (self.tested.kept and not self.reuse):
             try:
                 self._made = self.tested.make()
@@ -97,13 +97,13 @@ class Session:
                 return
 
     def close(self) -> None:
-        """Lets go of the list."""
+        """Release the neighbor list object."""
         self._made, self._returned = None, []
 
     def _call(
         self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, skin: float | None
     ) -> CallOutcome:
-        """One call; with a skin, a list that is kept is allocated."""
+        """Make one call; a kept list is allocated if a skin is given."""
         inputs = {"positions": positions, "cell": cell, "pbc": pbc}
         before = {name: array.copy() for name, array in inputs.items()}
         returned, self._returned = self._returned, []
@@ -156,19 +156,19 @@ def _failed(error: Exception | SystemExit, case: Case, package: str | None) -> C
 
 
 def meant(error: Exception, package: str | None = None) -> bool:
-    """Whether an exception states on purpose that something cannot be done, or came about by accident.
+    """Return whether an exception is a deliberate statement that a case is not supported, not an accident.
 
-    A refusal keeps a program from computing with wrong pairs and can be relied on. A `min()` of no distances
-    is a ValueError as well, and only shows that nobody thought of such input.
+    A deliberate rejection keeps a program from computing with wrong pairs. An accidental exception, such as
+    a ValueError from `min()` of no distances, only shows that the input was not anticipated.
 
     Args:
         error: with its traceback.
-        package: distribution of the list; what it raises itself in compiled code counts as meant.
+        package: distribution of the list; exceptions raised in its own compiled code count as deliberate.
 
     Returns:
-        True where the innermost frame is the list's own and stands at a `raise`, or at a call of a library's
-        compiled code that raised, of a ValueError, a RuntimeError or a class of the library's own, with
-        words; False where it is not, and where that cannot be decided.
+        True if the innermost frame is the list's own and is at a `raise`, or at a call of a library's
+        compiled code that raised; and if the exception is a ValueError, a RuntimeError or a class of the
+        library's own, with a message. False otherwise, and if this cannot be decided.
     """
     own = (package or "").replace("-", "_").lower()
     usual = isinstance(error, ValueError | RuntimeError) or _is_own(type(error).__module__, own)
@@ -188,13 +188,13 @@ def meant(error: Exception, package: str | None = None) -> bool:
 
 
 def _is_own(module: str, own: str) -> bool:
-    """Whether a module is a list's, rather than Python's or one that everybody computes with."""
+    """Return whether a module belongs to the list, rather than to Python or a common numerical library."""
     top = module.partition(".")[0]
     return bool(top) and (top.lower() == own or (top not in _BORROWED and top not in sys.stdlib_module_names))
 
 
 def _at_raise(place: TracebackType) -> bool:
-    """Whether a frame stands at a `raise` statement."""
+    """Return whether a frame is at a `raise` statement."""
     code, at = place.tb_frame.f_code.co_code, place.tb_lasti
     if 0 <= at < len(code) and dis.opname[code[at]] == "RAISE_VARARGS":
         return True
@@ -204,7 +204,7 @@ def _at_raise(place: TracebackType) -> bool:
 
 
 def _called_module(place: TracebackType) -> str:
-    """The module of the compiled function that a frame stands in a call of; empty where it is none."""
+    """Return the module of the compiled function that a frame is calling; empty if there is none."""
     code = place.tb_frame.f_code
     where = next(islice(code.co_positions(), max(0, place.tb_lasti // 2), None), (None,) * 4)
     first, last, left, right = where
@@ -232,7 +232,7 @@ def _called_module(place: TracebackType) -> str:
 
 
 def _value(name: ast.expr, place: TracebackType) -> Any:
-    """What a name, or an attribute of one, means where an exception passed; None where unclear."""
+    """Return the value of a name, or of its attribute, in the frame of an exception; None if unclear."""
     if isinstance(name, ast.Attribute):
         return getattr(_value(name.value, place), name.attr, None)
     if not isinstance(name, ast.Name):
@@ -243,9 +243,9 @@ def _value(name: ast.expr, place: TracebackType) -> Any:
 
 
 class RemoteSession:
-    """As `Session`, of a list that `load` finds by its word, in another process.
+    """Session for a named list in a separate process.
 
-    A new one is started after each that ended: a crash is a finding and not an end.
+    A new process is started after each one that ended, since a crash is a finding and must not end the suite.
     """
 
     most = np.inf  # seconds that an answer may take, where that is less than usual
@@ -260,10 +260,10 @@ class RemoteSession:
         self._from = 0
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """The outcome at every still, as far as the list goes.
+        """Return the outcome at every still, up to the first without an answer.
 
         Raises:
-            TimeUp: the deadline passed meanwhile; the process is ended.
+            TimeUp: the deadline passed during the call; the process is terminated.
         """
         outcomes: list[CallOutcome] = []
         try:
@@ -282,7 +282,7 @@ class RemoteSession:
             return [*outcomes, CallOutcome(failure=ended.failure)]
 
     def close(self) -> None:
-        """Ends the process."""
+        """Terminate the process."""
         process, self._process = self._process, None
         if process is not None:
             with process:  # which closes its streams and waits for its end
@@ -334,7 +334,7 @@ class RemoteSession:
 
 
 class _Ended(Exception):
-    """The other process is gone; the failure says how."""
+    """Raised when the separate process has ended; `failure` describes how."""
 
     def __init__(self, failure: Failure):
         super().__init__(failure.text)
@@ -342,7 +342,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Ends a process that had its time and did not answer; `late` then has the words for it."""
+    """Kill a process that did not answer within its time; `late` then describes the delay."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):
@@ -358,7 +358,7 @@ def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Eve
 
 
 def _processor_seconds(process: int) -> float | None:
-    """What a process has used of the processor so far, all threads together; None where that is not known."""
+    """Return the processor time of a process over all threads, s; None if unknown."""
     try:
         # the second word is the name of the program in brackets, which may hold blanks
         words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
@@ -380,7 +380,7 @@ def _received(stream: BinaryIO | Any) -> Any:
 
 
 def serve(word: str, parent: int) -> None:
-    """Answers questions on stdin to the list of this word: the process of a `RemoteSession` of another."""
+    """Answer cases from stdin with the named list: the main function of a `RemoteSession` process."""
     from mdnum.references.conformance.peers import load
 
     # a list may print: what it writes to stdout must not be taken for an answer

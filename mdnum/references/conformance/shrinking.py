@@ -1,4 +1,4 @@
-"""A failing case brought down to a few atoms, few steps and round numbers that fail in the same way."""
+"""Reduce a failing case to a few atoms, few steps and round numbers that fail in the same way."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ Failures = Callable[[Case], Sequence[Failure]]
 
 
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
-    """The smallest case found, before the deadline, that fails with the same code.
+    """Return the smallest case found before the deadline that fails with the same code.
 
-    `failures` asks the list; a new object of a kept list for each question.
+    `failures` evaluates the list, with a new object of a kept list for each case.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)
@@ -73,13 +73,13 @@ def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None)
 
 
 def _only(case: Case, atoms: list[int]) -> Case:
-    """Some of the atoms; few need no pairs in closed form."""
+    """Return the case with only some atoms; small cases drop the pairs known in closed form."""
     smaller = case.only(np.array(atoms, int))
     return replace(smaller, known=None) if len(atoms) <= 400 else smaller
 
 
 def _sensible(case: Case) -> bool:
-    """Whether it is a question: finite numbers, a box with room in it, not too many images to count."""
+    """Return whether a case is valid: finite numbers, a nonsingular box, not too many images."""
     pbc = np.array(case.pbc)
     if not (0 < case.r_cut < np.inf and all(np.isfinite(still.positions).all() for still in case.stills)):
         return False
@@ -98,7 +98,7 @@ def _sensible(case: Case) -> bool:
 
 
 def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
-    """Axes that need not repeat, cells that need not lean, fewer digits, coordinates that may be 0."""
+    """Yield simplifications: fewer periodic axes, right angles, fewer digits, coordinates set to 0."""
     for axis in range(3):
         yield lambda case, axis=axis: replace(
             case, pbc=tuple(on and n != axis for n, on in enumerate(case.pbc)), known=None
@@ -128,9 +128,9 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 
 
 def deepest(failures: Failures, failed: Failed) -> Failed:
-    """A pair that is lost just inside the cutoff, followed as far in as it stays lost.
+    """Follow a missing pair inside the cutoff as far as it remains missing.
 
-    It moves on the way it went, so that what is reported is how near a lost pair can be.
+    The pair continues its motion, so that the reported case has the smallest distance of a missing pair.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
@@ -147,7 +147,7 @@ def deepest(failures: Failures, failed: Failed) -> Failed:
 
 
 def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline) -> Failed:
-    """A failure brought down to few atoms and calls, whose script was run where it can be."""
+    """Return a failure reduced to few atoms and calls, whose script was run if possible."""
 
     def failures(case: Case) -> Sequence[Failure]:
         with suppress(TimeUp):
@@ -175,7 +175,7 @@ def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadli
 def _needing(
     examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline
 ) -> Failed | None:
-    """A failure with the earlier questions without which a new process does not show it; None if none do."""
+    """Find the earlier cases that a new process needs to show a failure; None if there are none."""
     session, began = examiner.session, time.perf_counter()
 
     def fails(cases: Sequence[Case]) -> bool:

@@ -1,4 +1,4 @@
-"""One list through all questions: which it answers correctly, and the first failure of each kind."""
+"""Run the conformance suite on one neighbor list: its correct answers, and the first failure of each kind."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ _REFUSALS = 6  # refusals that are examined; a list with more kinds of them has 
 
 
 class Examiner:
-    """Asks a list and judges its answers; finds out its conventions first.
+    """Runs test cases on a list and judges its answers, after determining its conventions.
 
     Args:
-        reuse: ask one object in all cases.
-        apart: call it in a process of its own, which may crash.
-        deadline: after which that process is ended, and what it was asked raises `TimeUp`.
+        reuse: use one object in all cases.
+        apart: call the list in a separate process, which may crash.
+        deadline: time at which this process is terminated, with `TimeUp` for the current case.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Examiner:
             self._find_conventions()
 
     def _find_conventions(self) -> None:
-        """Full or half, signs of shifts and vectors, from a question that nobody gets wrong otherwise."""
+        """Determine from simple cases whether the list is full, and the signs of shifts and vectors."""
         tested, report = self.tested, self.report
         full, sign, toward = tested.full, 1, 1
         triple = once("a triple through a face", "few", [[0.2, 2, 2], [3.8, 2.1, 2], [0.5, 2.4, 2.2]], 4.0)
@@ -103,9 +103,10 @@ class Examiner:
             self._find_padding()
 
     def _find_padding(self) -> None:
-        """Whether a list that is kept gives what its skin holds, and how far it has all pairs.
+        """Determine whether a kept list returns the pairs in its skin, and how far it is complete.
 
-        Its padding is where the nearest pair is that it lacks, or what it states.
+        The padding is the distance of the nearest missing pair beyond the cutoff, or the value the list
+        states.
         """
         report = self.report
         crowd = replace(once("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
@@ -136,7 +137,7 @@ class Examiner:
             report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
 
     def unusable(self) -> str | None:
-        """Why no plain question had an answer that is one, but for what the suite reports; None otherwise."""
+        """Return why every simple case raised an exception or gave a malformed answer, or None."""
         reasons = [
             f"asked about {case.name}, {'it raised ' * (why.code == 'RAISED')}{why.text}"
             for case, outcome in self.opening
@@ -145,11 +146,11 @@ class Examiner:
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """What is wrong with the answers to a case within the limits, at the first step where anything is."""
+        """Return the errors of a case within the limits, at the first step with an error."""
         return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
-        """What becomes of a case. An accidental exception is a failure; a refusal is none."""
+        """Run a case; an accidental exception is a failure, but a deliberate rejection is not."""
         began = time.perf_counter()
         outcomes = self.session.ask(case)
         result = CaseResult(case.name, seconds=time.perf_counter() - began)
@@ -171,7 +172,7 @@ class Examiner:
         return result
 
     def take(self, case: Case, result: CaseResult) -> None:
-        """Makes what became of a case part of what is known of the list."""
+        """Record the result of a case."""
         self.report.take(case, result)
         if result.refused is not None:
             step, words = result.refused
@@ -183,7 +184,7 @@ class Examiner:
     def _judge(
         self, case: Case, step: int, answer: ListAnswer, how: Conventions
     ) -> tuple[list[Failure], tuple[float, float] | None, tuple[int, int]]:
-        """(failures, the error of one that is right in single precision alone, ties counted and not)."""
+        """Return (failures, error if correct only in float32, numbers of ties listed and not listed)."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
@@ -208,7 +209,7 @@ class Examiner:
 
 
 def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
-    """Pairs at exactly the cutoff, listed and not, of a case in which no rounding can blur them."""
+    """Count pairs at exactly the cutoff, listed and not listed, in a case without rounding."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
         return 0, 0  # on small integers no arithmetic rounds
@@ -223,7 +224,7 @@ def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
 
 
 def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
-    """The truth at a step, where pairs that were listed correctly earlier in the list's life may still be."""
+    """Return the exact pairs at a step, including those listed correctly since the list was built."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
@@ -256,26 +257,26 @@ def examine(
     answers: CaseAnswers | None = None,
     saved: Saved | None = None,
 ) -> Report:
-    """Put a list through the suite.
+    """Run the conformance suite on a neighbor list.
 
     Args:
-        cases: random ones, beside those with a name.
-        seed: of the random ones.
-        large: ask about 5,000 and 100,000 atoms, too.
-        stop: at the first failure.
-        shrink: bring failures down to a few atoms.
-        apart: call it in a process of its own, so that a crash is reported as one; needs a list from `load`.
-        asked: instead of all questions.
+        cases: number of random cases, in addition to the named ones.
+        seed: of the random cases.
+        large: include 5,000 and 100,000 atoms.
+        stop: stop at the first failure.
+        shrink: reduce failures to a few atoms.
+        apart: call the list in a separate process, so that a crash is reported; needs a list from `load`.
+        asked: cases to run instead of all.
         progress: called with (cases done, cases, words).
-        examiner: that knows its conventions already, instead of a new one.
-        deadline: after which no case is begun; what was not asked by then is counted.
-        answers: of an earlier examination of the same questions, which are not asked again; each new one is
-            put there.
-        saved: called at the beginning and after each that is put there, with whether it should not be lost.
+        examiner: existing examiner that knows the list's conventions, instead of a new one.
+        deadline: no case starts after this time; the remaining cases are counted.
+        answers: results of an earlier examination of the same cases, which are not run again; new results are
+            added to it.
+        saved: called at the beginning and after each new result, with whether it must not be lost.
 
     Returns:
-        what was asked and what became of it. A list may raise, return anything and write to its input: that
-        is reported as a failure.
+        the cases and their results. A list may raise exceptions, return anything and write to its input:
+        these are reported as failures.
     """
     began = time.perf_counter()
     deadline, answers = deadline or Deadline(), answers or CaseAnswers()
@@ -356,7 +357,7 @@ def examine(
 
 
 def _keeps_order(examiner: Examiner) -> bool | None:
-    """Whether the same question has the same rows in the same order, three times; None where it has none."""
+    """Return whether three identical calls give the same rows in the same order; None without an answer."""
     for case in (once("order", "reuse", gas(40, 6.0, 120), 6.0), once("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
@@ -367,7 +368,7 @@ def _keeps_order(examiner: Examiner) -> bool | None:
 
 
 def _too_long(report: Report, case: Case) -> str | None:
-    """Why a large question is not asked: it would take longer than anybody waits, by the one before it."""
+    """Return why a large case is skipped, from its expected time by the previous one; None if it is not."""
     if report.large is None:
         return None
     atoms, seconds = report.large
@@ -377,9 +378,9 @@ def _too_long(report: Report, case: Case) -> str | None:
 
 
 def _refusals(examiner: Examiner) -> list[RefusalKind]:
-    """Each kind of refusal, with what is answered of the same question put in another way.
+    """Return each kind of rejection, with the variants of the same case that are answered.
 
-    A new process, or a new object, is asked each.
+    Each variant is run in a new process, or with a new object.
     """
     found = []
     for refusal in list(examiner.refused.values())[:_REFUSALS]:
@@ -395,10 +396,10 @@ def _refusals(examiner: Examiner) -> list[RefusalKind]:
 
 
 def distinct(failed: Iterable[Failed]) -> list[Failed]:
-    """The smallest failure of each kind: one mistake is met in many areas, and one script of it is enough.
+    """Return the smallest failure of each kind, since one error appears in many areas.
 
-    Those of a code that need equally many atoms, steps and periodic axes are taken for the same mistake;
-    exceptions and what is no list of pairs, where they are the same in words but for numbers.
+    Failures with the same code and equal numbers of atoms, steps and periodic axes are taken for one error;
+    exceptions and malformed answers are compared by message, ignoring numbers.
     """
 
     def size(failure: Failed) -> tuple[bool, bool, int, int, int]:
