@@ -79,7 +79,7 @@ class Meter:
 
     @property
     def up(self) -> type[TimeUp] | None:
-        """The exception for the limit that has been reached; None while calls and time remain."""
+        """The exception class for an exceeded limit on calls or time; None while both remain."""
         return TimeUp if self.deadline.passed else CallsUp if self.calls >= self.most else None
 
     @contextmanager
@@ -106,7 +106,7 @@ class Meter:
 
 @dataclass(frozen=True)
 class Observed:
-    """One finding of a check: a code, and values for its sentences in mdnum/verbs/audit.toml."""
+    """One finding of a check: a code, and values for its text in mdnum/verbs/audit.toml."""
 
     code: str  # short stable name
     severity: Severity  # info (nothing to do), warning (look at it), error (the numbers are wrong)
@@ -137,7 +137,7 @@ def finding(
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart: labeled lines over a shared x axis, with labeled marks (such as a threshold) on that axis."""
+    """A chart of labeled lines over a shared x axis, with labeled marks such as thresholds on this axis."""
 
     title: str
     x_label: str
@@ -170,10 +170,11 @@ class CheckResult:
 
 
 class AuditCheck:
-    """One question about a calculator: a file in `mdnum.audit.checks`, or an entry point of another package.
+    """Base class of a calculator check, defined in `mdnum.audit.checks` or by a plugin of another package.
 
-    A subclass has a name, a title, a one-line docstring and `ask`; its sentences are under the codes of its
-    findings in mdnum/verbs/audit.toml. To add one, add the file `checks/NAME.py` with the class `NameCheck`.
+    A subclass defines a name, a title, a one-line docstring and `ask`; the texts of its findings are in
+    mdnum/verbs/audit.toml, under their codes. To add a check, add the file `checks/NAME.py` with the class
+    `NameCheck`.
 
     Args:
         timestep: time step of a run, internal time; None for a fraction of the fastest vibration's period.
@@ -237,7 +238,7 @@ def _above_limits(result: CheckResult) -> Iterator[Observed]:
 
 @dataclass
 class Ways:
-    """Counts of the cases that a check examined, skipped, or could have examined."""
+    """Counts of test cases that a check examined, skipped, or could have examined."""
 
     skipped: list[Skipped] = field(default_factory=list)
     asked: int = 0  # those on which the calculator failed included

@@ -45,7 +45,7 @@ _SAME = 1e-9  # of the energy: a second element that changes it by less is none 
 
 
 def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None) -> Atoms:
-    """Return a test structure for a calculator: its own, a crystal of supported elements, or rigid water.
+    """Return a test structure for a calculator: its own, a crystal, or rigid water.
 
     The crystal is that of an element that the calculator is meant for; half of its atoms are of a second
     element if the calculator distinguishes the two. The lattice constant is at the calculator's own energy
@@ -80,7 +80,7 @@ def _labeled(atoms: Atoms, origin: str) -> Atoms:
 
 
 class _Builder:
-    """Builds a structure for a calculator, and keeps the best structure computed so far."""
+    """Builds a test structure for a calculator, and keeps the best structure evaluated so far."""
 
     def __init__(self, loaded: LoadedCalculator, meter: Meter):
         self.name, self.calculator, self.meter = loaded.name, loaded.make(), meter
@@ -128,7 +128,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return the crystal of the first supported element, after testing two atoms if `paired`."""
+        """Return the crystal of the first supported element; if `paired`, walk a pair of its atoms first."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():
@@ -163,7 +163,7 @@ class _Builder:
         return made
 
     def _crystal(self, subject: CalculatorSubject, pair: Pair | None, *symbols: str) -> Atoms | None:
-        """Build the crystal; return None if the calculator fails at every density."""
+        """Build a crystal for the calculator; return None if the calculator fails at every density."""
         if pair is not None:
             self.cutoff, self.least = _felt(subject, pair)
         elif len(symbols) == 1:
@@ -240,10 +240,10 @@ def water(edge: int = 4) -> Atoms:
 
 
 def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Return the processor time of a repeated energy and force calculation, s: the smaller of two values.
+    """Return the processor time of an energy and force calculation in seconds, the smaller of two values.
 
-    Child processes of the calculator are counted. Other programs are not, so the choice of structure does not
-    depend on the load of the machine.
+    The time of the calculator's child processes is included. Other programs are excluded, so the choice of
+    structure does not depend on the load of the machine.
     """
 
     def clock() -> float:
@@ -261,7 +261,7 @@ def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """Estimate (the cutoff distance of a pair, the distance of its energy minimum); None where there is none.
+    """Estimate the cutoff of a pair interaction and the distance of its energy minimum (None if absent).
 
     If the calculator fails on atoms without neighbors, the cutoff is the distance where it starts to fail.
     """
@@ -307,7 +307,7 @@ def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
 def _grown(
     subject: CalculatorSubject, cell: Atoms, kind: str, scale: float, relaxed: bool, cutoff: float | None
 ) -> Atoms | None:
-    """Build the largest crystal up to two cutoffs wide that is computed fast enough; None if none is."""
+    """Return the largest crystal, up to two cutoffs wide, that is evaluated fast enough, or None."""
     at = "at the calculator's own least energy" if relaxed else _tabulated(scale)
     if cutoff and scale * _least_distance(cell) > _BARELY * cutoff:
         # nothing holds it together: a crystal in which nothing is felt would tell nothing
@@ -349,7 +349,7 @@ def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, r
 def _unit_cell(symbol: str, *others: str) -> tuple[Atoms, str]:
     """Return a rectangular unit cell of the element (fcc, bcc or diamond; otherwise fcc of its size).
 
-    Every second atom is of the second element, if one is given.
+    If a second element is given, every second atom is of this element.
     """
     from ase.build import bulk
     from ase.data import atomic_numbers, covalent_radii, reference_states
@@ -373,7 +373,7 @@ def _least_distance(cell: Atoms) -> float:
 def _least_energy(
     subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
 ) -> tuple[float, bool]:
-    """Find the lattice scale of least energy from `start`: (scale factor, whether a minimum exists)."""
+    """Find the lattice scale factor of least energy, from `start`, and whether a minimum exists."""
 
     def energy(scale: float) -> float:
         try:

@@ -1,4 +1,4 @@
-"""Which causes explain which findings: causes.toml, next to this file, has one table per finding code."""
+"""Table of the causes that explain findings, read from causes.toml next to this file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mdnum.plain import beside
 
 @dataclass(frozen=True)
 class Cause:
-    """Known consequences, alternatives and tests of the cause reported under one finding code."""
+    """Known consequences, alternative causes and tests for the cause that one finding code reports."""
 
     brings: tuple[str, ...] = ()  # codes of findings that it explains
     rivals: tuple[str, ...] = ()  # codes of other causes that show the same
@@ -41,16 +41,16 @@ _SEVERITIES = ("info", "warning", "error")
 
 
 def cause(code: str) -> Cause:
-    """Return the table row of a finding code; an empty row for a code of another package."""
+    """Return the table row for a finding code; the row is empty for a code of another package."""
     return CAUSES.get(code, Cause())
 
 
 def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
-    """Return the index of the finding under which each finding is listed (its own if it stands alone).
+    """Return the index of the finding under which each finding is listed (its own if listed separately).
 
     A finding is listed under the deepest reported cause that explains it and is no less severe, or under the
-    first finding of the same code. A shared cause is likely but not proven: correct the upper finding and run
-    the audit again.
+    first finding of the same code. A shared cause is likely but not proven: fix the upper finding and run the
+    audit again.
 
     Args:
         findings: code and severity of each, in the order in which they were found.

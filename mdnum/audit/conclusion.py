@@ -45,12 +45,12 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
 
 
 def largely_unasked(result: CheckResult) -> bool:
-    """Return whether the time was up before a check had examined most of its cases."""
+    """Return whether a check ran out of time before it had examined most of its cases."""
     return result.asked < _NEARLY * result.possible
 
 
 def nothing_felt(results: Sequence[CheckResult]) -> bool:
-    """Return whether no atoms interact in the structure, so that findings there mean nothing."""
+    """Return whether no atoms interact in the structure, which makes its results meaningless."""
     return any(result.numbers.get("nothing_felt") for result in results)
 
 
@@ -59,7 +59,7 @@ def _begun(results: Sequence[CheckResult]) -> set[str]:
 
 
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
-    """Return whether there is no verdict yet: no error was found, and a basic check has not yet run."""
+    """Return whether the audit has no verdict yet: no error was found, and a basic check has not run."""
     begun, basic = _begun(results), {name for name in wanted if CHECKS[name].basic}
     return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
 
@@ -67,7 +67,8 @@ def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
 def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
     """Return text variants, by finding code, that depend on the results of several checks.
 
-    Incorrect forces that do no work around loops belong to another energy; those that do work have no energy.
+    Incorrect forces that do no work around closed loops derive from another energy; forces that do work
+    derive from no energy.
     """
     numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
     curl, forces = numbers.get("curl"), numbers.get("forces")

@@ -99,7 +99,7 @@ def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndar
 
 
 def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> tuple[float, float]:
-    """Return (one-sided dF/dx at start, its error) at the spacing with the smallest error."""
+    """Return the one-sided dF/dx at `start` and its error, for the spacing with the smallest error."""
     best = (0.0, np.inf)
     for relative in _WIDTHS:
         width = max(abs(start), 1.0) * relative
@@ -114,7 +114,7 @@ def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> t
 
 
 def _bend(curve: Curve, start: float, sign: int, room: float) -> float:
-    """Estimate |second derivative of the force| on one side."""
+    """Estimate the magnitude of the force's second derivative on one side."""
     width = min(1e-3 * max(abs(start), 1.0), room / 4)
     force = curve.many(start + sign * width * np.arange(3))[1]
     return abs(float(force[0] - 2 * force[1] + force[2])) / width**2
@@ -129,7 +129,7 @@ def _close(curve: Curve, start: float, toward: float) -> Float[np.ndarray, "2 po
 
 @dataclass(frozen=True)
 class Jump:
-    """A coordinate at which the curve or one of its derivatives jumps."""
+    """A coordinate at which a curve or one of its derivatives jumps."""
 
     low: float  # the last coordinate before it
     high: float  # the first one after it; the next double after low where `exact`
@@ -161,10 +161,10 @@ def find_jumps(
 ) -> tuple[list[Jump], int]:
     """Find every jump of energy, force, curvature or third derivative that stands out of a scan.
 
-    The detection limit depends on the bending of the curve; `smallest_steps` gives it for the force. At a
-    spacing of 0.025 Å, 199 of 200 force steps of 1e-6 eV/Å at random places of five potentials are found, and
-    all larger ones; energy steps are found down to 3e-6 eV on a wall of ε = 1 eV, and to 1e-8 eV on a soft
-    one.
+    The detection limit depends on the curvature of the curve; for force steps, `smallest_steps` returns it.
+    At a spacing of 0.025 Å, 199 of 200 force steps of 1e-6 eV/Å at random places of five potentials are
+    found, and all larger ones; energy steps are found down to 3e-6 eV on a wall of ε = 1 eV, and to 1e-8 eV
+    on a soft one.
 
     Args:
         curve: must be defined slightly beyond both ends.
@@ -301,21 +301,21 @@ def _outliers(
 
 
 def _eighth(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "2 intervals"]:
-    """Eighth differences of energy and force: the smaller of those centered on an interval's ends.
+    """Eighth differences of energy and force: the smaller of the two centered on an interval's endpoints.
 
-    On a repulsive wall they are a hundredth of the mismatch of two cubics; the signal of a step grows in them
-    by the same factor as rounding.
+    On a repulsive wall, eighth differences are a hundredth of the mismatch of two cubics; a step and the
+    rounding error are amplified by the same factor.
     """
     differences = np.abs(np.lib.stride_tricks.sliding_window_view(curve.many(places), 9, axis=1) @ _EIGHTH)
     return np.minimum(differences[:, :-1], differences[:, 1:])
 
 
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
-    """Mismatch of each interval with its two sides: of the energy, the force, and the energy minus the work.
+    """Mismatch across each interval: in energy, in force, and in energy change plus work of the force.
 
-    The first two are |prediction from the left minus prediction from the right| at the midpoint. The third is
-    the change of the energy minus the integral of the force (fifth power of the spacing where smooth), which
-    is far more sensitive to a jump of the energy alone.
+    The first two values are |prediction from the left minus prediction from the right| at the midpoint. The
+    third value is the energy change plus the work integral of the force (fifth power of the spacing where
+    smooth), which is far more sensitive to a jump of the energy alone.
     """
     values = curve.many(places)
     windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
@@ -327,7 +327,7 @@ def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.nda
 
 
 def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
-    """Find the jumps between left and right, down to neighboring doubles where a value jumps."""
+    """Find the jumps between left and right, located to neighboring doubles if energy or force jumps."""
     room = right - left
     left, right = left - 1.5 * room, right + 1.5 * room
     noise = np.maximum(scatter(curve, left, right, room).max(axis=0), 1e-300)
@@ -413,7 +413,7 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """Locate a jump of the energy's third derivative, from the force's second derivative on both sides.
 
-    Of several fit widths, the one with the best agreement between full and half width is used.
+    Of several fit widths, the width with the best agreement between full and half width is used.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

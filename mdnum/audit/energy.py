@@ -2,8 +2,8 @@
 
 The energy of every step is accounted for: ΔU plus the work of the forces along the straight line between two
 steps vanishes for a force that has this energy, whatever the integrator does. A remainder at a threshold is
-the jump of a flip; at another single point it comes from a cap on neighbors or a choice of the nearest;
-anywhere else the force is not the derivative of the energy.
+the energy jump of a flip; a remainder at another single point is due to a cap on neighbors or a selection of
+nearest neighbors; a distributed remainder means that the force is not the derivative of the energy.
 """
 
 from __future__ import annotations
@@ -67,13 +67,13 @@ class NveRun:
         return there
 
     def way(self, step: int, share: float) -> Float[np.ndarray, "atoms 3"]:
-        """Return the positions at a fraction of the straight line of a step."""
+        """Return the positions at a fraction of the straight line between two time steps."""
         return self.positions[step - 1] + share * (self.positions[step] - self.positions[step - 1])
 
 
 @dataclass(frozen=True)
 class RunCrossing:
-    """A pair that crossed a threshold between two steps."""
+    """A pair of atoms that crossed a distance threshold between two time steps."""
 
     step: int  # after it; the step before is one less
     # i, j, rank: the pair, and how many of its images inside are nearer
@@ -89,7 +89,7 @@ class RunCrossing:
 
     @property
     def sign(self) -> float:
-        """Direction of the crossing: 1 for a pair that enters, -1 for one that leaves."""
+        """Direction of the crossing: 1 if the pair enters the threshold distance, -1 if it leaves."""
         return 1.0 if self.entered else -1.0
 
 
@@ -127,7 +127,7 @@ def _furthest(moved: Float[np.ndarray, "atoms 3"]) -> float:
 
 
 def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
-    """Return the fraction s in [0, 1] at which |start + s way|² passes a value."""
+    """Return the fraction s in [0, 1] at which |start + s way|² equals `square`."""
     a, b, c = float(way @ way), 2 * float(start @ way), float(start @ start) - square
     inside = b * b - 4 * a * c
     if a == 0 or inside < 0:
@@ -139,7 +139,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy and force along the straight line of a step; with `ends`, the run's own at its ends."""
+    """Energy and force along the straight line between two steps; `ends` uses the run's own end values."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:
@@ -198,7 +198,7 @@ def _unexplained(curve: Curve, low: float, high: float) -> float:
 
 @dataclass(frozen=True)
 class HiddenJump:
-    """A point on the straight line of a step at which the energy jumps."""
+    """A point on the straight line between two steps at which the energy jumps."""
 
     step: int  # at its end
     share: float  # of the way
@@ -209,7 +209,7 @@ class HiddenJump:
 
 @dataclass(frozen=True)
 class HiddenJumps:
-    """Energy jumps found in the steps of a run with an unexplained energy change."""
+    """Energy jumps found in those time steps of a run that have an unexplained energy change."""
 
     jumps: tuple[HiddenJump, ...] = ()  # found in the steps that were searched
     steps: Mapping[int, float] = field(default_factory=dict)  # those, with what they left unexplained, eV
@@ -223,7 +223,7 @@ class HiddenJumps:
         return max(1.0 - left / whole, 0.0) if whole else 0.0
 
     def brought(self, step: int) -> float:
-        """Return the energy change by the jumps found in a step, eV."""
+        """Return the sum of the energy jumps found in a time step, eV."""
         return sum(jump.energy for jump in self.jumps if jump.step == step)
 
     def energies(self, rest: Steps) -> Steps:
@@ -235,7 +235,7 @@ class HiddenJumps:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Most frequent k whose k-th and next neighbors change places at a jump, and the number of jumps."""
+        """Most frequent k whose k-th and (k+1)-th neighbors swap at a jump, and the number of jumps."""
         return _most_frequent(k for jump in self.jumps for k in {k for _, k in jump.ties})
 
     @property
@@ -279,7 +279,7 @@ def hidden_jumps(
 def _within(
     probe: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], limit: float
 ) -> list[HiddenJump]:
-    """Find the energy jumps within one step."""
+    """Find the energy jumps within one time step."""
     curve, parts = along_step(probe, run, step), [(0.0, 1.0)]
     first = _unexplained(curve, 0.0, 1.0)
     for level in range(_LEVELS):
@@ -303,7 +303,7 @@ def _within(
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Energy balance of a run, step by step."""
+    """Energy balance of a run at every time step."""
 
     crossed: Sequence[RunCrossing]  # flips at thresholds
     jumps: Steps  # energy that the flips of each step brought, measured or by the mean of those measured, eV
@@ -319,13 +319,13 @@ class EnergyBalance:
 
     @property
     def filled(self) -> Steps:
-        """Unexplained energy without hidden jumps, eV; its mean at steps that were left out."""
+        """Unexplained energy change without hidden jumps at each step, eV; the mean at steps not measured."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 
     @property
     def means(self) -> dict[PairThreshold, float]:
-        """Mean energy jump of a pair that enters, by threshold, eV."""
+        """Mean energy jump of a pair that enters the cutoff, for each threshold, eV."""
         found: dict[PairThreshold, list[float]] = {}
         for place, jump in self.measured.items():
             found.setdefault(self.crossed[place].threshold, []).append(self.crossed[place].sign * jump)
@@ -414,7 +414,7 @@ def drift(time: Steps, values: Steps) -> Drift:
     """Return the slope of a straight line through block means, with its standard error.
 
     Blocks are longer than the correlation time, so their means scatter independently if the run is long
-    enough; neighboring steps do not. At least 16 values are required.
+    enough; values at neighboring steps are correlated. At least 16 values are required.
     """
     blocks = np.array_split(np.arange(len(values)), _BLOCKS)
     x, y = ([float(row[block].mean()) for block in blocks] for row in (time, values))

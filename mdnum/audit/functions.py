@@ -1,7 +1,7 @@
 """Check the smoothness of a user's pair function between close contact and cutoff, from its values alone.
 
-A run records the flips at its cutoff. Where the function has a discontinuity of its own, such as pieces that
-do not join, no flip is recorded, and no derivative through the run includes it.
+A run records the flips at its cutoff. If the pair function itself has a discontinuity, for example where two
+pieces do not join, no flip is recorded, and no derivative through the run includes the discontinuity.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
 
 
 def _order(derivatives: np.ndarray) -> int:
-    """Return the number of derivatives that do not jump at the last distance."""
+    """Return the number of energy derivatives that do not jump at the last distance."""
     for order, row in enumerate(derivatives):
         usual = float(np.median(np.abs(row[np.isfinite(row)]))) if np.isfinite(row).any() else 0.0
         if not abs(row[-1]) <= _NOTHING[min(order, 1)] * usual:
@@ -123,7 +123,7 @@ def _order(derivatives: np.ndarray) -> int:
 
 
 def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float) -> list[dict[str, Any]]:
-    """Find the defects of a curve between two distances, one row each."""
+    """Find the discontinuities and other defects of a pair curve between two distances, one row each."""
     step = (r_cut - low) / _INTERVALS
     curve, high = Curve(at), r_cut * (1 + _BEYOND)
     grid = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)

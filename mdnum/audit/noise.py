@@ -76,8 +76,8 @@ class NoiseFloor:
     def allowed(self) -> NoiseFloor:
         """Largest difference allowed between two answers; every comparison with noise uses this value.
 
-        A standard deviation estimated from few values may be far too small by chance; Student's t
-        distribution accounts for this.
+        A standard deviation estimated from few values may be far too small by chance; the limit uses
+        Student's t distribution to account for this.
         """
         student = math.sqrt(2) * float(-stdtrit(min(self.freedom, 1e9), _BY_CHANCE / 2))
         return replace(self, **{
@@ -115,7 +115,7 @@ def along_a_line(
 
 @dataclass(frozen=True)
 class Staircase:
-    """Steps in energies and forces along a line on which smooth values change from point to point."""
+    """Size of discrete steps in energies and forces along a line."""
 
     energy: float  # the size of a step, eV; 0 where there are none
     force: float  # of a force component, eV/Å
@@ -128,8 +128,8 @@ class Staircase:
 def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     """Detect steps in energies and forces: values that stay the same to the last bit and then change.
 
-    In single or double precision, any smooth value changes within 1e-4 Å. Points at which nothing at all has
-    changed are not counted: a calculator that returned a cached answer looks the same.
+    In single or double precision, any smooth value changes within 1e-4 Å. Points at which energy and all
+    forces are unchanged are ignored, since a cached answer looks the same.
     """
     key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
     if key in subject.known:
@@ -171,7 +171,7 @@ def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
 
 
 def _quantum(values: Float[np.ndarray, "points"]) -> float:
-    """Return a number of which the second differences are multiples; 0 if there is none above rounding."""
+    """Return a common divisor of all second differences, larger than rounding, or 0."""
     sizes = np.abs(np.diff(values, n=2))
     sizes = sizes[sizes > np.spacing(largest(values)) / _ALIKE]
     for part in (1, 2, 3) if sizes.size else ():
@@ -182,7 +182,7 @@ def _quantum(values: Float[np.ndarray, "points"]) -> float:
 
 
 def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
-    """Standard deviation of the noise in each column: the median of three orders of difference."""
+    """Standard deviation of the noise in each column, the median over difference orders 4, 5 and 6."""
     found = []
     for order in (4, 5, 6):
         weight = math.factorial(order) ** 2 / math.factorial(2 * order)
@@ -195,9 +195,9 @@ def order_change(
 ) -> tuple[float, NoiseFloor]:
     """Largest energy change on reordering the atoms, eV, and the noise floor if rounding explains it.
 
-    The floor is 0 if rounding does not explain the change, or if no change exceeds the noise along a line.
-    The rounding error of a sum varies randomly with its terms, while terms that are missing in another order
-    change smoothly along a line.
+    The noise floor is 0 if rounding does not explain the energy change, or if no change exceeds the noise
+    along a line. The rounding error of a sum varies randomly with its terms, while terms that are missing in
+    another order change smoothly along a line.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
@@ -285,7 +285,7 @@ def under_jitter(
 def settled(
     subject: CalculatorSubject, rng: np.random.Generator, at_least: int = FEW, brief: bool = False
 ) -> tuple[Atoms, NoiseFloor]:
-    """Return the structure with its atoms displaced slightly, away from any threshold, and the noise there.
+    """Return the structure with its atoms displaced slightly, away from any threshold, and its noise level.
 
     In a perfect crystal a whole neighbor shell can lie exactly on a cutoff, which would disturb checks that
     are not about thresholds. An energy step within the line appears as noise, so the quietest of several
@@ -330,7 +330,7 @@ def settled(
 
 
 def roomy(atoms: Atoms, at_least: int) -> Atoms:
-    """Repeat a structure along its periodic axes until it has at least this many atoms."""
+    """Repeat a structure along its periodic axes until it has at least `at_least` atoms."""
     if len(atoms) >= at_least or not len(atoms) or not atoms.pbc.any():
         return atoms
     times = math.ceil((at_least / len(atoms)) ** (1 / int(atoms.pbc.sum())))
@@ -344,7 +344,7 @@ def direction(atoms: int, rng: np.random.Generator) -> Float[np.ndarray, "atoms 
 
 
 def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
-    """Return a copy with every atom displaced, Å."""
+    """Return a copy of a structure with every atom displaced, Å."""
     there = atoms.copy()
     there.positions += by
     return there
@@ -352,7 +352,7 @@ def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
 
 @dataclass(frozen=True)
 class Digits:
-    """Decimals and significand bits shared by a set of numbers."""
+    """Number of decimals and of significand bits that a set of numbers uses."""
 
     decimals: int | None  # they are rounded to; None where to none
     bits: int  # of their significands, at most; 53 for a double that is used in full
@@ -363,7 +363,7 @@ class Digits:
         return 0.0 if self.decimals is None else 10.0**-self.decimals
 
     def grain(self, values: np.ndarray) -> float:
-        """Return the spacing of representable numbers at the largest of these values."""
+        """Return the spacing of numbers with these digits at the largest of some values."""
         return max(self.quantum, 2.0**-self.bits * largest(values))
 
     @property
@@ -373,7 +373,7 @@ class Digits:
 
 
 def digits(values: np.ndarray) -> Digits:
-    """Return the decimals and bits of numbers; full precision if there are too few distinct values."""
+    """Return the number of decimals and bits that values use; full precision if too few are distinct."""
     found = np.unique(np.asarray(values, dtype=np.float64))
     found = found[np.isfinite(found) & (found != 0.0)]
     if len(found) < _FEWEST:
@@ -389,7 +389,7 @@ def digits(values: np.ndarray) -> Digits:
 def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
     """Yield a finding, QUANTIZED or LOW_PRECISION, if answers carry fewer digits than a double.
 
-    Steps in the answers are measured along a line, whatever the numbers look like: forces that were rounded
+    Steps in the answers are measured along a line and not inferred from the digits: forces that were rounded
     before a unit conversion, or computed from rounded positions, use all digits of a double.
     """
     stairs = steps(subject, atoms)

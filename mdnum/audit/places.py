@@ -27,28 +27,28 @@ class WrongPlaces:
 
     @property
     def pattern(self) -> str:
-        """Pattern of the wrong positions: "first", "last", "every" (nth) or "some"."""
+        """Pattern of the wrong list positions: "first", "last", "every" (every nth) or "some"."""
         if len(self.places) == 1:
             return {0: "first", self.count - 1: "last"}.get(self.places[0], "some")
         return "every" if len(set(np.diff(self.places).tolist())) == 1 else "some"
 
     @property
     def values(self) -> dict[str, Any]:
-        """Values for the sentences of a finding."""
+        """Values for the text of a finding about wrong list positions."""
         shown = ", ".join(map(str, self.places[:8])) + (", …" if len(self.places) > 8 else "")
         every = int(np.diff(self.places)[0]) if self.pattern == "every" else 0
         return {"places": shown, "every": every, "wrong_places": len(self.places), "count": self.count}
 
 
 def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) -> WrongPlaces | None:
-    """Find wrong list positions by exchanging an atom with another of its species at an ordinary position.
+    """Find wrong list positions by exchanging each atom with one of its species at a correct position.
 
-    Exchanging two atoms between ordinary positions changes nothing. An error tied to a position appears at
-    the same position in any order of the atoms; an error that depends on the whole order, such as dropped
-    neighbors, appears nearly everywhere, or elsewhere in another order.
+    Exchanging two atoms between two correct list positions changes nothing. An error tied to a list position
+    appears there for any order of the atoms; an error that depends on the whole order, such as dropped
+    neighbors, appears nearly everywhere, or at other positions for another order.
 
     Returns:
-        None if no position deviates by more than is allowed, or if nearly all do.
+        None if no list position deviates by more than is allowed, or if nearly all do.
     """
     key = "places", atoms.positions.tobytes(), atoms.numbers.tobytes()
     if key not in subject.known:
@@ -75,10 +75,10 @@ def _wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor)
 def _at_places(
     subject: CalculatorSubject, atoms: Atoms, order: np.ndarray, places: Sequence[int], allowed: NoiseFloor
 ) -> dict[int, tuple[bool, bool]]:
-    """Test whether energy and forces change when an atom is exchanged with one at an ordinary position.
+    """Test whether energy and forces change when an atom is exchanged with one at a correct position.
 
     Returns:
-        for each tested position; an empty dict if most positions of a species are not ordinary.
+        for each tested position; an empty dict if most positions of a species are wrong.
     """
     numbers, found = atoms.numbers[order], {}
     base = in_order(subject.fresh(), atoms, order)

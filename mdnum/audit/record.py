@@ -172,7 +172,7 @@ def kept(folder: RunFolder) -> AuditState:
 
 
 def encoded(atoms: Atoms) -> str:
-    """Encode a structure as JSON, exact to the last bit; `info` keeps only text and numbers."""
+    """Encode a structure as JSON, exact to the last bit; `info` is reduced to text and numbers."""
     copy = atoms.copy()
     copy.info = {key: value for key, value in atoms.info.items() if isinstance(value, str | int | float)}
     copy.set_constraint()

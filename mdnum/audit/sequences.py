@@ -20,7 +20,7 @@ _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked abou
 
 
 class SequenceStep(NamedTuple):
-    """A structure in a sequence, its difference from the previous one, and whether its answer is compared."""
+    """A structure in a sequence, its change from the previous one, and whether its energy is compared."""
 
     what: str
     atoms: Atoms
@@ -28,7 +28,7 @@ class SequenceStep(NamedTuple):
 
 
 def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[SequenceStep]]:
-    """Return the sequences that start from a structure, by name, without empty ones."""
+    """Return all nonempty sequences that start from a structure, by name."""
     sequences = {
         "sizes": _sizes(atoms, rng), "a slow drift": _slow_drift(atoms, rng),
         "two atoms head on": _head_on(atoms), "strain": _strain(atoms), "wrapping": _wrapping(atoms, rng),
@@ -77,7 +77,7 @@ def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, A
 
 
 def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures in which one atom, then two, approach another; this tests the half-skin criterion."""
+    """Yield structures in which one atom, then two, approach another, to test the half-skin criterion."""
     if len(atoms) < 2:
         return
     distances = atoms.get_distances(0, range(1, len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
@@ -130,7 +130,7 @@ def _scaled(atoms: Atoms, factor: float) -> Atoms:
 
 
 def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
-    """Yield named sequences in which two particles come within the cutoff; each needs its own object.
+    """Yield named sequences in which two particles come within the cutoff; each uses a new calculator object.
 
     Args:
         radius: cutoff distance, beyond which the particles do not interact, Å.

@@ -26,8 +26,8 @@ _NEAREST = 0.3  # distances are walked from the first
 def read_structure(words: str | Path) -> Atoms:
     """Read a structure from any file that ASE reads; `file@5` is the sixth structure, the default the last.
 
-    The text after @ is passed to ASE: a number, negative to count from the end, or a database selection
-    (`file.db@id=3`); it must select exactly one structure.
+    The text after @ is passed to ASE and must select exactly one structure: a number, negative to count from
+    the end, or a database selection (`file.db@id=3`).
 
     Raises:
         InputError: no such file, ASE cannot read it, no atoms, numbers that are not finite.
@@ -84,7 +84,7 @@ class Pair:
     moves: Literal["atom", "molecule"] = "atom"
 
     def at(self, distance: float) -> Atoms:
-        """Return the pair at a given distance of the reference atoms, exact to the last bit."""
+        """Return the pair with its reference atoms at a given distance, exact to the last bit."""
         both = self._together.copy()
         both.positions[len(self.first) :, 0] += distance
         return both
@@ -118,12 +118,11 @@ class Pair:
 
 
 def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[Skipped]]:
-    """Return a pair for each two species that the calculator supports, the most frequent first.
+    """Return a pair of particles for every two species that the calculator supports, most frequent first.
 
     A pair consists of single atoms if the calculator supports them at the smallest distance of the structure.
-    Otherwise (a bond order may divide by the number of neighbors) each atom gets two companions behind it; if
-    the calculator supports no such atoms at all (rigid water), the pair consists of molecules of the
-    structure.
+    Otherwise (a bond order may divide by the number of neighbors) each atom has two companion atoms; if the
+    calculator does not support this either (rigid water), the pair consists of molecules of the structure.
 
     Returns:
         (pairs, what was left out and why).
@@ -151,7 +150,7 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
 
 
 def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
-    """Return a copy with other attribute values; a new cell scales the atoms if `scaled`."""
+    """Return a copy of a structure with new attribute values; a new cell scales the atoms if `scaled`."""
     there = atoms.copy()
     if "cell" in values:
         there.set_cell(values.pop("cell"), scale_atoms=scaled)
@@ -161,7 +160,7 @@ def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
 
 
 def exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
-    """Return (atom, k) where the k-th and next nearest neighbors have changed places (minimum image)."""
+    """Return (atom, k) for atoms whose k-th and (k+1)-th nearest neighbors have changed places."""
     orders = []
     for atoms in (before, after):
         distances = atoms.get_all_distances(mic=bool(atoms.pbc.any()))
@@ -232,7 +231,7 @@ def _molecules(subject: CalculatorSubject) -> list[Pair]:
 def _answered(
     subject: CalculatorSubject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
 ) -> tuple[Pair | None, str]:
-    """Return the pair in the simplest cell that the calculator supports, or the reason for None."""
+    """Return the pair in the simplest cell that the calculator supports, or None and the reason."""
     why = ""
     for cell, periodic in _SURROUNDINGS:
         name = "-".join(part.get_chemical_formula() for part in (first, second))
@@ -247,7 +246,7 @@ def _answered(
 
 
 def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
-    """Return the scan distances from the first supported one to the farthest, and the farthest."""
+    """Return the scan distances at which the calculator works, and the farthest of them."""
     places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
     first = len(places)
     for k in range(len(places) - 1, -1, -1):
@@ -263,10 +262,10 @@ def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndar
 
 
 def group(atoms: Atoms) -> int | None:
-    """Return the number of atoms per molecule, if the structure is a list of identical molecules; else None.
+    """Return the number of atoms per molecule if a structure consists of identical molecules, else None.
 
-    A repeating sequence of species is not sufficient, since a salt crystal has one too. The atoms of a
-    molecule must be bonded to one another, by their covalent radii, and to no others.
+    A repeating sequence of species does not identify molecules, since a salt crystal has one too. The atoms
+    of a molecule must be bonded to one another, by their covalent radii, and to no others.
     """
     numbers = atoms.numbers
     if len(set(numbers)) < 2:

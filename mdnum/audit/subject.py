@@ -38,7 +38,7 @@ Answered = tuple[float, Forces] | CalculatorError  # energy and forces, or why t
 
 @dataclass
 class RepeatCounts:
-    """Statistics of structures that were evaluated more than once, identical to the last bit."""
+    """Statistics of repeated evaluations of structures that are identical to the last bit."""
 
     times: int = 0  # answers that could be compared with an earlier one
     differ: int = 0  # of them, those that are not the same to the last bit
@@ -49,7 +49,7 @@ class RepeatCounts:
 
 
 class Repeats:
-    """Fingerprints of all answers of a calculator's objects, compared when a structure is evaluated again.
+    """Fingerprints of all energies and forces of a calculator, compared when a structure is evaluated again.
 
     Attributes:
         new: statistics of the first answers of new objects, which have no memory of other structures.
@@ -62,7 +62,7 @@ class Repeats:
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
-        """Record a new object's (number `which`) answer for its first structure."""
+        """Record the first energy or force of a new calculator object, which has number `which`."""
         before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
@@ -91,7 +91,7 @@ def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) ->
 
 
 def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
-    """Return the absolute energy difference and the largest force component difference; 0 without forces."""
+    """Return the absolute energy difference and the largest force component difference, or 0."""
     forces = None if one[1] is None or other[1] is None else other[1] - one[1]
     return abs(other[0] - one[0]), 0.0 if forces is None else largest(forces)
 
@@ -125,14 +125,13 @@ class LoadedCalculator:
 
 
 class CalculatorSubject:
-    """A calculator and the structure for which it is audited.
+    """An ASE calculator and the structure for which it is audited.
 
-    ASE returns its cached answer if no coordinate moved by more than 1e-15 Å, which is several representable
-    distances near an atom at the origin: if the bits differ, the cache is cleared first. If no bit differs,
-    the cache is used, so that energy and forces cost one calculation; `forget` forces the next calculation.
-    The calculator is attached to the atoms, as in a run, since some calculators require it. Each evaluation
-    may raise a `CalculatorError`: the calculator raised an exception or returned nan, and the structure was
-    saved.
+    ASE returns its cached energy if no coordinate moved by more than 1e-15 Å, although near the origin such a
+    move changes several bits: if any bit differs, the cache is cleared first. If no bit differs, the cache is
+    used, so that energy and forces cost one calculation; `forget` forces the next calculation. The calculator
+    is attached to the atoms, as in a run, since some calculators require it. Each evaluation may raise a
+    `CalculatorError`: the calculator raised an exception or returned nan, and the structure was saved.
 
     Args:
         name: the calculator as the user named it.
@@ -190,7 +189,7 @@ class CalculatorSubject:
         return other
 
     def used(self) -> CalculatorSubject:
-        """Return a fresh copy without safeguards, to test the object's change detection and recovery."""
+        """Return a fresh copy that tests the calculator's own change detection and recovery from errors."""
         other = self.fresh()
         other.forgets = other.renews = False
         return other
@@ -212,7 +211,8 @@ class CalculatorSubject:
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:
         """Return (the energy consistent with the forces, the energy that a run logs), eV.
 
-        ASE calls the first `free_energy` and the second `energy`; None if the calculator has only one.
+        ASE calls the first energy `free_energy` and the second `energy`; the second is None if the calculator
+        has only one.
         """
         asked = self._ask(atoms)
         both = self._answer(lambda: self._energies(asked), asked, "energy")
@@ -253,12 +253,12 @@ class CalculatorSubject:
             return error
 
     def answers(self, atoms: Atoms) -> bool:
-        """Return whether the calculator gives energy and forces for a structure."""
+        """Return whether the calculator returns energy and forces for a structure."""
         return not isinstance(self.try_both(atoms), CalculatorError)
 
     @contextmanager
     def trying(self) -> Iterator[None]:
-        """Save no structures in this block, in which calculator failures are expected."""
+        """Save no failing structures in this block, in which calculator failures are expected."""
         before, self.saving = self.saving, False
         try:
             yield
@@ -313,7 +313,7 @@ class CalculatorSubject:
         return asked
 
     def _nearly(self, atoms: Atoms) -> bool:
-        """Return whether ASE would treat these atoms as unchanged although a bit differs."""
+        """Return whether ASE would treat a structure as unchanged although a bit differs."""
         check = getattr(self.calculator, "check_state", None)
         if not callable(check):
             return False
@@ -393,7 +393,7 @@ def _projection(size: int) -> np.ndarray:
 
 
 def largest(values: np.ndarray) -> float:
-    """Return the largest absolute value; 0 for an empty array."""
+    """Return the largest absolute value in an array; 0 for an empty array."""
     return float(np.max(np.abs(values), initial=0.0))
 
 
@@ -403,12 +403,12 @@ def rms(forces: np.ndarray) -> float:
 
 
 def bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
-    """Return copies of positions, numbers, cell and periodicity, independent of later changes."""
+    """Return copies of positions, atomic numbers, cell and periodicity, which later changes do not affect."""
     return atoms.positions.copy(), atoms.numbers.copy(), np.array(atoms.cell), atoms.pbc.copy()
 
 
 def _question(atoms: Atoms) -> bytes:
-    """Return a digest of all calculator input: charges, tags and info as well as the structure."""
+    """Return a hash of all calculator input: the structure, charges, tags and info."""
     parts = {**atoms.arrays, "cell": np.asarray(atoms.cell), "pbc": atoms.pbc}
     info = {key: value for key, value in atoms.info.items() if isinstance(value, _PLAIN)}
     text = b"|".join(name.encode() + parts[name].tobytes() for name in sorted(parts))
@@ -416,7 +416,7 @@ def _question(atoms: Atoms) -> bytes:
 
 
 def _bare(atoms: Atoms) -> Atoms:
-    """Return a copy without calculator and constraints, in float64."""
+    """Return a copy of a structure without calculator and constraints, in float64."""
     copy = atoms.copy()
     copy.calc = None
     copy.set_constraint()

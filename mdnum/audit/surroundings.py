@@ -1,10 +1,11 @@
 """Search for discontinuities in many-atom environments: moves through a structure, and crowded atoms.
 
-A jump of two isolated atoms may differ among many atoms (an embedding, an angle), and a pair that is smooth
-in isolation may jump there: triples, and atoms of the structure, are moved through the known pair thresholds
-and beyond. To detect a cap on neighbors, one more atom is moved past all neighbors of a crowded center: when
-it is as far as the k-th neighbor, a calculator that keeps k neighbors exchanges one for the other, and
-something jumps. If the calculator keeps the first k in list order, a permutation of the atoms shows the cap.
+Two atoms may interact differently among many atoms (an embedding, an angle), so a jump may change and a
+smooth threshold may jump there: triples, and atoms of the structure, are moved through the known pair
+thresholds and beyond. To detect a cap on neighbors, one more atom is moved past all neighbors of a crowded
+central atom: when it is as far as the k-th neighbor, a calculator that keeps k neighbors exchanges one for
+the other, and the energy or a force jumps. If the calculator keeps the first k in list order, a permutation
+of the atoms shows the cap.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ _HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 
 
 
 class RouteCrossing(NamedTuple):
-    """A point along a route, length, at which the lead atom's distance to an atom passes a threshold."""
+    """A point along a route at which the distance of the lead atom to another atom passes a threshold."""
 
     at: float
     threshold: PairThreshold
@@ -82,7 +83,7 @@ class Route:
     def crossings(self, thresholds: Sequence[PairThreshold], low: float, high: float) -> list[RouteCrossing]:
         """Return the points between low and high at which a distance of the lead atom passes a threshold.
 
-        The distance along a line is a hyperbola, so the points are roots of a quadratic equation.
+        The squared distance along a line is quadratic, so the points are roots of a quadratic equation.
         """
         found: list[RouteCrossing] = []
         symbols = np.array(self.atoms.get_chemical_symbols())
@@ -100,7 +101,7 @@ class Route:
         return sorted(found, key=lambda one: one.at)
 
     def ties(self, along: float) -> tuple[tuple[int, int], ...]:
-        """Return (atom, k) if the atom's k-th and (k+1)-th neighbors change places at this point."""
+        """Return (atom, k) for atoms whose k-th and (k+1)-th neighbors swap at a point of the route."""
         return exchanged(self.at(along - _TIED), self.at(along + _TIED))
 
 
@@ -184,12 +185,12 @@ def walk_surroundings(
 
 
 def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
-    """Return the groups that move together: single atoms, or molecules if the calculator requires them."""
+    """Return the groups of atoms that move together: single atoms, or else whole molecules."""
     return [np.array([k]) for k in range(len(atoms))] if single else molecules(atoms)
 
 
 def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
-    """Cut out the groups nearest to the first, unwrapped and in their original order, in a pair's cell."""
+    """Return a cluster of the groups nearest to the first one, in their original order, in a pair's cell."""
     center = _lead(atoms, groups[0])
     offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
@@ -323,7 +324,7 @@ def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
 
 
 class CrowdOrder(NamedTuple):
-    """How the order of the atoms in a crowd changes energy and forces."""
+    """Effect of the atom order in a crowded cluster on energy and forces."""
 
     # number of neighbors at which it starts to matter, None if it never does
     start: int | None = None
@@ -335,7 +336,7 @@ class CrowdOrder(NamedTuple):
 
 @dataclass(frozen=True)
 class Crowd:
-    """A center with many neighbors at distinct distances, and the jumps found by crowding it."""
+    """A central atom with many neighbors at distinct distances, and the energy and force jumps found."""
 
     species: str  # of all atoms
     radius: float  # cutoff that the crowd is inside of, length
@@ -350,7 +351,7 @@ class Crowd:
 
 
 def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int = _MOST) -> list[Crowd]:
-    """Surround one atom of each species with many neighbors, and measure whether the calculator caps them.
+    """Surround one atom of each species with many neighbors to detect a cap on their number.
 
     Args:
         most: neighbors given to the center.
@@ -378,10 +379,11 @@ def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int 
 
 
 def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndarray, "neighbors"]]:
-    """Return a center at the origin with `count` atoms around it, and their distinct distances.
+    """Return a central atom at the origin with `count` neighbors, and their distinct distances.
 
     The neighbors fill the shell evenly (golden spiral in angle, equal volumes in distance), so that no two
-    are as close to each other as random positions would be. They are sorted by distance, after the center.
+    are as close to each other as random positions would be. The neighbors are sorted by distance and follow
+    the central atom.
     """
     k = np.arange(count)
     share = (k + 0.5) / count
@@ -397,7 +399,7 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
 
 
 def gap(atoms: Atoms) -> Float[np.ndarray, "3"]:
-    """Return the direction from the center that is farthest from every neighbor."""
+    """Return the direction from the central atom that is farthest from every neighbor."""
     tried = np.random.default_rng(1).normal(size=(2000, 3))
     tried /= np.linalg.norm(tried, axis=1)[:, None]
     offsets = atoms.positions[1:] - atoms.positions[0]
@@ -418,7 +420,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     side = _SIDE_OF_TIE * float(np.spacing(np.float32(max(np.abs(atoms.positions).max(), radius))))
 
     def change(place: float, without: int | None = None) -> tuple[float, Float[np.ndarray, "atoms"]]:
-        """Nonsmooth changes from place - side to place + side; one atom may be left out.
+        """Return the nonsmooth changes of energy and forces from place - side to place + side.
 
         (|change of the energy minus the force's work|, for each atom |change of its force minus the mean
         change over the adjacent intervals of the same length|).
@@ -466,7 +468,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
 
 
 def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int) -> CrowdOrder:
-    """Find the number of neighbors from which the atom order matters, and how large its effect is."""
+    """Find the number of neighbors above which the order of atoms matters, and how large its effect is."""
     low, high, changed = 1, None, (0.0, 0.0)
     larger = iter([*(count for count in (4, 16, 64) if count < most), most])
     while count := next(larger, None) if high is None else (low + high) // 2 * (high - low > 1):
@@ -487,7 +489,7 @@ def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int)
 def _permuted(
     subject: CalculatorSubject, walk: PairWalk, radius: float, count: int, aside: bool = False
 ) -> tuple[float, float] | None:
-    """Changes of energy and force on reordering the atoms; None if they are rounding of a reordered sum.
+    """Return the changes of energy and force on reordering the atoms; None if rounding explains them.
 
     Args:
         aside: move the last neighbor out of reach of all others.

@@ -1,7 +1,7 @@
 """Locate the distances at which a calculator's pair interactions change form, from its answers alone.
 
-Two atoms of each pair of species are moved from far apart to a distance that costs 1000 kT. Thresholds that
-appear only among many atoms (an angle's own cutoff, a cap on neighbors) are searched in surroundings.py.
+Two atoms of each pair of species are moved from a large distance to one with an energy of 1000 kT. Thresholds
+that appear only among many atoms (an angle's own cutoff, a cap on neighbors) are searched in surroundings.py.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class PairWalk:
 
 @dataclass(frozen=True)
 class PairWalks:
-    """Results of walking all pairs."""
+    """Results of scanning all pairs of species over their distances."""
 
     walks: tuple[PairWalk, ...]  # one for each pair that was walked
     ways: Ways  # all pairs that there are to walk, and what was left out
@@ -120,14 +120,14 @@ class PairWalks:
 
 
 def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
-    """Return all distances at which a pair interaction changes form, computed once per subject."""
+    """Return all thresholds of the calculator's pair interactions, computed once per subject."""
     if "thresholds" not in subject.known:  # a resumed audit knows them without a walk
         subject.known["thresholds"] = [one for walk in walk_pairs(subject).walks for one in walk.thresholds]
     return subject.known["thresholds"]
 
 
 def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWalks:
-    """Walk every pair of species through its distances, with extra calls; cached in the subject."""
+    """Scan every pair of species over its distances; the result is computed once per subject."""
     if "walks" not in subject.known:
         with subject.meter.apart(WALKING_CALLS):
             subject.known["walks"] = _walked(subject, progress)
@@ -165,7 +165,7 @@ def _walked(subject: CalculatorSubject, progress: Progress) -> PairWalks:
 
 
 def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairWalk:
-    """Scan one pair over its distances.
+    """Scan the energy and force of one pair over its distances.
 
     Args:
         calls: number of calls after which only the most prominent place of the scan is examined.
@@ -247,9 +247,10 @@ def _seen(
     rounding: float,
     known: Sequence[float],
 ) -> tuple[float, float, float, float] | None:
-    """Return (from, to, force step found at half of the places, force step found at all places).
+    """Return (from, to, force step detectable at half of the places, force step detectable at all places).
 
-    Close to a known threshold another would be hidden; such places are not counted, nor those beyond the end.
+    Places close to a known threshold, which would hide another one, and places beyond the end of the
+    interaction are not counted.
     """
     felt = places < end
     for radius in known:
@@ -271,7 +272,7 @@ def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThresh
 
 
 def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairThreshold]) -> bool:
-    """Return whether companion atoms of the pair pass another threshold at this distance."""
+    """Return whether companion atoms of the pair cross another threshold at this distance."""
     others = pair.others(threshold.radius)
     radii = [one.radius for one in thresholds if one is not threshold]
     return len(others) > 0 and any(np.abs(others - radius).min() < 1e-5 for radius in radii)
@@ -285,8 +286,8 @@ def _end_of(
 ) -> tuple[float, float] | None:
     """Return the last distance with an interaction and the next double; None if there is no interaction.
 
-    A smooth switch may vanish in rounding at some distances before it ends; any interaction farther out moves
-    the search outward.
+    A smooth switching function may vanish in rounding at some distances before it ends; any interaction found
+    farther out moves the search outward.
     """
     last = next((k for k in range(len(coarse) - 2, -1, -1) if alive(float(coarse[k]))), None)
     if last is None:
@@ -339,10 +340,11 @@ def _with_end(
 
 
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
-    """Extrapolate the end of an interaction whose force falls with this power of the distance to it.
+    """Extrapolate the end distance of an interaction, toward which the force falls with this power.
 
-    Returns the edge itself if it is within the error of the extrapolation: the power law holds only in the
-    limit, while the edge is known to the last bit unless the force was lost in rounding.
+    The last distance with a force is returned if it is within the error of the extrapolation: the power law
+    holds only in the limit, while this distance is known to the last bit unless the force was lost in
+    rounding.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])
     far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
@@ -364,7 +366,7 @@ def _beyond(
 ) -> Beyond | None:
     """Search outward from a distance, as long as the remaining energy could be lost at a cutoff.
 
-    Returns None if no distance could be evaluated: in a periodic cell, where images of the particles come
+    None is returned if no distance could be evaluated: in a periodic cell, where images of the particles come
     near, or if the calculator fails.
     """
     if pair.periodic:
@@ -445,7 +447,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 
 
 def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
-    """Energy change from the last point to infinity by a power law; inf if the force falls too slowly."""
+    """Energy change from the last point to infinity for a power-law force; inf for slow decay."""
     first, last = abs(float(forces[0])), abs(float(forces[-1]))
     if not last or not first:
         return np.inf
@@ -454,7 +456,7 @@ def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"])
 
 
 def _expected(curve: Curve, place: float) -> float:
-    """Extrapolate the force at a distance by the power law with which it falls slightly before."""
+    """Extrapolate the force at a distance by a power law fitted at slightly smaller distances."""
     near, far = place - 0.5, place - 0.25
     first, last = (abs(curve(one)[1]) for one in (near, far))
     if not first or not last:

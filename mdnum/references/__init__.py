@@ -1,6 +1,6 @@
-"""Reference implementations: ASE, other neighbor searches, plain numpy, and mdnum as an ASE calculator.
+"""Reference implementations by ASE, other neighbor searches and plain numpy, and mdnum as an ASE calculator.
 
-Modules are imported at first use: ASE, MDAnalysis and jax each take a second or more to import.
+Every module is imported at first use, since ASE, MDAnalysis and jax each take a second or more to import.
 """
 
 from __future__ import annotations

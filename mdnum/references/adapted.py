@@ -43,7 +43,7 @@ class StepAtCutoff(ClassicalCalculator):
 
 
 class SpeciesSum(ClassicalCalculator):
-    """A mixture of single-species calculators: pairs a-b are all pairs minus pairs a-a and b-b.
+    """A mixture of single-species calculators; the a-b energy is that of all pairs minus a-a and b-b pairs.
 
     Args:
         parts: (calculator, species a, species b) for every pair of species present.
@@ -77,7 +77,7 @@ class SpeciesSum(ClassicalCalculator):
 
 
 def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, Any]:
-    """Return energy, forces, energies if available and, as six numbers, the stress of atoms."""
+    """Return energy, forces, atomic energies if available and, as six numbers, stress of a structure."""
     bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
     names = ["energy", "forces", *(["stress"] if stress else [])]
     if "energies" in calculator.implemented_properties:  # ASE's EAM has the total only
@@ -87,7 +87,7 @@ def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, An
 
 
 def evaluate(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
-    """Return energy, forces, stress (3, 3) and energies of atoms; None for quantities not available."""
+    """Return energy, forces, stress (3, 3) and atomic energies; None for unavailable quantities."""
     # ASE gives a stress for a molecule in a box, of the box's volume
     results = _results(calculator, atoms, atoms.cell.rank == 3 and bool(atoms.pbc.all()))
     if "stress" in results:
@@ -141,8 +141,8 @@ def short_listed_eam(file: Path) -> Calculator:
 class EnergyOnNeighborList(ClassicalCalculator):
     """ASE calculator for an energy function on ASE's neighbor list, compiled separately.
 
-    This reference tests neighbor lists, decisions and the rollout, but not the function and its derivatives,
-    which are jax's here too.
+    This reference tests neighbor lists, cutoff decisions and the rollout, but not the energy function and its
+    derivatives, which jax evaluates here too.
     """
 
     implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012

@@ -1,7 +1,7 @@
-"""Run folders of mdnum as an ASE file format; ASE imports this module together with its own formats.
+"""Run folders of mdnum as a file format of ASE, which imports this module together with its own formats.
 
-The format is separate from `ase_plugin`: ASE's plugins import its formats, at which time that module would
-still be empty.
+The format is not part of `ase_plugin`, because ASE's plugins import its formats while that module is still
+empty.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ioformat = ExternalIOFormat(desc="Run folder of mdnum", code="+S", module="mdnum
 
 
 def read_mdnum(folder: str, index: Any = -1) -> Iterator[Atoms]:
-    """Yield frames of a run folder, for `ase.io.read(folder, index, format="mdnum")`; in float64 as stored.
+    """Yield frames of a run folder in float64, for `ase.io.read(folder, index, format="mdnum")`.
 
     Raises:
         FolderError: the folder is not a run folder of mdnum, or the run stored no frames.

@@ -1,6 +1,6 @@
-"""Choose the reference for a simulation: the corresponding ASE class, or else plain numpy.
+"""Choose the reference calculator for a simulation, which is the corresponding ASE class or else plain numpy.
 
-Differences between the codes, and the conversions that remove them:
+Differences between the two codes, and the conversions that remove them:
 
 | system file | ASE | conversion |
 |---|---|---|
@@ -16,7 +16,7 @@ Differences between the codes, and the conversions that remove them:
 | all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), and labeled so |
 
 ASE's LennardJones keeps a pair at r == rc (r² > rc² is dropped); its neighbor lists do not (r < rc). In the
-shifted and switched forms such a pair has no energy, so only its force can differ.
+shifted and switched forms a pair at r == rc has no energy, so only its force can differ.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Reference:
 
 
 def reference(subject: Simulation | System) -> Reference:
-    """Return the best available reference for a simulation: ASE if it has the class, else plain numpy.
+    """Return the best available reference for a simulation, an ASE class if there is one, else plain numpy.
 
     Args:
         subject: a `Simulation`, or a `System`, whose box may be too small for its skin.
@@ -120,7 +120,7 @@ def independent(subject: Simulation | System) -> Reference:
 
 
 def _written_again(model: Any) -> StillingerWeberModel | TersoffModel:
-    """Return a many-body potential implemented in plain numpy, with its constants."""
+    """Return the plain-numpy implementation of a many-body potential, with the same constants."""
     kind = TersoffModel if isinstance(model, tetrahedral.Tersoff) else StillingerWeberModel
     names = (one.name for one in fields(kind) if hasattr(model, one.name))
     return kind(**{name: float(getattr(model, name)) for name in names})

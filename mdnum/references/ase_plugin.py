@@ -1,4 +1,4 @@
-"""Plugin entry for ASE, which imports this module; it imports nothing of mdnum."""
+"""Entry for ASE's list of plugins; ASE imports this module, which imports no other module of mdnum."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ _SAID = {"potential", "cutoff", "terms", "units"}
 
 
 class _Recipe(NamedTuple):
-    """How to build a simulation for given atoms."""
+    """Recipe for building a simulation of given atoms."""
 
     make: Callable[[Atoms], Simulation]  # without a skin: the evaluator keeps what the box has room for
     skin: float  # length
@@ -48,7 +48,7 @@ def _of_system(system: Simulation | System) -> _Recipe:
 
 
 def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
-    """Return a recipe from potential objects, or from the tables of a system file."""
+    """Return a simulation recipe for potential objects, or for the tables of a system file."""
     if isinstance(potential, Mapping):
         made = interaction(potential, cutoff)
         end, model = made.cutoff, lambda atoms: model_of(made, atoms, Path())
@@ -76,9 +76,9 @@ def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
 class MdnumCalculator(ClassicalCalculator):
     """ASE calculator that evaluates an mdnum potential.
 
-    Use it to relax with ase.optimize, to compute stress and equations of state, and to compare mdnum's forces
-    with ASE's own tools. A Verlet list is kept between calls until motion and box strain have used its skin;
-    for molecular dynamics use mdnum's rollout, which records its flips.
+    Use this calculator to relax structures with ase.optimize, to compute stress and equations of state, and
+    to compare mdnum's forces with ASE's own tools. A Verlet list is kept between calls until motion and box
+    strain have used up its skin; for molecular dynamics use mdnum's rollout, which records its flips.
 
     Args:
         system: a `Simulation`, a `System`, or the name or path of a system file; the atoms may differ from
@@ -129,11 +129,11 @@ class MdnumCalculator(ClassicalCalculator):
 
     @property
     def simulation(self) -> Simulation | None:
-        """Simulation evaluated last; None before the first call."""
+        """The simulation evaluated last, or None before the first call."""
         return None if self._evaluator is None else self._evaluator.simulation
 
     def set(self, **changes: Any) -> dict[str, Any]:
-        """Reject changes of parameters: create another calculator for another potential.
+        """Reject any change of parameters; another potential needs another calculator.
 
         Raises:
             TypeError: a parameter was given.
@@ -168,7 +168,7 @@ class MdnumCalculator(ClassicalCalculator):
         return results
 
     def _made_for(self, atoms: Atoms) -> Evaluator:
-        """Return an evaluator for these atoms, at any positions and in any cell."""
+        """Return an evaluator for the given atoms, at any positions and in any cell."""
         # only what the forces depend on: constraints and the like stay with ASE
         bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
         if self._given is not None:

@@ -54,7 +54,7 @@ class AloneCheck(AuditCheck):
         )
 
     def look(self, subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> None:
-        """Evaluate fragments of a structure with new objects; whole molecules if nothing smaller works."""
+        """Evaluate atoms and fragments of a structure, or else whole molecules, with new objects."""
         self.rows: list[dict[str, Any]] = []
         self.floor = noise.allowed
         self.refused: list[tuple[str, CalculatorError]] = []
@@ -143,7 +143,7 @@ def _boxed(part: Atoms) -> Atoms:
 
 
 def _apart(part: Atoms, other: Atoms) -> Atoms:
-    """Return a fragment together with another one beyond its cutoff."""
+    """Return a fragment together with a second fragment beyond the cutoff."""
     there = other.copy()
     there.positions += [part.positions[:, 0].max() + _FAR - there.positions[:, 0].min(), 2.0, 3.0]
     return part + there

@@ -24,15 +24,15 @@ _INFO = {"charge": 1, "spin": 2, "total_charge": 1, "multiplicity": 2}
 class CallerCheck(AuditCheck):
     """Does a calculator notice what its caller changes, and leave the caller's data unchanged?
 
-    Tested with an `Atoms` object that is edited in place, as in dynamics; with arrays that were returned; and
-    with random number generators.
+    The check uses an `Atoms` object that is edited in place, as in dynamics, the arrays that the calculator
+    returned, and the global random number generators.
     """
 
     name, title, order, calls = "caller", "Caller", 30, 280
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Answer every question with a new object."""
+        """Run every test of the check with a new calculator object."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
             atoms, noise = settled(subject.fresh(), rng)
@@ -81,7 +81,7 @@ def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Call
 def _edited(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, what: str, change: Callable[[Atoms], Any]
 ) -> Iterator[Observed]:
-    """Compare one calculator before and after an in-place change of its `Atoms` object with new objects."""
+    """Test whether a calculator notices an in-place change of its `Atoms` object, against a new object."""
 
     def asked() -> tuple[tuple[float, Forces], tuple[float, Forces]]:
         used, there = subject.used(), atoms.copy()

@@ -41,7 +41,7 @@ class Loop:
 
     @property
     def share(self) -> float:
-        """Antisymmetric part of the force derivative, relative to the symmetric part."""
+        """Antisymmetric part of the force derivative divided by the symmetric part."""
         return abs(self.curl) / self.stiffness if self.stiffness else (float("inf") if self.curl else 0.0)
 
 
@@ -100,7 +100,8 @@ class CurlCheck(AuditCheck):
 def agreed(tried: Sequence[Loop]) -> Loop:
     """Return the loop with the smallest error, increased if a loop of another radius disagrees.
 
-    A curl is the same on every small circle; the work due to a jump of the forces is not.
+    The curl is the same on every small circle, while the work due to a jump of the forces depends on the
+    circle.
     """
     best = min(tried, key=lambda one: one.error)
     others = [one.curl for one in tried if _SIGNIFICANT * one.error < abs(best.curl)]

@@ -49,9 +49,9 @@ _SOURCES = ("integrator", "flips", "elsewhere", "rest")
 class DynamicsCheck(AuditCheck):
     """Does a short run at constant energy conserve its energy, and if not, why?
 
-    Reports the energy drift with a block error, separated into integrator, flips and the rest. The drift that
-    remains after subtracting flips and the work of the forces is due to the integrator, and must fall to a
-    quarter with half the time step, which a second run tests.
+    The check reports the energy drift with a block error, separated into integrator, flips and the rest. The
+    drift that remains after subtracting flips and the work of the forces is due to the integrator, and must
+    fall to a quarter with half the time step, which a second run tests.
     """
 
     name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
@@ -112,7 +112,7 @@ class DynamicsCheck(AuditCheck):
 
 
 def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor) -> tuple[float, float]:
-    """Largest energy difference between a run and new objects, and the difference allowed by noise, eV."""
+    """Return the largest energy difference between a run and new objects, and its allowed value, eV."""
     places = np.unique(np.linspace(0, len(ran.potential) - 1, count).astype(int))
     again = [subject.fresh().energy(ran.at(ran.positions[n])) for n in places]
     rounding = NoiseFloor(np.finfo(float).eps * largest(ran.potential), 0.0)
@@ -120,7 +120,7 @@ def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor
 
 
 def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult:
-    """Return the result of a short run, which tests whether answers depend on earlier steps."""
+    """Return the result of a short run, which tests whether energies depend on earlier steps."""
     (differs, allowed), steps = stale, len(ran.potential) - 1
     change = 1e3 * largest(ran.total - ran.total[0]) / ran.positions.shape[1]
     seen = Measured(differs, "energy", allowed)
@@ -157,7 +157,7 @@ class TwoRuns:
     period: float  # of the fastest vibration, internal time
 
     def shares(self) -> dict[str, Drift]:
-        """Drift of the total, of flips, of the rest, and of the integrator by two methods, meV/atom/ps."""
+        """Energy drift in total, by flips, by the rest, and by the integrator (two methods), meV/atom/ps."""
         one, other = self.whole, self.half
         rest, elsewhere = self.balance.filled, self.balance.elsewhere
         flips = wandering(one.time, self.balance.jumps)
@@ -186,7 +186,7 @@ class TwoRuns:
         return {name: share.times(factor) for name, share in found.items()}
 
     def outcome(self, unknown: str) -> CheckResult:
-        """Return the result of the check; `unknown` is the reason why there is no threshold."""
+        """Return the result of the check; `unknown` is the reason why no threshold is known."""
         shares = self.shares()
         numbers = self._numbers(shares)
         crossed, measured = len(self.balance.crossed), len(self.balance.measured)
@@ -359,7 +359,7 @@ class TwoRuns:
 
 
 class _Bridge(Calculator):
-    """ASE calculator that wraps the audited one, so that a structure on which it fails is saved."""
+    """An ASE calculator that wraps the audited calculator and saves structures on which this fails."""
 
     implemented_properties = ["energy", "forces"]  # noqa: RUF012
 
@@ -399,7 +399,7 @@ def prepared(
 def fitting_timestep(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, iterations: int = _POWER_ITERATIONS
 ) -> tuple[float, float]:
-    """Estimate a time step and the period of the fastest vibration (inf for none), internal time."""
+    """Estimate a suitable time step and the period of the fastest vibration (inf for none), internal time."""
     roots = np.sqrt(atoms.get_masses())[:, None]
     mode = direction(len(atoms), rng)
     mode /= np.linalg.norm(mode)
@@ -426,7 +426,7 @@ def run(
     steps: int,
     each: Callable[[int], None] = lambda step: None,
 ) -> tuple[NveRun, Atoms]:
-    """Run at constant energy with one calculator object.
+    """Run molecular dynamics at constant energy with one calculator object.
 
     Args:
         start: structure with velocities and constraints; not modified.
@@ -494,7 +494,7 @@ class RigidGroups:
         self._sweep(settled)
 
     def adjust_momenta(self, atoms: Atoms, momenta: Float[np.ndarray, "atoms 3"]) -> None:
-        """Remove the momentum components that would stretch a bond."""
+        """Remove the momentum components that would change a bond length."""
         share = 1 / atoms.get_masses()
         size = float(np.max(np.abs(momenta), initial=0.0)) * float(np.max(share))
 

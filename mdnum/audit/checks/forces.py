@@ -77,11 +77,11 @@ class Slope:
 
 
 class ForcesCheck(AuditCheck):
-    """Are the forces the derivative of the energy, and of which energy?
+    """Are the forces minus the gradient of the energy, and of which energy?
 
-    The error of a difference is |D(h) - D(h/4)| after extrapolation plus the measured noise over the step; of
-    a ladder of steps the one with the smallest error is used. A difference that grows like 1/h indicates a
-    step of the energy, not a wrong force, and is reported as such.
+    The error of a finite difference is |D(h) - D(h/4)| after extrapolation plus the measured noise over the
+    step; of nine steps h, the one with the smallest error is used. A deviation that grows like 1/h indicates
+    a jump of the energy, not a wrong force, and is reported as such.
     """
 
     name, title, order, basic, calls = "forces", "Forces", 10, True, 500
@@ -199,7 +199,7 @@ def _worst(slopes: list[Slope]) -> Slope:
 
 
 def _directions(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Displacement]]:
-    """Yield displacements of length at most 1: of all atoms at random, and of a few along each axis."""
+    """Yield displacement directions: of all atoms at random, and of a few single atoms along each axis."""
     for number in range(_DIRECTIONS):
         yield f"all atoms at random, {number + 1}", direction(len(atoms), rng)
     for who in sorted(rng.permutation(len(atoms))[:_ATOMS]):
@@ -257,10 +257,11 @@ def slope(
 def _best(
     gaps: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
 ) -> tuple[int, float]:
-    """Return the index and error of the step of smallest error, unless other steps contradict it.
+    """Return the index and error of the finite-difference step of smallest error, if others agree with it.
 
-    If the energy jumps at flips, two steps may contain the same jumps by chance, and agree on a wrong slope.
-    A wrong force is equally wrong at every step that resolves it, in particular at the shorter ones.
+    If the energy jumps at flips, two finite-difference steps may include the same jumps by chance, and agree
+    on a wrong slope. A wrong force deviates equally at every step that resolves the deviation, in particular
+    at the shorter ones.
 
     Args:
         gaps: difference minus force at each step, the longest first.
@@ -295,7 +296,7 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
 def _drowned(
     worker: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, known: float, scale: float
 ) -> list[Observed]:
-    """Return a finding if forces, or their finite differences, are lost in noise that is not rounding."""
+    """Return a finding if noise beyond rounding hides the forces or the energy differences."""
     stairs = steps(worker, atoms)  # which are another finding
     size = max(noise.force, 0.0 if stairs.energy else known)
     if size <= max(_DROWNED * scale, stairs.force):
@@ -358,8 +359,8 @@ def _two_energies(
 ) -> Iterator[Observed]:
     """Yield a finding if `energy` and `free_energy` differ by more than a constant.
 
-    All other checks examine the free energy, to which forces belong by ASE's definition; if the two energies
-    differ by at most a constant, their findings hold for both.
+    All other checks examine `free_energy`, of which the forces are the gradient by ASE's definition; if the
+    two energies differ by at most a constant, the findings hold for both.
 
     Args:
         along: derivative along `line`, a displacement per Å of a structure away from thresholds.

@@ -55,13 +55,13 @@ class Same:
 
 
 def _same(code: str, base: Atoms, what: str, there: Atoms, factor: float = 1.0, **more) -> Same:
-    """Return a representation with the atoms in their order, rounded like the coordinates."""
+    """Return a representation with the atoms in the original order."""
     return Same(what, code, there, np.arange(len(there)), **{"rounding": factor * ulp(there, base), **more})
 
 
 @dataclass(frozen=True)
 class _Difference:
-    """Differences between two representations of one structure, and the differences allowed."""
+    """Actual and allowed differences in energy and force between two representations of one structure."""
 
     same: Same
     energy: float
@@ -208,7 +208,7 @@ class InvarianceCheck(AuditCheck):
 
 
 class _Judge:
-    """Compares representations; the allowed difference is measured once per size of rounding."""
+    """Compares representations of a structure; allowed differences are measured once per size of rounding."""
 
     def __init__(self, subject: CalculatorSubject, rng: np.random.Generator):
         self.subject, self.worker, self._rng = subject, subject.fresh(), rng
@@ -374,7 +374,7 @@ def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield structures with the atoms in another order."""
+    """Yield the structure with its atoms in another order."""
     if len(atoms) < 2:
         return
     for _ in range(2):
@@ -404,7 +404,7 @@ def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | N
 
 
 def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
-    """Yield cells one ulp larger and smaller, with the atoms in place."""
+    """Yield structures whose cell is one ulp larger or smaller, with the atoms in place."""
     if not atoms.pbc.any():
         return
     for what, base in (("", atoms), (", of the structure as it was given", given)):
@@ -434,8 +434,8 @@ def repeated(atoms: Atoms) -> Iterator[Same]:
 def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     """Yield the supercell of a dense four-atom cell, for comparison with the cell itself.
 
-    A structure at least two cutoffs wide never needs a second image of a pair. Structures of one or two
-    species are used, in equal numbers as in a salt; with more species the result in such a cell would be
+    In a structure at least two cutoffs wide, no pair has a second image within the cutoff. Only structures of
+    one or two species are used, in equal numbers as in a salt; with more species the result would be
     ambiguous.
     """
     species = list(dict.fromkeys(atoms.symbols))
@@ -469,7 +469,7 @@ def skewed(atoms: Atoms) -> Iterator[Same]:
 
 
 def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield structure and cell rotated together, arbitrarily and by exchanging axes, and mirrored."""
+    """Yield the structure rotated with its cell, by arbitrary angles and by exchanging axes, and mirrored."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     anyhow = q * np.sign(np.diag(r))
     anyhow *= np.sign(np.linalg.det(anyhow))

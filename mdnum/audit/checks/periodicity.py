@@ -24,7 +24,7 @@ class PeriodicityCheck(InvarianceCheck):
     name, title, order, calls = "periodicity", "Mixed periodicity", 45, 250
 
     def ways(self, atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-        """Yield many representations of a slab and a wire."""
+        """Yield many representations of a slab and of a wire cut from the structure."""
         axes = np.flatnonzero(atoms.pbc)
         if not len(axes) and len(atoms):  # a molecule that repeats along x
             apart = float(np.ptp(atoms.positions[:, 0])) + 1.2 * (nearest_distance(atoms) or 4.0)

@@ -1,4 +1,4 @@
-"""Check the smoothness of the energy: pairs, triples and many-atom environments through every threshold."""
+"""Check the smoothness of the energy at every threshold, for pairs, triples and many-atom environments."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SmoothnessCheck(AuditCheck):
     neighbors, routes = 160, 2
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Walk pairs and triples through thresholds, and crowd atoms with neighbors."""
+        """Move pairs and triples of atoms through thresholds, and surround atoms with many neighbors."""
         walks = walk_pairs(subject, progress)
         if not walks.walks and subject.meter.deadline.passed:
             raise TimeUp
@@ -97,7 +97,7 @@ def _two(threshold: PairThreshold) -> str:
 def figures(
     walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
 ) -> tuple[tuple[list[str], dict[str, Any]], dict[str, Any]]:
-    """Return (names of sentences and their values, numbers) for the summary."""
+    """Return the sentences, their values, and the numbers of the summary."""
     # (lowest derivative that jumps, jump of the energy, of the force) wherever something does
     seen = [(one.order, *one.jumps[:2]) for one in _all(walks)]
     seen += [(one.jump.order, one.jump.energy, one.force) for one in around.events]
@@ -184,7 +184,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
 
 
 def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield a finding if a jump at a pair threshold is of lower order among many atoms than for two."""
+    """Yield a finding if a lower derivative jumps at a pair threshold among many atoms than for two."""
     if not around.lower:
         return
     worst = min(
@@ -241,7 +241,7 @@ def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) 
 
 
 def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
-    """Yield findings about crowded atoms: a neighbor cap if their number matters, else the jump."""
+    """Yield findings about atoms with many neighbors: a cap on their number, or another jump."""
     values: dict[str, Any] = {"species": one.species, "radius": one.radius}
     if one.kept:
         values |= {"kept": one.kept, "distance": one.distance, "force": one.force}
@@ -263,7 +263,7 @@ def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
 
 
 def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
-    """Yield findings about one pair walk: no cutoff, a steep switch, places that were not examined."""
+    """Yield findings about one pair interaction: no cutoff, a steep switch, places that were not examined."""
     further = walk.further
     if walk.cutoff is None and np.abs(walk.energy).max() > 0:
         # what was searched for an end, and no more
@@ -283,7 +283,7 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
 
 
 def _steepness(walk: PairWalk) -> tuple[float, float] | None:
-    """Return (largest curvature beyond the well over that at its bottom, distance); None without a well."""
+    """Return the largest curvature beyond the well, relative to the bottom, and its distance; or None."""
     curvature = -np.gradient(walk.force, walk.distance)
     bottom = int(np.argmin(walk.energy))
     if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:
@@ -300,7 +300,7 @@ def _steepness(walk: PairWalk) -> tuple[float, float] | None:
 
 
 def _first_to_jump(event: Event) -> str:
-    """Name of the lowest derivative that jumps; the pair's own if none up to the curvature does."""
+    """Return the name of the lowest derivative that jumps at an event."""
     order = event.jump.order
     return ORDERS[max(order, event.threshold.order) if order == SMOOTH and event.threshold else order]
 

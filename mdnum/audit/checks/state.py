@@ -29,15 +29,15 @@ _EPS = np.finfo(float).eps
 class StateCheck(AuditCheck):
     """Does an answer depend on the structures that the calculator object evaluated before?
 
-    Tests repeated calls, and one object on structures that grow, shrink, move and strain, against new
-    objects.
+    The check repeats calls, and compares one object with new ones on structures that grow, shrink, move and
+    strain.
     """
 
     name, title, order, basic, calls = "state", "Memory", 60, True, 500
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compare one object that is used repeatedly with new objects."""
+        """Compare one calculator object that is used repeatedly with new objects."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
             atoms, noise = settled(subject.fresh(), rng, brief=self.brief)
@@ -137,7 +137,7 @@ class StateCheck(AuditCheck):
 
 @dataclass
 class Comparison:
-    """Answer of a used object, and that of a new object for the same structure."""
+    """Energy and forces from a used calculator object and from a new one, for the same structure."""
 
     sequence: str  # in which it was asked
     what: str  # happened to the structure
@@ -154,7 +154,7 @@ class Comparison:
 
     @property
     def refused(self) -> CalculatorError | None:
-        """Failure of the new object, or else of the used one; None if both succeeded."""
+        """Error of the new calculator object, or else of the used one; None if both succeeded."""
         return next((one for one in (self.new, self.old) if isinstance(one, CalculatorError)), None)
 
     @property
@@ -187,7 +187,7 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep
 def _through(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, name: str
 ) -> Iterator[Comparison]:
-    """Evaluate a sequence with one object, and yield each answer with that of a new object."""
+    """Evaluate a sequence with one calculator object, and compare each answer with that of a new object."""
     used = subject.used()
     before: Atoms | None = None
     known: dict[int, Answered] = {}
@@ -224,7 +224,7 @@ def _through(
 def _again(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, worst: Comparison
 ) -> bool:
-    """Return whether another object reproduces the largest difference in the same sequence."""
+    """Return whether another calculator object reproduces the largest difference in the same sequence."""
     end = next(k for k, one in enumerate(sequence) if (one.what, one.atoms) == (worst.what, worst.atoms))
     way = [step._replace(compared=place == end) for place, step in enumerate(sequence[: end + 1])]
     (again,) = _through(subject, way, noise, worst.sequence)
@@ -294,10 +294,10 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
 
 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Largest move of an atom or cell edge after which an answer stays the same to the last bit, Å, or 0.
+    """Return the largest move of an atom or cell edge that leaves an answer unchanged, Å, or 0.
 
-    Only moves that should change many of the last digits count; the expected change is in proportion to that
-    over the longest move.
+    Only moves that should change many of the last digits count; the expected change is proportional to the
+    length of the move.
     """
     # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate
     line = np.zeros((len(atoms), 3))

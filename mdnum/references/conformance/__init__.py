@@ -1,7 +1,8 @@
 """A conformance suite that compares any neighbor list with an exact brute-force search.
 
-`examine` tests a list with all cases; `load` finds a list by name; `NeighborListConformance` is a class to
-subclass in a library's own tests; `cases` and `boxes` are hypothesis strategies for custom tests.
+`examine` tests a neighbor list with all test cases; `load` finds a neighbor list by name;
+`NeighborListConformance` is a class to subclass in a library's own tests; `cases` and `boxes` are hypothesis
+strategies for custom tests.
 """
 
 from __future__ import annotations

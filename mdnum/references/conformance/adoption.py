@@ -1,4 +1,4 @@
-"""The conformance suite for a library's own tests: a class to subclass, with one test per area.
+"""The conformance suite for a library's own tests: a class to subclass, with one test per topic.
 
     from mdnum.references.conformance import ListLimits, NeighborListConformance
     from mylibrary import neighbor_list
@@ -7,7 +7,7 @@
         pairs = staticmethod(neighbor_list)
         limits = ListLimits(minimum_image=True)
 
-A failure prints what is wrong and a script of a few atoms that reproduces it.
+A failed test prints the error and a script with a few atoms that reproduces the error.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class NeighborListConformance:
 
     @pytest.mark.parametrize("area", AREAS)
     def test_neighbor_list(self, area: str) -> None:
-        """Test that the list returns the correct pairs in the cases of an area."""
+        """Test that the neighbor list returns the correct pairs in all test cases of one area."""
         tested = self.subject()
         cases = self.asked(tested, area)
         if not cases:
@@ -78,7 +78,7 @@ class NeighborListConformance:
 
     @staticmethod
     def _answers(tested: PairList) -> bool:
-        """Return whether the list answers the simplest cases within its declared limits."""
+        """Return whether the neighbor list returns pairs in the simplest cases within its declared limits."""
         plain = [once("a gas", "few", gas(20, 6.0, 0), 6.0), once("a free gas", "few", gas(20, 3.0, 0))]
         report = examine(tested, asked=questions.as_kept(tested, plain), large=False, shrink=False)
         return not report.asked or bool(report.failed) or report.conforms

@@ -23,12 +23,12 @@ _ROWS = "pairs one by one are to be tuples (i, j) in a list, or rows of an array
 
 
 class Malformed(Exception):
-    """An answer that is not a list of pairs; the message gives the reason."""
+    """Raised if a returned value is not a list of pairs; the message gives the reason."""
 
 
 @dataclass(frozen=True)
 class ListAnswer:
-    """Rows returned by a neighbor list."""
+    """Pairs returned by a neighbor list, one per row."""
 
     # i, j: atoms, shape (rows,)
     i: np.ndarray
@@ -48,14 +48,15 @@ class ListAnswer:
 
 
 def read(given: Any) -> ListAnswer:
-    """Return the rows of a neighbor list's return value.
+    """Return the pairs in a neighbor list's return value as a `ListAnswer`.
 
-    A list may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance, vector), or any
-    of these without the parts in between: a part with one number per row is a distance, the first part with
-    three integers per row is the shift, another with three numbers is the vector. It may return a mapping, or
-    an object with attributes, named i, j, shift, distance and vector. It may also return single pairs: a list
-    of tuples (i, j), or one array with a row (i, j) for each pair. A list of lists is read as parts, never as
-    pairs, since some would be ambiguous.
+    A neighbor list may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance,
+    vector), or any of these without the parts in between: a part with one number per row is a distance, the
+    first part with three integers per row is the shift, another part with three numbers per row is the
+    vector. A neighbor list may return a mapping with the keys i, j, shift, distance and vector, or an object
+    with attributes of these names. A neighbor list may also return single pairs: a list of tuples (i, j), or
+    one array with a row (i, j) for each pair. A Python list of lists is always read as parts, not as pairs,
+    since some such lists would be ambiguous.
 
     Raises:
         Malformed: the value has none of these forms.
@@ -78,7 +79,7 @@ def read(given: Any) -> ListAnswer:
 
 
 def parts(given: Any) -> dict[str, Any]:
-    """Return the parts of an answer under the names of `ListAnswer`, with at least i and j.
+    """Return the parts of a neighbor list's answer under the names of `ListAnswer`, with at least i and j.
 
     Raises:
         Malformed: the value is not a list of pairs.
@@ -100,7 +101,7 @@ def parts(given: Any) -> dict[str, Any]:
 
 
 def _one_by_one(given: Any) -> dict[str, Any]:
-    """Return i and j from rows (i, j)."""
+    """Return the arrays i and j from rows (i, j)."""
     table = _array(given, "the answer")
     if table.size == 0 and table.ndim:
         table = np.zeros((0, 2), np.int64)
@@ -113,7 +114,7 @@ def _one_by_one(given: Any) -> dict[str, Any]:
 
 
 def _in_order(arrays: list[np.ndarray]) -> dict[str, Any]:
-    """Identify the parts of a tuple by position and shape."""
+    """Identify the parts of a returned tuple by their position and shape."""
     if not 2 <= len(arrays) <= 5:
         raise Malformed(f"it returned {len(arrays)} parts, not (i, j), (i, j, shift), ...; {_ROWS}")
     first, second = arrays[:2]

@@ -1,4 +1,4 @@
-"""Test cases for neighbor lists: atoms in a box, at one moment or in a sequence."""
+"""Test cases for neighbor lists, with atoms in a box at one moment or in a sequence."""
 
 from __future__ import annotations
 
@@ -77,20 +77,20 @@ class Case:
 
     @property
     def atoms(self) -> int:
-        """Number of atoms, the largest if it changes."""
+        """Number of atoms in the case, the largest number if it changes."""
         return max(len(still.positions) for still in self.stills)
 
     @property
     def steps(self) -> int:
-        """Number of calls of the neighbor list."""
+        """Number of calls of the neighbor list in the case."""
         return len(self.stills)
 
     def until(self, steps: int) -> Case:
-        """Return the first steps of the case."""
+        """Return the test case with only its first `steps` steps."""
         return replace(self, stills=self.stills[:steps])
 
     def only(self, atoms: ndarray) -> Case:
-        """Return the case with only these atoms, in this order; atoms missing from a still are skipped."""
+        """Return the test case with only some atoms, in the given order, where they exist."""
         stills = tuple(
             replace(still, positions=still.positions[atoms[atoms < len(still.positions)]])
             for still in self.stills
@@ -98,14 +98,14 @@ class Case:
         return replace(self, stills=stills, known=None if self.known is None else _among(self.known, atoms))
 
     def changed(self, positions: Any = None, cell: Any = None, **other: Any) -> Case:
-        """Return the case with functions applied to the positions and to the cell of every step."""
+        """Return the test case with functions applied to the positions and to the cell at every step."""
         same = lambda rows: rows  # noqa: E731
         x, box = positions or same, cell or same
         stills = tuple(replace(one, positions=x(one.positions), cell=box(one.cell)) for one in self.stills)
         return replace(self, **{"stills": stills, "known": None, **other})
 
     def equals(self, other: Case) -> bool:
-        """Return whether another case has the same numbers."""
+        """Return whether another test case has the same positions, cells, cutoff and skin."""
         return (self.pbc, self.r_cut, self.skin) == (other.pbc, other.r_cut, other.skin) and all(
             np.array_equal(a.positions, b.positions) and np.array_equal(a.cell, b.cell)
             for a, b in zip(self.stills, other.stills, strict=True)
@@ -113,7 +113,7 @@ class Case:
 
 
 def matrix(cell: Any) -> ndarray:
-    """Return lattice vectors as rows, from a matrix, three edges or the edge of a cube."""
+    """Return lattice vectors as rows, from a matrix, from three edge lengths or from the edge of a cube."""
     cell = np.asarray(cell, np.float64)
     return np.diag(cell * np.ones(3)) if cell.ndim < 2 else cell
 
@@ -132,7 +132,7 @@ def once(
     r_cut: float = 1.0,
     known: PairSet | None = None,
 ) -> Case:
-    """Return a case of a single still; without a cell, the atoms are free."""
+    """Return a test case with the atoms at one moment; without a cell, the atoms are free."""
     if cell is None:
         cell, pbc = np.zeros((3, 3)), False
     return Case(name, area, (Still(positions, matrix(cell)),), _axes(pbc), float(r_cut), known=known)
@@ -147,14 +147,14 @@ def sequence(
     skin: float = 0.3,
     pbc: bool | Sequence[bool] = True,
 ) -> Case:
-    """Return a case of several successive stills, given by positions or (positions, cell)."""
+    """Return a test case with several successive moments, each given by positions or (positions, cell)."""
     places = (place if isinstance(place, tuple) else (place, cell) for place in path)
     stills = tuple(Still(positions, matrix(box)) for positions, box in places)
     return Case(name, area, stills, _axes(pbc), float(r_cut), float(skin))
 
 
 def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
-    """Return the pairs among some of the atoms, with new indices."""
+    """Return the pairs among some of the atoms, with the indices of these atoms in the smaller case."""
     most = int(max(atoms.max(initial=-1), pairs.i.max(initial=-1), pairs.j.max(initial=-1))) + 1
     new = np.full(most, -1)
     new[atoms] = np.arange(len(atoms))
@@ -165,7 +165,7 @@ def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
 
 
 def gas(count: int, cell, seed: int, low: float = 0.0, high: float = 1.0) -> ndarray:
-    """Return coordinates drawn uniformly from a range of fractions of a cell."""
+    """Return random coordinates, uniform over a range of fractional coordinates of a cell."""
     return np.random.default_rng(seed).uniform(low, high, (count, 3)) @ matrix(cell)
 
 

@@ -1,4 +1,4 @@
-"""Compare a list's answers with the exact pairs, classify the errors, and count the results."""
+"""Compare the pairs from a neighbor list with the exact pairs, classify the errors, and count the results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SILENT = ("CRASHED", "NO_ANSWER", "RAISED")  # those of cases in which nothing c
 
 @dataclass(frozen=True)
 class Truth(PairSet):
-    """Exact pairs at one still, inside the cutoff and out to the requested reach."""
+    """Exact pairs at one step of a test case, inside the cutoff and out to the requested reach."""
 
     # positions, cell: as the list was given them; rows of axes that do not repeat are zero
     positions: ndarray
@@ -46,16 +46,16 @@ class Truth(PairSet):
     reach: float  # pairs as far as this may be listed, length; the cutoff unless a list holds a skin
 
     def needed(self, unit: float) -> ndarray:
-        """Return which pairs a list with this unit roundoff must contain."""
+        """Return a mask of the pairs that a list with this unit roundoff must contain."""
         return self.distance < self.r_cut - unit * self.scale
 
     def allowed(self, unit: float) -> ndarray:
-        """Return which pairs a list with this unit roundoff may contain."""
+        """Return a mask of the pairs that a list with this unit roundoff may contain."""
         return self.distance <= self.reach + unit * self.scale
 
 
 def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DOUBLE) -> Truth:
-    """Compute the exact pairs of one still of a case.
+    """Compute the exact pairs of a test case at one of its steps.
 
     Args:
         reach: largest distance of listed pairs, length; the cutoff by default.
@@ -93,7 +93,7 @@ def conditioning(cell: ndarray, pbc: ndarray) -> float:
 
 
 def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tuple) -> list[ndarray]:
-    """Return an integer key for each row (i, j, shift), equal for equal rows, for these rows and `others`.
+    """Return an integer key for each row (i, j, shift), of these rows and of `others`, equal for equal rows.
 
     `count` is the number of atoms; without shifts, rows are identified by their atoms alone.
     """
@@ -118,7 +118,7 @@ def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tup
 
 @dataclass(frozen=True)
 class Conventions:
-    """Conventions of a neighbor list, all of which are acceptable."""
+    """Conventions of a neighbor list, none of which counts as an error."""
 
     full: bool = True  # every pair from both of its atoms (True), or once (False)
     sign: int = 1  # +1 where shifts are added to atom j, -1 where they are added to atom i
@@ -136,7 +136,7 @@ class Failure:
 
     @property
     def kind(self) -> tuple[str, str]:
-        """Signature that a smaller case must reproduce: the code, and the message of an exception or crash."""
+        """Error code, and message of an exception or crash, which a smaller case must reproduce."""
         text = self.text if self.code in ("RAISED", "CRASHED", "MALFORMED") else ""
         return self.code, without_numbers(text)
 
@@ -147,10 +147,10 @@ def without_numbers(text: str) -> str:
 
 
 def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Return all errors of an answer; an empty list if it conforms.
+    """Return all errors in the pairs from a neighbor list; empty if the pairs conform.
 
-    A pair within rounding of the cutoff (`Truth.scale` times the roundoff of the list) may be present or
-    absent, but consistently for both of its atoms.
+    A pair within rounding error of the cutoff (`Truth.scale` times the unit roundoff of the list) may be
+    present or absent, but must be so for both of its atoms.
 
     Args:
         truth: exact pairs, listed as far as the answer may reach.
@@ -176,7 +176,7 @@ def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
 
 
 def _compare(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Return the errors found by matching the rows of an answer with the exact rows."""
+    """Return the errors found by matching the listed pairs with the exact pairs."""
     i, j, shifts = answer.i, answer.j, answer.shift is not None
     shift = how.sign * answer.shift if answer.shift is not None else np.zeros((len(i), 3), np.int64)
     right = _both(truth) if how.full else (truth.i, truth.j, truth.shift)
@@ -241,19 +241,19 @@ def _compare(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure
 
 
 def _through(shift: ndarray) -> str:
-    """Return the image shift as text; empty for the atom itself."""
+    """Return the periodic image shift as text; empty for a zero shift."""
     return f" + ({', '.join(str(int(part)) for part in shift)})" if np.any(shift) else ""
 
 
 def _both(truth: Truth) -> tuple[ndarray, ndarray, ndarray]:
-    """Return every exact pair from both of its atoms."""
+    """Return every exact pair twice, once from each of its atoms."""
     columns = (truth.i, truth.j), (truth.j, truth.i), (truth.shift, -truth.shift)
     i, j, shift = map(np.concatenate, columns)
     return i, j, shift
 
 
 def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Orient every row as the exact pairs are: i < j, or the leading one of two opposite shifts."""
+    """Orient every pair so that i < j or, for equal atoms, so that the first nonzero shift is positive."""
     a, b, c = shift.T if len(shift) else np.zeros((3, 0), np.int64)
     leading = (a > 0) | ((a == 0) & ((b > 0) | ((b == 0) & (c > 0))))
     turn = (i > j) | ((i == j) & ~leading)
@@ -261,7 +261,7 @@ def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, 
 
 
 def _shift_hint(answer: ListAnswer, truth: Truth, how: Conventions) -> str:
-    """Suggest which convention would explain wrong shifts."""
+    """Return a hint at the convention that would explain wrong shifts, as text."""
     assert answer.shift is not None
     if not _compare(answer, truth, replace(how, sign=-how.sign)):
         return "; added to the other atom they are right"
@@ -273,7 +273,7 @@ def _shift_hint(answer: ListAnswer, truth: Truth, how: Conventions) -> str:
 
 
 def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Return errors of distances and vectors, for rows with correct pairs."""
+    """Return the errors of listed distances and vectors, for an answer whose pairs are correct."""
     if answer.distance is None and answer.vector is None:
         return []
     # a bound for a length near the cutoff; a code may form it from squares of its coordinates' differences
@@ -309,14 +309,14 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """Error of an answer that is correct in float32, as in `CaseResult.single`; None if it is not."""
+    """Return the rounding error of an answer if correct in float32, as in `CaseResult.single`, else None."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))
 
 
 def measures_well(answer: ListAnswer, truth: Truth, how: Conventions) -> bool:
-    """Return whether an answer has distances or vectors that are as accurate as the conventions state."""
+    """Return whether the listed distances or vectors are as accurate as the declared unit roundoff."""
     given = answer.distance is not None or answer.vector is not None
     n = len(truth.positions)
     named = bool(((answer.i >= 0) & (answer.i < n) & (answer.j >= 0) & (answer.j < n)).all())
@@ -324,7 +324,7 @@ def measures_well(answer: ListAnswer, truth: Truth, how: Conventions) -> bool:
 
 
 def _nearest(mine: ndarray, told: ndarray, theirs: ndarray, length: ndarray) -> ndarray:
-    """Return the difference of every number from the nearest number with the same key."""
+    """Return the absolute difference between each value and the nearest reference value with the same key."""
     order = np.lexsort((length, theirs))
     theirs, length = theirs[order], length[order]
     first, last = np.searchsorted(theirs, mine, "left"), np.searchsorted(theirs, mine, "right")
@@ -371,27 +371,27 @@ class Failed:
 
     @property
     def worst(self) -> Failure:
-        """Most severe failure, which is reported."""
+        """The most severe failure of the test case, which is the one reported."""
         return min(self.failures, key=lambda failure: CODES.index(failure.code))
 
     @property
     def code(self) -> str:
-        """Code of the most severe failure."""
+        """Code of the most severe failure in the test case."""
         return self.worst.code
 
 
 @dataclass
 class CaseAnswers:
-    """Results of all test cases, by case number, and the shrunk failures.
+    """Results of all test cases, by case number, and the failures reduced to a few atoms.
 
-    An examination that is resumed draws the same cases from the same seed, so the cases are not stored.
+    A resumed examination draws the same test cases from the same seed, so the test cases are not stored.
     """
 
     cases: dict[str, CaseResult] = field(default_factory=dict)
     shrunk: dict[str, Failed] = field(default_factory=dict)
 
     def of(self, number: int, case: Case) -> CaseResult | None:
-        """Return the result of a case; None if it has not run yet. Raises InputError for a different case."""
+        """Return the result of a test case or None; raise InputError if the stored case differs."""
         result = self.cases.get(str(number))
         if result is None:
             return None
@@ -408,7 +408,7 @@ class CaseAnswers:
 
 @dataclass(frozen=True)
 class RefusalKind:
-    """A kind of case that a list rejects."""
+    """A kind of test case that a neighbor list rejects."""
 
     exception: str  # in words
     case: Case  # the smallest question that met it, up to the step that was refused
@@ -421,7 +421,7 @@ class RefusalKind:
 
 @dataclass
 class AreaTally:
-    """Counts of results in one area."""
+    """Counts of the test results in one area of the suite."""
 
     # asked, refused, skipped: cases; refused by the list itself, skipped because of its limits
     asked: int = 0
@@ -432,17 +432,17 @@ class AreaTally:
 
     @property
     def failed(self) -> int:
-        """Number of cases with a wrong answer, or none."""
+        """Number of test cases with a wrong answer, or without any answer."""
         return sum(self.codes.values())
 
     @property
     def silent(self) -> int:
-        """Number of failed cases without any answer."""
+        """Number of failed test cases in which the neighbor list returned nothing."""
         return sum(self.codes.get(code, 0) for code in SILENT)
 
     @property
     def passed(self) -> int:
-        """Number of cases answered correctly."""
+        """Number of test cases answered correctly."""
         return self.asked - self.failed - self.refused
 
 
@@ -480,13 +480,13 @@ class Report:
     whole: bool = True  # all failures were shrunk as far as they are
 
     def skip(self, case: Case, why: str) -> None:
-        """Count a case that is skipped."""
+        """Count a test case that is skipped."""
         tally = self.areas.setdefault(case.area, AreaTally())
         tally.skipped += 1
         tally.why[why] = tally.why.get(why, 0) + 1
 
     def take(self, case: Case, result: CaseResult) -> None:
-        """Count the result of a case."""
+        """Count the result of a test case."""
         tally = self.areas.setdefault(case.area, AreaTally())
         tally.asked += 1
         self.ties = (self.ties[0] + result.ties[0], self.ties[1] + result.ties[1])
@@ -512,16 +512,16 @@ class Report:
             tally.why[result.refused[1]] = tally.why.get(result.refused[1], 0) + 1
 
     def reach(self, case: Case) -> float:
-        """Largest distance of the pairs that a list with pairs beyond the cutoff may return, length.
+        """Return the largest pair distance allowed for a list that includes pairs beyond the cutoff, length.
 
-        Either atom of a listed pair may have moved as far as the skin allows.
+        Both atoms of a listed pair may have moved as far as the skin allows since the list was built.
         """
         usual = case.r_cut + 2 * case.skin if case.skin else 1.5 * case.r_cut
         own = 0.3 * (self.padding or 1.0)  # asked with a skin of 0.3 cutoffs
         return usual if own < 0.31 else max(usual, (1 + 2 * own) * case.r_cut)
 
     def total(self, count: str) -> int:
-        """Sum an attribute of the tallies over all areas."""
+        """Return the sum of a count over all areas of the suite."""
         return sum(getattr(tally, count) for tally in self.areas.values())
 
     @property
@@ -531,7 +531,7 @@ class Report:
 
     @property
     def left(self) -> int:
-        """Number of cases that neither ran nor were skipped."""
+        """Number of test cases that neither ran nor were skipped."""
         return self.questions - self.asked - self.total("skipped")
 
     @property
@@ -541,5 +541,5 @@ class Report:
 
     @property
     def conforms(self) -> bool:
-        """Whether the list was tested and no case failed."""
+        """Whether the neighbor list was tested and no test case failed."""
         return self.wrong == 0 and self.asked > self.total("refused")

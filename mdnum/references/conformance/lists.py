@@ -1,4 +1,4 @@
-"""Neighbor lists under test: how they are called, what they do not support, and how they are created."""
+"""Interfaces of neighbor lists under test: calls, declared limits and creation."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ class KeptList(Protocol):
 
     `allocate` builds a new list and may be called again on the same object; `update` gets the current
     positions. The returned pairs must include every pair within r_cut at the positions of this call, and may
-    include pairs slightly farther apart, within the skin. A list with its own padding, independent of the
-    given skin, states it in an attribute `skin` (length), which is read after each `allocate`.
+    include pairs slightly farther apart, within the skin. A neighbor list with its own padding, independent
+    of the given skin, states this padding in an attribute `skin` (length), which is read after each
+    `allocate`.
     """
 
     def allocate(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float, skin: float) -> Any:
-        """Build a new list and return its pairs."""
+        """Build a new neighbor list and return its pairs."""
         ...
 
     def update(self, positions: ndarray, cell: ndarray) -> Any:
-        """Return the pairs of the current list at these positions.
+        """Update the neighbor list to new positions and return its pairs.
 
-        The arrays may be those of the previous call with new contents: store copies, not references.
+        The arguments may be the arrays of the previous call with new contents: store copies, not references.
         """
         ...
 
@@ -47,7 +48,7 @@ _WANTED = f"Give a function of ({', '.join(_GIVEN)}) that returns (i, j)"
 
 @dataclass(frozen=True)
 class ListLimits:
-    """Cases that a list does not support; they are skipped, and counted."""
+    """Limits of a neighbor list; test cases beyond them are skipped and counted."""
 
     minimum_image: bool = False  # one image of a pair at most: no cell narrower than two cutoffs (and skins)
     orthorhombic: bool = False  # no cell with other than right angles
@@ -68,11 +69,11 @@ class ListLimits:
     roomy: float = np.inf  # no box of more cells of r_cut than this along all axes together
 
     def refusal(self, case: Case) -> str | None:
-        """Return why a case is skipped, or None if it is not."""
+        """Return why a test case is beyond these limits, or None if it is within them."""
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
-        """Yield (whether a case exceeds a limit, the limit as text), the fastest tests first."""
+        """Yield (whether a test case exceeds a limit, the limit as text), the fastest tests first."""
         pbc, cells = np.array(case.pbc), [still.cell for still in case.stills]
         least = min(len(still.positions) for still in case.stills)
         yield least < self.atoms, f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"
@@ -138,17 +139,17 @@ class PairList:
 
     @property
     def version(self) -> str | None:
-        """Installed version of the list's package, or None."""
+        """Installed version of the neighbor list's package, or None."""
         return self.package and version(self.package)
 
     @property
     def lacks(self) -> list[str]:
-        """Required distributions that are not installed."""
+        """Python distributions that the neighbor list requires and that are not installed."""
         needed = (*((self.package,) if self.package else ()), *self.needs)
         return [name for name in needed if version(name) is None]
 
     def with_options(self, **options: Any) -> PairList:
-        """Return the list with other declared properties; None leaves a property unchanged."""
+        """Return the `PairList` with other declared properties; None leaves a property unchanged."""
         return replace(self, **{name: value for name, value in options.items() if value is not None})
 
 
@@ -168,10 +169,10 @@ def source_of(made: Any) -> str:
 
 
 def from_object(made: Any, name: str | None = None, source: str | None = None) -> PairList:
-    """Return a list from a function, from a class of kept lists, or from a kept list.
+    """Return a `PairList` for a function, for a class of kept lists, or for a kept list.
 
-    Declared properties are read from attributes of the object, if present: `full` (bool), `unit` (roundoff),
-    `superset` (bool), `limits` (`ListLimits`).
+    Declared properties are read from the attributes `full` (bool), `unit` (roundoff), `superset` (bool) and
+    `limits` (`ListLimits`) of the object, if present.
 
     Raises:
         InputError: the object is none of these.
@@ -203,7 +204,7 @@ def from_object(made: Any, name: str | None = None, source: str | None = None) -
 
 
 def _check_signatures(made: Any, name: str, kept: bool) -> None:
-    """Raise InputError if a known signature does not accept the suite's arguments."""
+    """Raise InputError if the signature of a neighbor list does not accept the suite's arguments."""
     is_class = inspect.isclass(made)
     calls: list[tuple[str, Any, tuple[str, ...]]] = []
     if is_class or not kept:

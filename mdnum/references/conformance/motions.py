@@ -1,12 +1,12 @@
-"""Motion sequences for kept neighbor lists, including the smallest motions that a rebuild rule must detect.
+"""Motion sequences that test kept neighbor lists, with the smallest motions that require a rebuild.
 
-A pair that was beyond r_cut + padding when the list was built is inside the cutoff once its two atoms have
-approached by the padding; the smallest motion that achieves this is along their line. A rule that tests
-whether two atoms could have used up the padding rebuilds before that, for any direction, any division of the
-motion between the atoms and any motion of the others. So each of `motions` closes a pair by slightly more
-than the padding: along axes, diagonals and random directions; by both atoms or one, in any proportion; alone,
-among atoms at rest, among hundreds that move little, among others with the same motion or a common drift; in
-one step, slowly, and back and forth.
+A pair that was just beyond r_cut + padding when the list was built is inside the cutoff once its two atoms
+have approached by the padding; the smallest motion that achieves this is along the line between them. A rule
+that tests whether two atoms could have used up the padding rebuilds the list in time, for any direction, any
+division of the motion between the atoms and any motion of the others. Each sequence of `motions` therefore
+brings a pair closer by slightly more than the padding: along axes, diagonals and random directions; by both
+atoms or one, in any proportion; alone, among atoms at rest, among hundreds that move little, among others
+with the same motion or a common drift; in one step, slowly, and back and forth.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are spread evenly
 
 
 def movers() -> Iterator[Case]:
-    """Yield sequences for a kept list, the short ones first."""
+    """Yield motion sequences for a kept neighbor list, short sequences first."""
     for area, scripts in (
         ("motion", _pairs),
         ("motion", _many),
@@ -50,7 +50,7 @@ def movers() -> Iterator[Case]:
 
 
 def sequences() -> Iterator[Case]:
-    """Yield sequences for a list built from scratch at each call: its internal state must have no effect."""
+    """Yield sequences for a list that is built anew at each call, to test that no internal state matters."""
     for case in _reuse():
         yield replace(case, skin=0.0)
 
@@ -61,7 +61,7 @@ def _two(apart: float, middle: ndarray = _MIDDLE) -> ndarray:
 
 
 def _beside(apart: float) -> ndarray:
-    """Return an atom, and another at a given distance that will approach or recede."""
+    """Return positions of two atoms at a given distance along x, the first fixed in the middle."""
     return np.array([_MIDDLE, _MIDDLE + np.array([apart, 0, 0])])
 
 
@@ -169,7 +169,7 @@ def _strain() -> Script:
 
 
 def _narrow() -> Iterator[Case]:
-    """Yield boxes so narrow that pairs have several images within the cutoff and atoms see their own."""
+    """Yield boxes so narrow that pairs have several images within the cutoff, and so do single atoms."""
     skewed = np.array([[0.9, 0, 0], [0.5, 0.8, 0], [-0.4, 0.3, 0.85]])
     for word, count, cell, pbc in (
         ("an atom alone, edges of 0.8 cutoffs", 1, 0.8, True),
@@ -208,7 +208,7 @@ def _reuse() -> Iterator[Case]:
 
 
 def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = None) -> Case:
-    """Return a case in which every still, or every still with a given skin, starts a new list."""
+    """Return a test case that builds a new list at every step, or at every step with a given skin."""
     case = sequence(name, "reuse", path, _L, _R, max(filter(None, skins)) if skins else _SKIN)
     starts = zip(case.stills, skins or [None] * len(path), strict=True)
     stills = (replace(still, fresh=skin is not None or not skins, skin=skin) for still, skin in starts)
@@ -216,7 +216,7 @@ def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = Non
 
 
 def motions(padding: float | None = None) -> Iterator[Case]:
-    """Yield sequences of small motions, the short ones first; `Case.motions` counts the motions.
+    """Yield sequences of small motions, short sequences first; `Case.motions` counts the motions.
 
     Args:
         padding: measured or stated padding of the list, in units of the given skin; None if unknown: the
@@ -267,7 +267,7 @@ def motions(padding: float | None = None) -> Iterator[Case]:
 
 
 def _ways() -> list[ndarray]:
-    """Return unit vectors: axes, diagonals of faces and of the cube, and three random ones."""
+    """Return unit vectors along axes, along diagonals of faces and of the cube, and in random directions."""
     ways = [np.array(way, float) for way in itertools.product((-1, 0, 1), repeat=3) if way > (0, 0, 0)]
     ways.sort(key=lambda way: (np.count_nonzero(way), tuple(-way)))
     ways += list(np.random.default_rng(140).normal(size=(3, 3)))
@@ -275,12 +275,12 @@ def _ways() -> list[ndarray]:
 
 
 def _closing(room: float) -> float:
-    """Return the approach that takes a pair from just beyond the list to just inside the cutoff."""
+    """Return the decrease in distance that takes a pair from just beyond the padding into the cutoff."""
     return (1 + 2 * HAIR) * room
 
 
 def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
-    """Return pairs that start just beyond the list: all first atoms, then all second ones."""
+    """Return pairs that start just beyond the padding, with all first atoms before all second atoms."""
     half = (_R + (1 + HAIR) * room) / 2 * way
     return np.vstack([middle - half, middle + half])
 
@@ -288,17 +288,17 @@ def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
 def _walk(
     room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float] = (0.0, 1.0)
 ) -> list[ndarray]:
-    """Return the path of two atoms that approach by given fractions of the smallest motion."""
+    """Return the path of two atoms that approach each other by given fractions of the smallest motion."""
     start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
 
 
 def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
-    """Return a path in which two of many atoms approach, and the others rest or move little.
+    """Return a path in which two of many atoms approach each other, and the others rest or move little.
 
-    The division of the motion between the two atoms depends on `n`. The index of the
-    atom that moves most is spread evenly over all indices; that of its partner is random.
+    The division of the motion between the two atoms depends on `n`. The index of the atom that moves most
+    varies evenly over all indices; the index of its partner is random.
     """
     rng = np.random.default_rng(170 + n)
     most = int(count * (1.0 - (n + 1) * _GOLDEN % 1.0))
@@ -328,14 +328,14 @@ def _with(others: ndarray, atoms: list[int], path: list[ndarray]) -> list[ndarra
 
 
 def _dozen(room: float, way: ndarray, share: float, n: int) -> list[ndarray]:
-    """Return a path of twelve pairs at different places with the same motion."""
+    """Return a path of twelve pairs at different places that all make the same motion."""
     start = _around(_places(12, 12.0, n), room, way)
     moves = _closing(room) * np.repeat([share * way, (share - 1.0) * way], 12, axis=0)
     return [start, start + moves]
 
 
 def _in_turn(room: float, ways: list[ndarray]) -> Case:
-    """Return a case of 25 pairs whose 50 atoms move in turn, to detect atoms that a rule ignores."""
+    """Return a test case of 25 pairs whose 50 atoms move in turn, to detect atoms that a rule ignores."""
     count = 25
     way = np.array([ways[n % len(ways)] for n in range(count)])
     start = _around(_places(count, 15.0, 0), room, way)
@@ -353,7 +353,7 @@ def _in_turn(room: float, ways: list[ndarray]) -> Case:
 
 
 def _ladder(room: float, way: ndarray, n: int) -> Case:
-    """Return a case in which pairs from various distances approach slowly until each is inside."""
+    """Return a test case in which pairs from various distances approach until each is inside the cutoff."""
     start = _around(_places(len(_RUNGS), 12.0, n), room * _RUNGS[:, None], way)
     inward = np.repeat([0.5 * way, -0.5 * way], len(_RUNGS), axis=0)
     path = [start + _closing(room) * closed * inward for closed in (0.0, *_RUNGS)]
@@ -362,7 +362,7 @@ def _ladder(room: float, way: ndarray, n: int) -> Case:
 
 
 def _one_by_one(room: float, way: ndarray, share: float, n: int) -> Case:
-    """Return a case in which pairs from various distances approach and return, one pair at a time."""
+    """Return a test case in which pairs from various distances approach and return, one pair at a time."""
     count = len(_RUNGS)
     start = _around(_places(count, 12.0, n + 1), room * _RUNGS[:, None], way)
     path = [start]
@@ -383,13 +383,13 @@ def _direction(way: ndarray) -> str:
 
 
 def _places(count: int, edge: float, n: int) -> ndarray:
-    """Return separate places for pairs, in an order unrelated to space."""
+    """Return separate positions for pairs, in random order."""
     side = int(np.ceil(count ** (1 / 3)))
     return edge * np.random.default_rng(200 + n).permutation((grid(side) + 0.5) / side)[:count]
 
 
 def _sequence(name: str, paths: Iterable[list[ndarray]], cell: float | ndarray, skin: float = _SKIN) -> Case:
-    """Return a case of successive motions, between which all atoms move far, so that any rule rebuilds."""
+    """Return a test case of successive motions, with far moves in between that make any rule rebuild."""
     paths = list(paths)
     case = sequence(name, "rule", [still for path in paths for still in path], cell, _R, skin)
     return replace(case, motions=len(paths))

@@ -1,8 +1,8 @@
 """Neighbor searches of libraries, by name, and lookup of any list by name or `module:function`.
 
-Every function and class here imports what it needs and uses nothing defined outside it, because its source is
-printed in scripts that reproduce a failure without mdnum. It calls its library as a user would and corrects
-nothing: atoms outside the box, unusual cells and few atoms are passed on unchanged.
+Every function and class in this module imports what it needs and uses nothing defined outside it, because its
+source is printed in scripts that reproduce a failure without mdnum. Each of them calls its library as a user
+would and corrects nothing: atoms outside the box, unusual cells and few atoms are passed on unchanged.
 """
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalCall=false
@@ -34,7 +34,7 @@ def _declared(name: str) -> dict[str, Any]:
 
 
 def peer(*names: str, helpers: Sequence[Any] = ()) -> Callable[[Any], Any]:
-    """Decorator that registers a function, or a class of kept lists, in `LISTS` under these names.
+    """Return a decorator that registers a function, or a class of kept lists, in `LISTS` under these names.
 
     Args:
         names: of peers.toml.
@@ -135,7 +135,7 @@ def ase_primitive_list(positions, cell, pbc, r_cut):
 
 @peer("vesin", "vesin-half")
 def vesin_cells(positions, cell, pbc, r_cut, half=False):
-    """Cell list of vesin, every pair from both atoms."""
+    """The cell list of vesin, with every pair listed from both atoms."""
 
     from vesin import NeighborList
 
@@ -147,7 +147,7 @@ def vesin_cells(positions, cell, pbc, r_cut, half=False):
 
 @peer("matscipy")
 def matscipy_list(positions, cell, pbc, r_cut):
-    """Function matscipy.neighbours.neighbour_list of matscipy."""
+    """The function matscipy.neighbours.neighbour_list of matscipy."""
 
     from ase import Atoms
     from matscipy.neighbours import neighbour_list  # type: ignore
@@ -159,7 +159,7 @@ def matscipy_list(positions, cell, pbc, r_cut):
 
 @peer("pymatgen")
 def pymatgen_points(positions, cell, pbc, r_cut):
-    """Function find_points_in_spheres of pymatgen."""
+    """The function find_points_in_spheres of pymatgen."""
 
     import numpy as np
     from pymatgen.core import Lattice  # type: ignore
@@ -206,7 +206,7 @@ def scipy_tree(positions, cell, pbc, r_cut):
 
 @peer("freud")
 def freud_query(positions, cell, pbc, r_cut):
-    """Class freud.locality.AABBQuery of freud."""
+    """The class freud.locality.AABBQuery of freud."""
 
     import freud  # type: ignore
     import numpy as np
@@ -225,7 +225,7 @@ def freud_query(positions, cell, pbc, r_cut):
 
 @peer("torch-sim")
 def torch_sim_pairs(positions, cell, pbc, r_cut):
-    """Linked-cell search of torch-sim."""
+    """The linked-cell search of torch-sim."""
 
     import torch  # type: ignore
     from torch_sim.neighbors import torch_nl_linked_cell  # type: ignore
@@ -244,7 +244,7 @@ def torch_sim_pairs(positions, cell, pbc, r_cut):
 
 @peer("nvalchemi-ops")
 def nvalchemi_pairs(positions, cell, pbc, r_cut, room=64):
-    """Function cell_list of nvalchemi-ops."""
+    """The function cell_list of nvalchemi-ops."""
 
     import torch  # type: ignore
     from nvalchemiops.torch.neighbors import NeighborOverflowError, cell_list  # type: ignore
@@ -260,7 +260,7 @@ def nvalchemi_pairs(positions, cell, pbc, r_cut, room=64):
 
 @peer("jax-md-kept")
 class JaxMdList:
-    """Function partition.neighbor_list of jax-md, allocated and updated as in its documentation."""
+    """The function partition.neighbor_list of jax-md, used with updates as in its documentation."""
 
     found = neighbor = step = None
     skewed = free = False
@@ -325,13 +325,13 @@ class JaxMdList:
 
 @peer("jax-md", helpers=[JaxMdList])
 def jax_md_pairs(positions, cell, pbc, r_cut):
-    """Function partition.neighbor_list of jax-md, allocated at each call."""
+    """The function partition.neighbor_list of jax-md, with a new allocation at each call."""
     return JaxMdList().allocate(positions, cell, pbc, r_cut, 0.0)
 
 
 @peer("mdnum-verlet")
 class MdnumVerletList:
-    """Verlet list of mdnum, rebuilt before motion and box strain use up its skin."""
+    """The Verlet list of mdnum, rebuilt before motion and box strain use up its skin."""
 
     listed = built = pbc = None
 
@@ -367,7 +367,7 @@ def mdnum_host_list(positions, cell, pbc, r_cut):
 
 
 def known() -> tuple[PairList, ...]:
-    """Return every named list, installed or not."""
+    """Return every named neighbor list, whether its package is installed or not."""
 
     def named(name: str) -> PairList:
         listed = LISTS[name]
@@ -380,12 +380,12 @@ def known() -> tuple[PairList, ...]:
 
 
 def installed() -> tuple[PairList, ...]:
-    """Return the named lists whose packages are installed."""
+    """Return the named neighbor lists whose packages are installed."""
     return tuple(listed for listed in known() if not listed.lacks)
 
 
 def load(word: str) -> PairList:
-    """Return the neighbor list with this name.
+    """Return the neighbor list with a given name.
 
     Args:
         word: a name from `known()`, `package.module:function`, or `path/to/file.py:function`; see

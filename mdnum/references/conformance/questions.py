@@ -1,7 +1,7 @@
 """Test cases for neighbor lists: named cases that lists have failed, crowds, lattices, and random cases.
 
-For a library's own tests: `@given(cases())` gives cases with boxes of every kind, atoms in all positions and
-cutoffs on and off the neighbor shells; `boxes()` gives (cell, pbc, description) alone.
+For a library's own tests: `@given(cases())` draws test cases with boxes of every kind, atoms at all positions
+and cutoffs on and off the neighbor shells; `boxes()` draws only (cell, pbc, description).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _TURN = np.array([[2.0, -2.0, 1.0], [1.0, 2.0, 2.0], [2.0, 1.0, -2.0]]) / 3.0
 
 
 def catalog() -> Iterator[Case]:
-    """Yield every named single-moment case: computed cases, and cases from questions.toml."""
+    """Yield every named test case at one moment, including those from questions.toml."""
     computed = {"boxes": _boxes(), "axes": _axes(), "outside": _outside(), "ties": _ties()}
     for area in ("few", "boxes", "axes", "images", "outside", "ties", "coincident"):
         yield from (once(name, area, *rest) for name, *rest in computed.get(area, ()))
@@ -48,7 +48,7 @@ def catalog() -> Iterator[Case]:
 
 
 def crowds() -> Iterator[Case]:
-    """Yield clusters with very many neighbors per atom, alone and in a thin gas."""
+    """Yield test cases with very many neighbors per atom, as isolated clusters and in a dilute gas."""
     return (once(name, "crowded", *rest) for name, *rest in _crowds())
 
 
@@ -120,9 +120,10 @@ def _outside() -> Named:
 
 
 def _across_walls() -> ndarray:
-    """Return pairs along x: one atom just below a multiple of the cutoff, the other almost a cutoff below it.
+    """Return pairs along x, one atom just below a multiple of the cutoff and the other almost a cutoff lower.
 
-    A search that assigns one of them to the next cell, as float32 does, has two cells between them.
+    A search that assigns one of these atoms to the next cell, as rounding to float32 does, finds the pair two
+    cells apart.
     """
     hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
     pairs = []
@@ -163,9 +164,10 @@ def _crowds() -> Named:
 
 
 def vast() -> Iterator[Case]:
-    """Yield cases with few atoms in a volume so large that a cell grid exceeds memory, or 32-bit indices.
+    """Yield test cases with few atoms in a volume so large that a cell grid exceeds memory or 32-bit indices.
 
-    They are for lists in a separate process: a list that allocates such a grid terminates its process.
+    These cases are for lists in a separate process, since a list that allocates such a grid terminates its
+    process.
     """
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
     yield once("two pairs thousands of cutoffs apart, free", "axes", apart)
@@ -176,8 +178,8 @@ def vast() -> Iterator[Case]:
 def lattice(edge: int, seed: int = 0) -> Case:
     """Return a cubic lattice of integers with gaps, with atoms in random order and random images.
 
-    The neighbors are the 26 sites around each site, found by indices modulo the edge, without search or
-    rounding.
+    The neighbors of each atom are on the 26 sites around it, found by indices modulo the edge, without search
+    or rounding.
 
     Args:
         edge: sites along an edge.
@@ -237,7 +239,7 @@ _FEW_IMAGES = 400  # lattice vectors that the oracle may have to try for a pair
 
 @st.composite
 def boxes(draw: Any, r_cut: float = 1.0) -> tuple[ndarray, Pbc, str]:
-    """Draw (cell, pbc, description): lattice vectors as rows, periodic axes, and the kind of box.
+    """Draw a random box as (cell, pbc, description), with lattice vectors as rows.
 
     Args:
         r_cut: cutoff that sizes are relative to, length.
@@ -269,7 +271,7 @@ def boxes(draw: Any, r_cut: float = 1.0) -> tuple[ndarray, Pbc, str]:
 
 
 def _edges(size: str, rng: np.random.Generator) -> ndarray:
-    """Return lengths of the edges in units of the cutoff."""
+    """Return random edge lengths of a box in units of the cutoff."""
     edges = rng.uniform(2.05, 6.0, 3)
     axis = rng.integers(3)
     if size == "two cutoffs":
@@ -282,7 +284,7 @@ def _edges(size: str, rng: np.random.Generator) -> ndarray:
 
 @st.composite
 def cases(draw: Any, most: int = 40) -> Case:
-    """Draw a single-moment case with at most `most` atoms."""
+    """Draw a random test case at one moment with at most `most` atoms."""
     scale = draw(st.sampled_from((1.0, 1.0, 1.0, 2.5, 6.0, 0.1, 3.405)))
     cell, pbc, words = draw(boxes(scale))
     place = draw(st.sampled_from(PLACES))
@@ -298,7 +300,7 @@ def cases(draw: Any, most: int = 40) -> Case:
 
 
 def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
-    """Return the number of lattice vectors within reach of a pair."""
+    """Return the number of lattice vectors by which a pair may be inside the cutoff."""
     if not any(pbc):
         return 1
     width = widths(completed(cell, np.array(pbc)))
@@ -308,7 +310,7 @@ def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
 def _positions(
     place: str, count: int, cell: ndarray, pbc: ndarray, r_cut: float, rng: np.random.Generator
 ) -> tuple[ndarray, float]:
-    """Return coordinates and the cutoff, which is set to a pair distance for atoms "at the cutoff"."""
+    """Return coordinates and the cutoff, which equals a pair distance for atoms "at the cutoff"."""
     full = completed(cell, pbc)
     # free axes have vectors of length 1, which would be no room
     room = np.where(pbc, 1.0, np.maximum(1.0, 3.0 * r_cut / np.linalg.norm(full, axis=1)))
@@ -356,9 +358,9 @@ def plan(
     far: bool = False,
     large: bool = False,
 ) -> list[tuple[int, Iterable[Case]]]:
-    """Return the cases for a list, in order, by parts: (number of cases, cases, some generated late).
+    """Return the test cases for a neighbor list in order, as several (number of cases, cases).
 
-    The first part has `BREADTH` cases of each area, except random cases and thousands of atoms.
+    The first part has `BREADTH` test cases of each area, except for random cases and thousands of atoms.
 
     Args:
         count: number of random cases.
@@ -387,23 +389,23 @@ def plan(
 def questions(
     tested: PairList, count: int, seed: int, padding: float | None = None, far: bool = False
 ) -> list[Case]:
-    """Return all cases of `plan`, except those with thousands of atoms."""
+    """Return all test cases of `plan`, except those with thousands of atoms."""
     return [case for _, part in plan(tested, count, seed, padding, far=far) for case in part]
 
 
 def lattices() -> Iterator[Case]:
-    """Yield lattices of 5,000 and 100,000 atoms."""
+    """Yield test cases of lattices with 5,000 and 100,000 atoms."""
     return map(lattice, (SMALL_EDGE, LARGE_EDGE))
 
 
 def as_kept(tested: PairList, asked: Iterable[Case]) -> Iterator[Case]:
-    """Yield single-moment cases, with a skin for a kept list."""
+    """Yield test cases at one moment, with a skin for a kept neighbor list."""
     for case in asked:
         yield replace(case, skin=0.3 * case.r_cut) if tested.kept else case
 
 
 def drawn(count: int, seed: int) -> list[Case]:
-    """Return cases drawn by hypothesis, the same for the same seed."""
+    """Return test cases drawn by hypothesis, the same for the same seed."""
     collected: list[Case] = []
     checks: Any = list(hypothesis.HealthCheck)
 
@@ -425,7 +427,7 @@ def drawn(count: int, seed: int) -> list[Case]:
 
 
 def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
-    """Yield variants of a case: (description, whether the answer must not change, the variant)."""
+    """Yield variants of a test case as (description, whether the answer must not change, variant)."""
     yield "when it is asked anew", True, case
     if case.atoms > 1:
         yield "with its atoms in reverse order", True, case.only(np.arange(case.atoms)[::-1])
@@ -447,7 +449,7 @@ def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
 
 
 def _wrapped(still: Still, pbc: ndarray) -> Still:
-    """Return the same atoms wrapped into the box."""
+    """Return a still with its atoms wrapped into the box."""
     if not pbc.any() or not len(still.positions):
         return still
     matrix = completed(still.cell, pbc)

@@ -1,4 +1,4 @@
-"""Write a failing case as a Python script without mdnum: the neighbor list, the numbers, brute force."""
+"""Write a failing test case as a Python script that compares a neighbor list with brute force."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def script(
     """Return a script that calls the list for a failing case and compares it with brute force.
 
     The script needs only numpy and the list; it prints the error and exits with 1, or with 0 if the list is
-    correct. An exception of the list is not caught.
+    correct. The script does not catch exceptions of the list.
 
     Args:
         how: conventions of the list.
@@ -69,7 +69,7 @@ def script(
 
 
 def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
-    """Return the case as constants in source code."""
+    """Return the numbers of a failing case as constants in Python source code."""
     case, stills = failed.case, []
     several = any(other.skin is not None for other in case.stills)
     for still, fresh, skin in _calls(case):
@@ -100,7 +100,7 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
 
 
 def _calls(case: Case) -> Iterator[tuple[Still, bool, float]]:
-    """Yield (still, whether the list is rebuilt from scratch there, its skin) at every step."""
+    """Yield (still, whether the list is allocated anew, its skin) at every step of a test case."""
     atoms = None
     for still in case.stills:
         count = len(still.positions)
@@ -118,7 +118,7 @@ _SECONDS = 60.0  # seconds that a script may take
 
 
 def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | None:
-    """Run the script of a failure, and return whether it shows the failure; None if it cannot run in time."""
+    """Run the script of a failure; return whether the failure appears, None if the script cannot run in time."""
     tested, code, text = report.tested, failed.code, failed.worst.text
     if not tested.source.strip() or deadline.passed:
         return None
@@ -145,7 +145,7 @@ def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | Non
 
 
 def _array(values: np.ndarray) -> str:
-    """Return an array as an expression that gives the same bits."""
+    """Return an array as a Python expression that evaluates to the same bits."""
     if len(values) > _PRINTED:
         sink = io.BytesIO()
         np.save(sink, np.ascontiguousarray(values))

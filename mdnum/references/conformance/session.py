@@ -69,11 +69,11 @@ class Session:
         self._returned: list[ndarray] = []
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """Return the outcome at every still, up to the first without an answer."""
+        """Return the outcome of the call at every step of a test case, up to the first without an answer."""
         return list(self.outcomes(case))
 
     def outcomes(self, case: Case) -> Iterator[CallOutcome]:
-        """Yield the outcome at every still, up to the first without an answer."""
+        """Yield the outcome of the call at every step of a test case, up to the first without an answer."""
         if self._made is None or (self.tested.kept and not self.reuse):
             try:
                 self._made = self.tested.make()
@@ -103,7 +103,7 @@ class Session:
     def _call(
         self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, skin: float | None
     ) -> CallOutcome:
-        """Make one call; a kept list is allocated if a skin is given."""
+        """Call the neighbor list once; a kept list is allocated if a skin is given, otherwise updated."""
         inputs = {"positions": positions, "cell": cell, "pbc": pbc}
         before = {name: array.copy() for name, array in inputs.items()}
         returned, self._returned = self._returned, []
@@ -156,10 +156,11 @@ def _failed(error: Exception | SystemExit, case: Case, package: str | None) -> C
 
 
 def meant(error: Exception, package: str | None = None) -> bool:
-    """Return whether an exception is a deliberate statement that a case is not supported, not an accident.
+    """Return whether an exception was raised deliberately for an unsupported input, not by accident.
 
-    A deliberate rejection keeps a program from computing with wrong pairs. An accidental exception, such as
-    a ValueError from `min()` of no distances, only shows that the input was not anticipated.
+    An exception that was raised deliberately keeps a program from computing with wrong pairs. An accidental
+    exception, such as a ValueError from `min()` of no distances, only shows that the input was not
+    anticipated.
 
     Args:
         error: with its traceback.
@@ -188,13 +189,13 @@ def meant(error: Exception, package: str | None = None) -> bool:
 
 
 def _is_own(module: str, own: str) -> bool:
-    """Return whether a module belongs to the list, rather than to Python or a common numerical library."""
+    """Return whether a module belongs to the neighbor list, not to Python or a common numerical library."""
     top = module.partition(".")[0]
     return bool(top) and (top.lower() == own or (top not in _BORROWED and top not in sys.stdlib_module_names))
 
 
 def _at_raise(place: TracebackType) -> bool:
-    """Return whether a frame is at a `raise` statement."""
+    """Return whether a stack frame is at a `raise` statement."""
     code, at = place.tb_frame.f_code.co_code, place.tb_lasti
     if 0 <= at < len(code) and dis.opname[code[at]] == "RAISE_VARARGS":
         return True
@@ -204,7 +205,7 @@ def _at_raise(place: TracebackType) -> bool:
 
 
 def _called_module(place: TracebackType) -> str:
-    """Return the module of the compiled function that a frame is calling; empty if there is none."""
+    """Return the name of the module whose compiled function a stack frame is calling, or ""."""
     code = place.tb_frame.f_code
     where = next(islice(code.co_positions(), max(0, place.tb_lasti // 2), None), (None,) * 4)
     first, last, left, right = where
@@ -232,7 +233,7 @@ def _called_module(place: TracebackType) -> str:
 
 
 def _value(name: ast.expr, place: TracebackType) -> Any:
-    """Return the value of a name, or of its attribute, in the frame of an exception; None if unclear."""
+    """Return the value of a name, or of its attribute, in the stack frame of an exception, or None."""
     if isinstance(name, ast.Attribute):
         return getattr(_value(name.value, place), name.attr, None)
     if not isinstance(name, ast.Name):
@@ -243,9 +244,9 @@ def _value(name: ast.expr, place: TracebackType) -> Any:
 
 
 class RemoteSession:
-    """Session for a named list in a separate process.
+    """Calls of one named neighbor list in a separate process.
 
-    A new process is started after each one that ended, since a crash is a finding and must not end the suite.
+    A new process is started after a process has ended, since a crash is a finding and must not end the suite.
     """
 
     most = np.inf  # seconds that an answer may take, where that is less than usual
@@ -342,7 +343,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Kill a process that did not answer within its time; `late` then describes the delay."""
+    """Kill a process that does not answer within its time limit; `late` then describes the delay."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):
@@ -380,7 +381,7 @@ def _received(stream: BinaryIO | Any) -> Any:
 
 
 def serve(word: str, parent: int) -> None:
-    """Answer cases from stdin with the named list: the main function of a `RemoteSession` process."""
+    """Run test cases from stdin on a named list; the main function of a `RemoteSession` process."""
     from mdnum.references.conformance.peers import load
 
     # a list may print: what it writes to stdout must not be taken for an answer

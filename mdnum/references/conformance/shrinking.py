@@ -1,4 +1,4 @@
-"""Reduce a failing case to a few atoms, few steps and round numbers that fail in the same way."""
+"""Reduce a failing test case to a few atoms, few steps and round numbers that fail in the same way."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ Failures = Callable[[Case], Sequence[Failure]]
 
 
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
-    """Return the smallest case found before the deadline that fails with the same code.
+    """Return the smallest test case, found before the deadline, that fails with the same code.
 
-    `failures` evaluates the list, with a new object of a kept list for each case.
+    `failures` runs a test case on the neighbor list, with a new object if the list is kept.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)
@@ -73,13 +73,13 @@ def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None)
 
 
 def _only(case: Case, atoms: list[int]) -> Case:
-    """Return the case with only some atoms; small cases drop the pairs known in closed form."""
+    """Return the test case with only some atoms; a small case discards its precomputed pairs."""
     smaller = case.only(np.array(atoms, int))
     return replace(smaller, known=None) if len(atoms) <= 400 else smaller
 
 
 def _sensible(case: Case) -> bool:
-    """Return whether a case is valid: finite numbers, a nonsingular box, not too many images."""
+    """Return whether a test case has finite numbers, a nonsingular box and not too many images."""
     pbc = np.array(case.pbc)
     if not (0 < case.r_cut < np.inf and all(np.isfinite(still.positions).all() for still in case.stills)):
         return False
@@ -98,7 +98,7 @@ def _sensible(case: Case) -> bool:
 
 
 def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
-    """Yield simplifications: fewer periodic axes, right angles, fewer digits, coordinates set to 0."""
+    """Yield functions that simplify a test case: fewer periodic axes, right angles, fewer digits, zeros."""
     for axis in range(3):
         yield lambda case, axis=axis: replace(
             case, pbc=tuple(on and n != axis for n, on in enumerate(case.pbc)), known=None
@@ -128,9 +128,10 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 
 
 def deepest(failures: Failures, failed: Failed) -> Failed:
-    """Follow a missing pair inside the cutoff as far as it remains missing.
+    """Move a missing pair closer together as long as the pair remains missing.
 
-    The pair continues its motion, so that the reported case has the smallest distance of a missing pair.
+    The pair continues its motion, so that the reported failure has the smallest distance at which the pair is
+    missing.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
@@ -147,7 +148,7 @@ def deepest(failures: Failures, failed: Failed) -> Failed:
 
 
 def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline) -> Failed:
-    """Return a failure reduced to few atoms and calls, whose script was run if possible."""
+    """Reduce a failure to few atoms and calls, and run its script if possible."""
 
     def failures(case: Case) -> Sequence[Failure]:
         with suppress(TimeUp):
@@ -175,7 +176,7 @@ def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadli
 def _needing(
     examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline
 ) -> Failed | None:
-    """Find the earlier cases that a new process needs to show a failure; None if there are none."""
+    """Find earlier test cases that a new process must run before a failure appears; None if there are none."""
     session, began = examiner.session, time.perf_counter()
 
     def fails(cases: Sequence[Case]) -> bool:

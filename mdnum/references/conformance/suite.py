@@ -1,4 +1,4 @@
-"""Run the conformance suite on one neighbor list: its correct answers, and the first failure of each kind."""
+"""Run the conformance suite on one neighbor list, and keep the first failure of each kind."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Examiner:
             self._find_conventions()
 
     def _find_conventions(self) -> None:
-        """Determine from simple cases whether the list is full, and the signs of shifts and vectors."""
+        """Determine from simple cases whether a neighbor list is full, and the signs of shifts and vectors."""
         tested, report = self.tested, self.report
         full, sign, toward = tested.full, 1, 1
         triple = once("a triple through a face", "few", [[0.2, 2, 2], [3.8, 2.1, 2], [0.5, 2.4, 2.2]], 4.0)
@@ -103,10 +103,10 @@ class Examiner:
             self._find_padding()
 
     def _find_padding(self) -> None:
-        """Determine whether a kept list returns the pairs in its skin, and how far it is complete.
+        """Determine whether a kept list returns the pairs in its skin, and how far the list is complete.
 
-        The padding is the distance of the nearest missing pair beyond the cutoff, or the value the list
-        states.
+        The padding is the stated one, or the distance from the cutoff to the nearest pair missing from the
+        list.
         """
         report = self.report
         crowd = replace(once("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
@@ -137,7 +137,7 @@ class Examiner:
             report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
 
     def unusable(self) -> str | None:
-        """Return why every simple case raised an exception or gave a malformed answer, or None."""
+        """Return why every simple test case raised an exception or gave a malformed answer, or None."""
         reasons = [
             f"asked about {case.name}, {'it raised ' * (why.code == 'RAISED')}{why.text}"
             for case, outcome in self.opening
@@ -146,11 +146,11 @@ class Examiner:
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """Return the errors of a case within the limits, at the first step with an error."""
+        """Return the errors of a test case within the declared limits, at the first step with an error."""
         return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
-        """Run a case; an accidental exception is a failure, but a deliberate rejection is not."""
+        """Run a test case; an accidental exception is a failure, but a deliberate rejection is not."""
         began = time.perf_counter()
         outcomes = self.session.ask(case)
         result = CaseResult(case.name, seconds=time.perf_counter() - began)
@@ -172,7 +172,7 @@ class Examiner:
         return result
 
     def take(self, case: Case, result: CaseResult) -> None:
-        """Record the result of a case."""
+        """Record the result of a test case, with the smallest rejected case of each kind."""
         self.report.take(case, result)
         if result.refused is not None:
             step, words = result.refused
@@ -184,7 +184,7 @@ class Examiner:
     def _judge(
         self, case: Case, step: int, answer: ListAnswer, how: Conventions
     ) -> tuple[list[Failure], tuple[float, float] | None, tuple[int, int]]:
-        """Return (failures, error if correct only in float32, numbers of ties listed and not listed)."""
+        """Return the failures, the error if correct only in float32, and the counts of pairs at the cutoff."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
@@ -209,7 +209,7 @@ class Examiner:
 
 
 def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
-    """Count pairs at exactly the cutoff, listed and not listed, in a case without rounding."""
+    """Return the numbers of listed and unlisted pairs at exactly the cutoff, for a case without rounding."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
         return 0, 0  # on small integers no arithmetic rounds
@@ -224,7 +224,7 @@ def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
 
 
 def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
-    """Return the exact pairs at a step, including those listed correctly since the list was built."""
+    """Return the exact pairs at a step, with all pairs listed correctly since the list was built."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
@@ -357,7 +357,7 @@ def examine(
 
 
 def _keeps_order(examiner: Examiner) -> bool | None:
-    """Return whether three identical calls give the same rows in the same order; None without an answer."""
+    """Return whether three identical calls list the same pairs in the same order; None without an answer."""
     for case in (once("order", "reuse", gas(40, 6.0, 120), 6.0), once("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
@@ -368,7 +368,7 @@ def _keeps_order(examiner: Examiner) -> bool | None:
 
 
 def _too_long(report: Report, case: Case) -> str | None:
-    """Return why a large case is skipped, from its expected time by the previous one; None if it is not."""
+    """Return why a large test case would take too long, estimated from the previous one, or None."""
     if report.large is None:
         return None
     atoms, seconds = report.large
@@ -378,9 +378,9 @@ def _too_long(report: Report, case: Case) -> str | None:
 
 
 def _refusals(examiner: Examiner) -> list[RefusalKind]:
-    """Return each kind of rejection, with the variants of the same case that are answered.
+    """Return each kind of rejected test case, with its variants that are answered.
 
-    Each variant is run in a new process, or with a new object.
+    Each variant of the test case is run in a new process, or with a new object.
     """
     found = []
     for refusal in list(examiner.refused.values())[:_REFUSALS]:
@@ -396,7 +396,7 @@ def _refusals(examiner: Examiner) -> list[RefusalKind]:
 
 
 def distinct(failed: Iterable[Failed]) -> list[Failed]:
-    """Return the smallest failure of each kind, since one error appears in many areas.
+    """Return the smallest failure of each kind, since one error appears in many test cases.
 
     Failures with the same code and equal numbers of atoms, steps and periodic axes are taken for one error;
     exceptions and malformed answers are compared by message, ignoring numbers.
