@@ -62,12 +62,12 @@ class FrameComparison:
 
     @property
     def energy_roundings(self) -> float:
-        """Energy difference in units of the expected rounding."""
+        """Energy difference in units of the expected rounding error."""
         return _over(abs(self.energy - self.energy_reference), self.energy_expected)
 
     @property
     def force_roundings(self) -> float:
-        """Largest force difference in units of the expected rounding."""
+        """Largest force difference in units of the expected rounding error."""
         return _over(self.force_max, self.force_expected)
 
 
@@ -91,7 +91,7 @@ class EnergyReport:
 
     @property
     def worst(self) -> dict[str, Any]:
-        """Largest deviations over all frames, under the names of summary.json's `ase`."""
+        """Largest deviations over all frames, under the names used by `ase` in summary.json."""
         stress = [frame.stress_max for frame in self.frames if frame.stress_max is not None]
         names = ("energy_rel", "force_max", "force_scale")
         worst = {name: max(getattr(frame, name) for frame in self.frames) for name in names}
@@ -99,7 +99,7 @@ class EnergyReport:
         return worst if self.sampled is None else {**worst, "sampled": self.sampled}
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a table row per frame."""
+        """Return one table row per compared frame."""
         narrow = {"energy, roundings": "energy_roundings", "force, roundings": "force_roundings"}
         columns = {
             "energy": "energy", "energy, relative": "energy_rel", "force, largest": "force_max",
@@ -173,13 +173,13 @@ def check_energy(
 
 
 def narrowest(simulation: Simulation, roles: Sequence[str] = ("state", "force", "accumulate")) -> str:
-    """Return the narrowest float type of some roles; by default those that affect energies and forces."""
+    """Return the narrowest float type of several roles, by default those of energies and forces."""
     kinds = (carrier(getattr(simulation.policy, role)) for role in roles)
     return max(map(str, kinds), key=unit_roundoff)
 
 
 def _places(simulation: Simulation) -> str:
-    """Return the narrowest float type of positions: 16-bit forces use the displacements of the decision."""
+    """Return the narrowest float type of positions; 16-bit forces use the decision's displacements."""
     wide = simulation.policy.force in WIDE
     return narrowest(simulation) if wide else narrowest(simulation, ("state", "decision"))
 
@@ -211,7 +211,7 @@ def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Eval
 
 
 def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:
-    """Return the evaluation of a cluster's first atoms, taken from the whole; the pairs are the cluster's."""
+    """Return the evaluation of a cluster's first atoms in the whole system, with the cluster's pairs."""
     edges = edges_of(cluster, r_cut)
     once = edges.i < edges.j
     pairs = edges.i[once], edges.j[once], edges.r[once]
@@ -256,7 +256,7 @@ def _off(mine: Evaluation, other: Mapping[str, Any], scale: float) -> tuple[floa
 
 
 def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
-    """Return energy and forces of the first atoms only."""
+    """Return energy and forces of the first `count` atoms only."""
     if len(results["forces"]) == count:
         return results
     energies = results["energies"][:count]
@@ -265,16 +265,16 @@ def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
 
 
 def _over(difference: float, scale: float) -> float:
-    """Return difference / scale, which is 0 for a zero difference at any scale."""
+    """Return difference / scale, and 0 for a zero difference at any scale."""
     return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
 
 
 @dataclass(frozen=True)
 class _Scales:
-    """Scales against which differences are measured.
+    """Scales by which energy, force and stress differences are divided.
 
-    energy: sum of |energies|; force: largest force on an atom or along a pair; stress: virial without
-    cancellation over the volume; *_expected: differences expected from rounding.
+    energy: sum of |energies|; force: largest force on an atom or along a pair; stress: sum of absolute virial
+    terms over the volume; *_expected: differences expected from rounding.
     """
 
     energy: float
@@ -286,7 +286,7 @@ class _Scales:
 
     @classmethod
     def of(cls, simulation: Simulation, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]) -> _Scales:
-        """Return the scales of a frame; pair by pair for a pair potential, else from the totals."""
+        """Return the scales of a frame, summed over pairs for a pair potential, else from the totals."""
         unit, places = unit_roundoff(narrowest(simulation)), unit_roundoff(_places(simulation))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
@@ -330,7 +330,7 @@ class _Scales:
 
 
 def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
-    """Return the number of pairs within rounding error of their cutoff, on either side."""
+    """Return the number of pairs within rounding error of their cutoff, inside or outside."""
     bound = rounding_bound(atoms.get_positions(), np.asarray(atoms.cell), model.reach, unit_roundoff=unit)
     # as the judges asked for it, where that has the room: the list is made once
     edges = edges_of(atoms, model.reach + (bound if bound > SLACK / 2 * model.reach else 0.0))
@@ -384,7 +384,7 @@ class DynamicsReport:
     ok: bool  # within tolerance at the last step
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a table row for about ten of the steps."""
+        """Return table rows for about ten of the time steps."""
         shown = np.unique(np.linspace(0, self.steps, 11).round().astype(int)).tolist()
         return [
             {
@@ -398,8 +398,8 @@ class DynamicsReport:
 def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
     """Compare a rollout with ASE's velocity Verlet, from the same positions and velocities.
 
-    A thermostat is switched off. A hard cutoff has the same forces as ASE's shifted one, so the trajectories
-    must agree although the zeros of energy differ.
+    A thermostat is switched off. A hard cutoff gives the same forces as ASE's shifted potential, so the
+    trajectories must agree although the zeros of energy differ.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
@@ -435,7 +435,7 @@ def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = 
 
 
 def _forces(simulation: Simulation) -> Reference:
-    """Return ASE's class where it is fast enough; Tersoff and sums over species use plain numpy."""
+    """Return ASE's class as the reference if it is fast enough; Tersoff and mixtures use plain numpy."""
     judge = reference(simulation)
     slow = isinstance(simulation.model, Tersoff) or len(simulation.symbols) > 1
     return independent(simulation) if slow and not isinstance(simulation.potential, EmbeddedAtom) else judge
@@ -447,7 +447,7 @@ def _sudden(position: Sequence[float], floor: float) -> int | None:
 
 
 def _growth(position: Sequence[float]) -> float:
-    """Return the growth factor per step, from a line fit to log(deviation) over the second half."""
+    """Return the growth factor of the deviation per step, from a line fit to its logarithm."""
     tail = np.array(position[len(position) // 2 :])
     if len(tail) < 3 or not (tail > 0).all():
         return 1.0
@@ -462,7 +462,7 @@ PLACES, ATOMS = 8, 32  # places at random, and atoms nearest to each whose energ
 def neighborhoods(
     atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
 ) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
-    """Yield free clusters around random places: groups of atoms with every atom within their reach.
+    """Yield free clusters at random places: a group of atoms with all atoms within reach of the group.
 
     For a pair potential of that reach, the chosen atoms have the same energies and forces in the cluster as
     in the whole system, so a difference in the cluster is a difference in the whole. Neighbors are found by

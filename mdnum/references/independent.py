@@ -1,10 +1,10 @@
 """Energies, forces and stress in plain numpy on ASE's neighbor list, from the formulas alone.
 
-This code is independent of the code used in a run (each cutoff has its own numpy `reference`): it is the
-reference if ASE has no class for a potential or a cutoff, and a third calculation if ASE has one.
+This code is independent of the code used in a run (each cutoff has its own numpy `reference`): it serves as
+the reference if ASE has no class for a potential or a cutoff, and as a third calculation if ASE has one.
 
-A model gets directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
-the total energy with respect to every d. Forces and stress follow from this gradient in one function:
+A model takes directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
+the total energy with respect to every d. Forces and stress follow from this gradient g in one function, by
 F_i += g, F_j -= g, stress = sum(g outer d) / volume.
 """
 
@@ -44,11 +44,11 @@ SLACK = 1e-12  # what `edges_of` adds to the length it is asked for, relative
 
 
 def edges_of(atoms: Atoms, reach: float) -> Edges:
-    """Return both directions of every pair within slightly more than `reach`, from ASE.
+    """Return the pairs within slightly more than `reach`, in both directions, from ASE's neighbor list.
 
     ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster at 500 atoms than its
-    neighbor_list. It is strict (r < reach), while the model decides whether the cutoff itself is inside, so
-    the list reaches slightly farther, by SLACK.
+    neighbor_list. ASE's comparison is strict (r < reach), while the model decides whether the cutoff itself
+    is inside, so the list reaches slightly farther, by SLACK.
     """
     arrays = (atoms.positions, atoms.numbers, atoms.cell.array, atoms.pbc)
     key = (*(array.tobytes() for array in arrays), reach)
@@ -84,7 +84,7 @@ class Model(ABC):
     @property
     @abstractmethod
     def reach(self) -> float:
-        """Length beyond which an edge has no effect."""
+        """Length beyond which an edge (a directed pair) has no effect."""
 
     @abstractmethod
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
@@ -98,13 +98,13 @@ class ClassicalCalculator(Calculator):
     nolabel = True
 
     def calculate(self, atoms=None, properties=None, system_changes=all_changes):
-        """Evaluate (see ase.calculators.calculator.Calculator)."""
+        """Evaluate a structure, as defined by ase.calculators.calculator.Calculator."""
         super().calculate(atoms, properties or ["energy"], system_changes)
         results = self.evaluated(cast(Atoms, self.atoms), system_changes)
         self.results = {"free_energy": results["energy"], **results}
 
     def evaluated(self, atoms: Atoms, changes: Sequence[str]) -> dict[str, Any]:
-        """Return the results for atoms, given the changes since the last call."""
+        """Return energy, forces and stress of a structure, given its changes since the last call."""
         raise NotImplementedError
 
 
@@ -158,7 +158,7 @@ class PairForm:
 
     @property
     def at_cutoff(self) -> tuple[float, float]:
-        """The values u and u' of the bare potential at the cutoff."""
+        """Values u and u' of the bare potential at the cutoff."""
         u, du = self.bare(np.array([self.r_cut]))
         return float(u[0]), float(du[0])
 
@@ -209,14 +209,14 @@ _BARE: dict[type, Callable[..., tuple[ndarray, ndarray]]] = {
 
 @dataclass(frozen=True)
 class PairModel(Model):
-    """Any pair potential with any cutoff, for each pair of species, or a sum of several."""
+    """A pair potential with any cutoff for each pair of species, or a sum of several such potentials."""
 
     #: of each term its forms (see `pair_forms`) and the weights of the atoms, None for 1
     terms: Sequence[tuple[Mapping[tuple[str, str], PairForm], Any]]
 
     @classmethod
     def of(cls, model: CutPotential | Channels, symbols: Sequence[str], compare: str) -> PairModel:
-        """Return the model of a cut potential; arguments as for `pair_forms`."""
+        """Return the model of a cut potential, with arguments as for `pair_forms`."""
         parts = model.terms.values()
         weights = [np.asarray(part.weights[0]) if part.weights else None for part in parts]
         forms = [pair_forms(part, symbols, compare) for part in parts]
@@ -260,7 +260,7 @@ def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
 
 
 def _cosines(edges: Edges, e: ndarray, f: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Return cos of the angle between edges e and f, with its gradients with respect to d_e and d_f."""
+    """Return cosines of the angles between edges e and f, with gradients with respect to d_e and d_f."""
     re, rf = edges.r[e], edges.r[f]
     ne, nf = edges.d[e] / re[:, None], edges.d[f] / rf[:, None]
     cosine = np.einsum("ta,ta->t", ne, nf)
@@ -273,7 +273,7 @@ def _add_rows(target: ndarray, rows: ndarray, values: ndarray) -> None:
 
 
 class _OneSpecies(Model):
-    """A model of all edges within its reach, regardless of species."""
+    """A model that includes all edges within its reach, regardless of species."""
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:
@@ -288,7 +288,7 @@ class _OneSpecies(Model):
 
 @dataclass(frozen=True)
 class StillingerWeberModel(_OneSpecies):
-    """Stillinger-Weber silicon (Phys. Rev. B 31, 5262, 1985, equations 2.1 to 2.5).
+    """Stillinger-Weber potential of silicon, equations 2.1 to 2.5 of Physical Review B 31, 5262 (1985).
 
     Attributes: the constants of the paper; epsilon in eV, sigma in Å.
     """
@@ -336,7 +336,7 @@ class StillingerWeberModel(_OneSpecies):
 
 @dataclass(frozen=True)
 class TersoffModel(_OneSpecies):
-    """Tersoff's bond-order potential for one species (Phys. Rev. B 38, 9902, 1988), in LAMMPS notation.
+    """Tersoff's bond-order potential for one species, Physical Review B 38, 9902 (1988), in LAMMPS notation.
 
     Attributes: the 14 constants of a LAMMPS or ASE entry; the default is Tersoff's T3 silicon.
     """

@@ -1,4 +1,4 @@
-"""LAMMPS as a reference for pair functions, whose formulas its pair style `lepton` differentiates.
+"""LAMMPS as a reference for pair functions, evaluated and differentiated by its pair style `lepton`.
 
 The function traced by jax is written as an expression that LAMMPS parses and differentiates symbolically, so
 pairs, sums, energies and derivatives are computed by an independent program.

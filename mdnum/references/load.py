@@ -1,7 +1,7 @@
-"""Load a Python object by name: `package.module:thing(argument=value)` or `file.py:thing(argument=value)`.
+"""Load a Python object named by `package.module:thing(argument=value)` or `file.py:thing(argument=value)`.
 
-A module is imported or a file executed, a name is looked up, and the object is called if arguments are given.
-Arguments are literals; nothing else is evaluated.
+A module is imported or a file executed, the name is looked up, and the named object is called if arguments
+are given. Arguments are literals; nothing else is evaluated.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _counter = itertools.count()
 
 @dataclass(frozen=True)
 class NamedObject:
-    """Location of an object, as written by the user."""
+    """Location of a Python object, as written by the user."""
 
     text: str  # the words
     home: str  # a module, or the path of a Python file
@@ -33,12 +33,12 @@ class NamedObject:
 
     @property
     def is_file(self) -> bool:
-        """Whether `home` is a file, which is executed, rather than a module, which is imported."""
+        """Whether `home` is a Python file, which is executed, and not a module, which is imported."""
         return self.home.endswith(".py")
 
     @property
     def name(self) -> str:
-        """Last part of the dotted name, without arguments; the stem of the file if there is no name."""
+        """Last part of the object's dotted name, without arguments; the stem of the file without a name."""
         return self.call.partition("(")[0].rpartition(".")[2].strip() or Path(self.home).stem
 
     def find(self, defaults: Sequence[str] = (), anew: bool = False) -> Any:
@@ -77,7 +77,7 @@ class NamedObject:
             ) from error
 
     def source(self) -> tuple[str, str]:
-        """Return (import lines, an expression for the object), for a script without mdnum."""
+        """Return import lines and an expression for the object, for a script without mdnum."""
         first = self.call.partition("(")[0].partition(".")[0].strip()
         if not self.is_file:
             return f"from {self.home} import {first}\n", self.call
@@ -121,7 +121,7 @@ class NamedObject:
         raise InputError(f"{self.home} is a file{lacks}", remedy=has)
 
     def _attribute(self, node: ast.expr, module: ModuleType) -> Any:
-        """Return the object of a dotted name."""
+        """Return the object that a dotted name refers to."""
         parts: list[str] = []
         while isinstance(node, ast.Attribute):
             parts.append(node.attr)
@@ -164,6 +164,6 @@ def place(text: str) -> NamedObject | None:
 
 
 def public(scope: Any) -> list[str]:
-    """Return the public callable names in a module or a class."""
+    """Return the names of the public callables in a module or a class."""
     scope = scope if isinstance(scope, ModuleType | type) else type(scope)
     return [name for name in vars(scope) if name[0] != "_" and callable(getattr(scope, name, None))]

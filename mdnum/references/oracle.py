@@ -1,4 +1,4 @@
-"""Find the pairs inside a cutoff by brute force, and exactly near the threshold."""
+"""Find the pairs inside a cutoff by brute force, with exact arithmetic near the cutoff."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BLOCK = 2_000_000  # pairs and images looked at in one go: 48 MB of displacemen
 
 @dataclass(frozen=True)
 class PairSet:
-    """Pairs of atoms and periodic images, each once."""
+    """Pairs of atoms, including periodic images, with each pair listed once."""
 
     i: Int[ndarray, "pairs"]  # first atom; i <= j
     j: Int[ndarray, "pairs"]  # second atom; i == j for an atom and an image of itself
@@ -36,7 +36,7 @@ class PairSet:
         return len(self.i)
 
     def select(self, mask: Bool[ndarray, "pairs"]) -> PairSet:
-        """Return the pairs where mask is true."""
+        """Return the pairs for which `mask` is true."""
         columns = self.i, self.j, self.shift, self.distance, self.inside, self.exact
         return PairSet(*(column[mask] for column in columns))
 
@@ -51,9 +51,9 @@ def rounding_bound(
 ) -> float:
     """Upper bound on the rounding error of a computed distance near r_cut, in the length unit.
 
-    Covers a code that wraps the coordinates, adds a lattice vector, subtracts and takes the norm: each
-    operation acts on numbers no larger than the coordinates plus the cell and rounds each once or twice.
-    Typical errors are ten times smaller than this bound.
+    The bound holds for a code that wraps the coordinates, adds a lattice vector, subtracts and takes the
+    norm: each operation acts on numbers no larger than the coordinates plus the cell and rounds each once or
+    twice. Typical errors are ten times smaller than this bound.
 
     Args:
         positions: coordinates as given to the code.
@@ -82,7 +82,7 @@ def exact_squared_distance(
 def exactly_inside(
     positions: Positions, cell: Vectors, i: int, j: int, shift: Shift, r_cut: float, *, closed: bool = False
 ) -> bool:
-    """Decide in exact arithmetic whether the pair is inside r_cut; closed counts r == r_cut as inside.
+    """Decide in exact arithmetic whether a pair is inside r_cut; `closed` counts r == r_cut as inside.
 
     In exact arithmetic r < r_cut and r² < r_cut² are equivalent: they differ only through rounding.
     """
@@ -103,8 +103,8 @@ def all_pairs(
 
     No cell list or skin is used: all atom pairs are tested with every lattice vector that could bring them
     together, so the result is valid for triclinic cells, periodicity per axis, atoms outside the cell and
-    cells smaller than the cutoff (a pair then appears once per image). The cost is proportional to atoms², by
-    design.
+    cells smaller than the cutoff (a pair then appears once per image). The cost is proportional to the square
+    of the number of atoms, by design.
 
     Args:
         positions: coordinates, wrapped or not.

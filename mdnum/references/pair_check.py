@@ -31,7 +31,7 @@ _NEARBY = 3  # ulps either side of r_cut in which oriented pairs are placed
 
 @dataclass(frozen=True)
 class Search:
-    """A neighbor list, called with positions and cell in the form that it requires."""
+    """A neighbor list that is called with positions and cell in the form that the list requires."""
 
     listed: PairList
 
@@ -42,7 +42,7 @@ class Search:
 
     @property
     def ours(self) -> bool:
-        """Whether the search is mdnum's own, on which a run depends."""
+        """Whether the search is mdnum's own, so that a run depends on its result."""
         return self.listed.package == "mdnum"
 
     @property
@@ -56,7 +56,7 @@ class Search:
 
     @cached_property
     def _full(self) -> bool:
-        """Whether the search lists every pair from both of its atoms."""
+        """Whether the search lists every pair twice, once from each atom."""
         if self.listed.full is not None:
             return self.listed.full
         pair, cell, pbc = np.array([[0.0, 0, 0], [0.5, 0, 0]]), 4.0 * np.eye(3), np.ones(3, bool)
@@ -65,14 +65,14 @@ class Search:
         return len(read(self._call(pair, cell, pbc, 1.0))) > 1
 
     def refusal(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> str | None:
-        """Return why the search does not support these atoms, or None if it does."""
+        """Return why the search does not support a structure, or None if the structure is supported."""
         if self.listed.version is None:
             return "not installed"
         positions, cell = self._placed(positions, cell, pbc)
         return self.listed.limits.refusal(once("", "few", positions, cell, pbc.tolist(), r_cut))
 
     def pairs(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> tuple[ndarray, ndarray]:
-        """Return (i, j) of the pairs within r_cut, one row for each image, i <= j."""
+        """Return arrays i and j of the pairs within r_cut, one entry for each image, i <= j."""
         positions, cell = self._placed(np.asarray(positions, float), np.asarray(cell, float), pbc)
         answer = read(self._call(positions, cell, np.array(pbc), float(r_cut)))
         i, j = np.minimum(answer.i, answer.j), np.maximum(answer.i, answer.j)
@@ -83,7 +83,7 @@ class Search:
         return i, j
 
     def _placed(self, positions: ndarray, cell: ndarray, pbc: ndarray) -> tuple[ndarray, ndarray]:
-        """Return positions and cell in the form that the list requires, with the same distances."""
+        """Return positions and cell in the form that the neighbor list requires, with the same distances."""
         limits = self.listed.limits
         positions, cell = np.array(positions), np.where(np.asarray(pbc)[:, None], cell, 0.0)
         if limits.whole_cell and pbc.any():
@@ -107,16 +107,16 @@ class Search:
 
 
 def all_searches(system: Simulation) -> tuple[Search, ...]:
-    """Return mdnum's own searches, with the comparison of a system, and those of other libraries."""
+    """Return mdnum's own neighbor searches, with the comparison of a system, and those of other libraries."""
     own = own_searches(system)
     return (*own, *(Search(one) for one in known() if not one.kept and one.package != "mdnum"))
 
 
 def own_searches(system: Simulation) -> tuple[Search, ...]:
-    """Return the searches that mdnum uses for this system.
+    """Return the neighbor searches of mdnum, set up for this system.
 
-    "mdnum force loop" is the set of decisions that multiply the forces, outside jit. The other two are its
-    list builders with the same decision made on the host.
+    "mdnum force loop" is the cutoff decision of the force evaluation, outside jit. "mdnum, host list" and
+    "mdnum, jax-md list" are mdnum's list builders with the same cutoff decision made on the host.
     """
     compare, dtype = system.decider.compare, system.policy.decision
     unit = _SINGLE if "float32" in (dtype, system.policy.state) else 2.0**-53
@@ -147,7 +147,7 @@ def _force_loop(system: Simulation) -> Callable[..., Any]:
 
 
 def _variant(system: Simulation, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> Simulation:
-    """Return the system itself, or two of its atoms with r_cut for all pairs, without a skin."""
+    """Return the simulation, or one of two atoms with cutoff r_cut, without a skin."""
     species = system.structure.numbers
     if len(positions) != system.atoms:
         # the pair of species whose radius r_cut is; a pair at the cutoff is far from any core
@@ -208,7 +208,7 @@ class SearchResult:
 
 @dataclass(frozen=True)
 class PairsReport:
-    """Comparison of the pairs found by all searches with brute force."""
+    """Comparison of the pairs found by all neighbor searches with brute force."""
 
     system: str  # name
     compare: str  # what inside means in this system
@@ -219,11 +219,11 @@ class PairsReport:
 
     @property
     def ok(self) -> bool:
-        """Whether mdnum's own searches agree, except within rounding."""
+        """Whether mdnum's own searches agree with brute force, except within rounding error."""
         return all(one.verdict in (AGREES, AT_THE_CUTOFF, NOT_ASKED) for one in self.results if one.ours)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a table row per search."""
+        """Return one table row per neighbor search."""
         counts = ("pairs", "missing", "extra", "borderline")
         return [
             {"search": one.name, "version": one.version}
@@ -244,11 +244,11 @@ def check_pairs(
     searches: Sequence[Search] | None = None,
     effective: bool = True,
 ) -> PairsReport:
-    """Compare the pairs that every search finds inside the cutoff with brute force.
+    """Compare the pairs that every neighbor search finds inside the cutoff with brute force.
 
     A search runs once for each cutoff radius of the species pairs. Brute force uses the comparison of the
-    system file, decided in rational arithmetic near the threshold; a search that decides such a pair
-    differently is "at the cutoff", which is rounding or convention and not an error.
+    system file, in rational arithmetic near the cutoff; a search that decides only such pairs differently
+    "differs at the cutoff", which is rounding or convention and not an error.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
@@ -338,7 +338,7 @@ class EffectiveCutoff:
 
     @property
     def stops(self) -> str:
-        """Deviation of the effective cutoff from r_cut, as text."""
+        """Deviation of the effective cutoff from the requested cutoff, as text."""
         if abs(self.ulps) < 1000:
             return f"{self.ulps:+d} ulp"
         return f"{self.last_counted / self.r_cut - 1:+.1e} relative"
@@ -350,7 +350,8 @@ def effective_cutoff(
     """Bisect two-atom configurations to the last double that a search counts as inside r_cut.
 
     The two atoms differ along x only and the first has x = 0, so their distance is the coordinate itself and
-    only the search is measured; in a periodic box (5 r_cut wide) its own wrapping is included.
+    the result depends on the search alone; in a periodic box (5 r_cut wide) this includes the search's own
+    wrapping.
 
     Args:
         periodic: use a periodic box, as in a simulation; else free atoms.

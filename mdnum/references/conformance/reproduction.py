@@ -118,7 +118,7 @@ _SECONDS = 60.0  # seconds that a script may take
 
 
 def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | None:
-    """Run the script of a failure; return whether the failure appears, None if the script cannot run in time."""
+    """Run the script of a failure; return whether the failure appears, None if time runs out."""
     tested, code, text = report.tested, failed.code, failed.worst.text
     if not tested.source.strip() or deadline.passed:
         return None

@@ -176,7 +176,7 @@ def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadli
 def _needing(
     examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline
 ) -> Failed | None:
-    """Find earlier test cases that a new process must run before a failure appears; None if there are none."""
+    """Find earlier test cases that a new process must run to show a failure; None if there are none."""
     session, began = examiner.session, time.perf_counter()
 
     def fails(cases: Sequence[Case]) -> bool:

@@ -72,7 +72,7 @@ class Examiner:
             self._find_conventions()
 
     def _find_conventions(self) -> None:
-        """Determine from simple cases whether a neighbor list is full, and the signs of shifts and vectors."""
+        """Determine from simple cases whether the list is full, and the signs of its shifts and vectors."""
         tested, report = self.tested, self.report
         full, sign, toward = tested.full, 1, 1
         triple = once("a triple through a face", "few", [[0.2, 2, 2], [3.8, 2.1, 2], [0.5, 2.4, 2.2]], 4.0)
@@ -184,7 +184,7 @@ class Examiner:
     def _judge(
         self, case: Case, step: int, answer: ListAnswer, how: Conventions
     ) -> tuple[list[Failure], tuple[float, float] | None, tuple[int, int]]:
-        """Return the failures, the error if correct only in float32, and the counts of pairs at the cutoff."""
+        """Return the failures, the error if correct only in float32, and counts of pairs at the cutoff."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
