@@ -128,7 +128,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return the crystal of the first supported element; if `paired`, walk a pair of its atoms first."""
+        """Return the crystal of the first supported element; `paired` tests two atoms of an element first."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():

@@ -74,7 +74,7 @@ class NoiseFloor:
 
     @property
     def allowed(self) -> NoiseFloor:
-        """Largest difference allowed between two answers; every comparison with noise uses this value.
+        """Largest allowed difference of energies and of forces; every comparison with noise uses these values.
 
         A standard deviation estimated from few values may be far too small by chance; the limit uses
         Student's t distribution to account for this.
@@ -163,7 +163,7 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
 
 
 def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
-    """Return the noise due to steps in the answers and to the number of digits they carry."""
+    """Return the noise due to discrete steps and to the number of digits of energies and forces."""
     stairs = steps(subject, atoms)
     energies = stairs.energies
     grain = max(stairs.energy, digits(energies).grain(energies), _quantum(energies))
@@ -387,10 +387,10 @@ def digits(values: np.ndarray) -> Digits:
 
 
 def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
-    """Yield a finding, QUANTIZED or LOW_PRECISION, if answers carry fewer digits than a double.
+    """Yield a finding, QUANTIZED or LOW_PRECISION, if energies or forces carry fewer digits than a double.
 
-    Steps in the answers are measured along a line and not inferred from the digits: forces that were rounded
-    before a unit conversion, or computed from rounded positions, use all digits of a double.
+    Discrete steps are measured along a line and not inferred from the digits: forces that were rounded before
+    a unit conversion, or computed from rounded positions, use all digits of a double.
     """
     stairs = steps(subject, atoms)
     size, typical = largest(stairs.energies), rms(stairs.forces)

@@ -180,7 +180,7 @@ def encoded(atoms: Atoms) -> str:
 
 
 def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
-    """Return a program that shows, with ASE alone, that equivalent structures get different answers.
+    """Return a program that shows, with ASE alone, different energies or forces of equivalent structures.
 
     Args:
         words: the calculator as the user named it.

@@ -70,7 +70,7 @@ class Repeats:
             setattr(self.new, what, max(abs(value - before), getattr(self.new, what)))
 
     def findings(self, kT: float) -> list[Observed]:
-        """Return the finding that one structure has two answers, if the difference is more than rounding."""
+        """Return the finding that one structure gives two different results, if this is not rounding."""
         for seen, who in ((self.chance, "same"), (self.new, "new")):
             if seen.differ:
                 told = not_repeatable(
@@ -99,7 +99,7 @@ def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
 def not_repeatable(
     how: str, energy: float, force: float, typical: float, kT: float, **values: Any
 ) -> Observed:
-    """Return the finding that one structure has two answers; an error if they differ by more than rounding.
+    """Return the finding that one structure gives two different results; an error beyond rounding.
 
     Args:
         how: how this was discovered, a variant of the sentences.
@@ -268,7 +268,7 @@ class CalculatorSubject:
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
         """Evaluate a structure again with the same object, and record the comparison in `repeats`.
 
-        Only an isolated deviation counts as random: if the repeated answer also differs from that of a new
+        Only an isolated deviation counts as random: if the repeated result also differs from that of a new
         object, the history of this object may be the reason.
 
         Args:

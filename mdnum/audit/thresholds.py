@@ -1,4 +1,4 @@
-"""Locate the distances at which a calculator's pair interactions change form, from its answers alone.
+"""Locate thresholds of a calculator's pair interactions from energies and forces alone.
 
 Two atoms of each pair of species are moved from a large distance to one with an energy of 1000 kT. Thresholds
 that appear only among many atoms (an angle's own cutoff, a cap on neighbors) are searched in surroundings.py.

@@ -58,7 +58,7 @@ class DynamicsCheck(AuditCheck):
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Run twice, with the full and with half the time step, and compute the energy balance."""
+        """Run with the full and with half the time step, and compute the energy balance."""
         with subject.meter.limited():
             return self._ask(subject, progress)
 

@@ -89,7 +89,7 @@ class InvarianceCheck(AuditCheck):
 
     Allowed differences are measured: the calculator's noise along a line, and the largest change under random
     displacements of the size of coordinate rounding. A transformation that the calculator does not support is
-    skipped. `structures` holds both representations if their answers differ.
+    skipped. `structures` holds both representations if their energies or forces differ.
     """
 
     name, title, order, calls = "invariance", "Invariance", 40, 450
@@ -272,7 +272,7 @@ class _Judge:
 
 
 def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]:
-    """Yield findings about unsupported basic representations, and about answers that are not finite."""
+    """Yield findings about unsupported basic representations, and about results that are not finite."""
     empty = [one for one in refused if one[1].cause is None]
     raised = [one for one in refused if one[1].cause is not None and one[0].code in _MUST_ANSWER]
     for code, cases in (("NOT_FINITE", empty), ("FAILS", raised)):
@@ -435,7 +435,7 @@ def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     """Yield the supercell of a dense four-atom cell, for comparison with the cell itself.
 
     In a structure at least two cutoffs wide, no pair has a second image within the cutoff. Only structures of
-    one or two species are used, in equal numbers as in a salt; with more species the result would be
+    one or two species are tested, in equal numbers as in a salt; with more species the result would be
     ambiguous.
     """
     species = list(dict.fromkeys(atoms.symbols))
@@ -488,7 +488,7 @@ def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def without_periods(atoms: Atoms) -> Iterator[Same]:
-    """Yield a cluster in several nonperiodic cells, which must not change the answer."""
+    """Yield a cluster in several nonperiodic cells, which must not change energy and forces."""
     base = modified(atoms, cell=np.zeros((3, 3)), pbc=False)
     span = np.ptp(base.positions, axis=0).max() + 30.0
     for what, cell in (

@@ -1,4 +1,4 @@
-"""Check the memory of a calculator object: its answer must not depend on earlier structures."""
+"""Check that energies and forces from a calculator object do not depend on earlier structures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _EPS = np.finfo(float).eps
 
 
 class StateCheck(AuditCheck):
-    """Does an answer depend on the structures that the calculator object evaluated before?
+    """Do energy and forces depend on the structures that the calculator object evaluated before?
 
     The check repeats calls, and compares one object with new ones on structures that grow, shrink, move and
     strain.
@@ -187,7 +187,7 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep
 def _through(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, name: str
 ) -> Iterator[Comparison]:
-    """Evaluate a sequence with one calculator object, and compare each answer with that of a new object."""
+    """Evaluate a sequence with one calculator object, and compare each result with that of a new object."""
     used = subject.used()
     before: Atoms | None = None
     known: dict[int, Answered] = {}
@@ -294,7 +294,7 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
 
 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Return the largest move of an atom or cell edge that leaves an answer unchanged, Å, or 0.
+    """Return the largest move of an atom or cell edge that leaves energy and forces unchanged, Å, or 0.
 
     Only moves that should change many of the last digits count; the expected change is proportional to the
     length of the move.
@@ -311,7 +311,7 @@ def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _kept_within(subject: CalculatorSubject, sizes: np.ndarray, at: Callable[[float], Atoms]) -> float:
-    """Return the longest of several successive moves after which one object repeats its last answer."""
+    """Return the longest of several successive moves after which one object repeats its last result."""
     used = subject.fresh()
     used.forgets = False
     places = np.array([0.0, *np.cumsum(sizes)])

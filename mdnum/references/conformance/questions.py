@@ -449,7 +449,7 @@ def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
 
 
 def _wrapped(still: Still, pbc: ndarray) -> Still:
-    """Return a still with its atoms wrapped into the box."""
+    """Return one step of a test case with its atoms wrapped into the box."""
     if not pbc.any() or not len(still.positions):
         return still
     matrix = completed(still.cell, pbc)

@@ -261,7 +261,7 @@ class RemoteSession:
         self._from = 0
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """Return the outcome at every still, up to the first without an answer.
+        """Return the outcome of the call at every step of a test case, up to the first without an answer.
 
         Raises:
             TimeUp: the deadline passed during the call; the process is terminated.
