@@ -74,7 +74,7 @@ class NoiseFloor:
 
     @property
     def allowed(self) -> NoiseFloor:
-        """Largest allowed difference of energies and of forces; every comparison with noise uses these values.
+        """Largest allowed difference of energies and forces; every comparison with noise uses these values.
 
         A standard deviation estimated from few values may be far too small by chance; the limit uses
         Student's t distribution to account for this.
