@@ -1,4 +1,4 @@
-"""Running: epochs of a Verlet list, what they record, and the folder it goes into."""
+"""Rollouts: epochs of a Verlet list, the records that they make, and the run folder with the results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a time step and a cutoff are adequate: what a configuration and a potential say of it."""
+"""Checks of whether a time step and a cutoff are adequate for a configuration and a potential."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _NODES, _FEWER, _AGREE = 200, 100, 1e-3
 
 
 def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> float | None:
-    """Period of the fastest vibration about a configuration, in the user's time; None where none is bound.
+    """Period of a configuration's fastest vibration, in the user's time; None if no motion is bound.
 
-    The largest eigenvalue of the mass-weighted second derivatives by a Lanczos iteration, from differences
-    of forces. A pair that crosses a cutoff between the two would be taken for a spring: its force is
-    shifted to end at zero, which leaves second derivatives as they are but for a small part across the pair.
+    The largest eigenvalue of the mass-weighted Hessian is found by a Lanczos iteration with finite
+    differences of forces. To avoid jumps at pairs that cross the cutoff between two evaluations, forces are
+    shifted to vanish there, which leaves second derivatives unchanged except for a small transverse term.
 
     Args:
         simulation: the system as objects.
         positions: length.
 
-    Error: at most some percent too long, since 12 directions are examined.
+    Error: the period is at most a few percent too long, because the Lanczos iteration has 12 steps.
     """
     smooth = simulation.with_policy()
     smooth = smooth.with_cutoff("force-shifted") if smooth.pairwise else smooth
@@ -56,16 +56,16 @@ def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3
 
 
 def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mapping[str, float] | None:
-    """What pairs beyond the cutoff would add in a bulk whose atoms are spread evenly there (g = 1).
+    """Contributions of pairs beyond the cutoff to energy and pressure of a bulk with g(r) = 1 there.
 
     Args:
         simulation: the system as objects.
-        volume: of the box, length cubed; default the system's.
+        volume: volume of the box, length cubed; by default the system's.
 
     Returns:
-        `energy` per atom, `pressure` in the user's unit (Allen and Tildesley, section 2.8); None where there
-        is no such bulk (an axis is not periodic), the potential has its end inside or atoms have weights, or
-        where the integral does not settle: it diverges unless the potential falls faster than 1/r³.
+        `energy` per atom, `pressure` in the user's unit (Allen and Tildesley, section 2.8); None if an axis
+        is not periodic, the potential ends before the cutoff, atoms have weights or the integral does not
+        converge (it diverges unless the potential decays faster than 1/r³).
     """
     if not simulation.pairwise or not all(simulation.pbc) or simulation.model.weights:
         return None
@@ -76,7 +76,7 @@ def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mappin
 
 
 def _beyond(simulation: Simulation, nodes: int, volume: float | None) -> tuple[float, float]:
-    """Energy and pressure by a quadrature from the cutoff to infinity."""
+    """Integrate energy per atom and pressure by quadrature from the cutoff to infinity."""
     density = simulation.atoms / (volume or simulation.cell.volume)
     share = np.bincount(simulation.species) / simulation.atoms
     node, weight = np.polynomial.legendre.leggauss(nodes)

@@ -1,8 +1,8 @@
-"""A fixed-point rollout reversed: from where it ended to where it began, with lists of its own.
+"""Reversal of a fixed-point rollout, from its end to its start, with separate neighbor lists.
 
-Every step is undone by the integers that it added, so the states that come by are those of the run, bit for
-bit. The lists are built anew at places along the way back, without looking at those of the run: sums of
-integers do not depend on them.
+Every step is undone by subtracting the integers that it added, so the states visited are those of the forward
+run, bit for bit. Neighbor lists are rebuilt independently on the way back, because sums of integers do not
+depend on them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mdnum.systems.simulation import Simulation
 
 
 class Back(NamedTuple):
-    """Where a rollout stands on its way back, in the user's order of atoms."""
+    """State of a rollout that is being reversed, in the user's order of atoms."""
 
     step: Int[Array, ""]  # the step whose forces come next; -1 when all are done
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
@@ -39,7 +39,7 @@ class Back(NamedTuple):
 
 
 class Stretched(NamedTuple):
-    """Rows that were filled on the way back, earlier steps first, in the order of a list's atoms."""
+    """Rows recorded during the reversal, earlier steps first, atoms in the order of the neighbor list."""
 
     first: int  # step of the first row
     rows: int  # how many there are; the record's other rows are void
@@ -52,14 +52,14 @@ class Stretched(NamedTuple):
 
 @partial(jax.jit, static_argnames=("structure",))
 def _undrifted(leaves, structure, state: EpochState) -> Back:
-    """Where a rollout stood before the last drift."""
+    """Return the state of a rollout before its last drift."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = jnp.arange(state.x.shape[1])
     return _before(program, program.masses, order, Back(state.step, *state[1:4], state.extra))
 
 
 def _before(program: EpochProgram, masses, order, back: Back) -> Back:
-    """Undo the drift that led to a state: positions, velocities and extra state of the step before."""
+    """Undo the drift that led to a state; return positions, velocities and extra state of the step before."""
     step = back.step - 1
     x, v, extra = program.integrator.undrift(  # type: ignore[attr-defined]
         back.x, back.v, back.extra, masses, step, order
@@ -71,7 +71,7 @@ def _before(program: EpochProgram, masses, order, back: Back) -> Back:
 
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
 def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord):
-    """Undo steps until the skin is used up, the record is full or the bath is to be changed."""
+    """Undo steps until the skin is used up, the record is full or the bath is due to be replaced."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
 
@@ -121,15 +121,15 @@ def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord
 
 
 class BackwardRun:
-    """Reverses a fixed-point rollout.
+    """Reversal of a fixed-point rollout.
 
     Args:
         simulation: the system as objects, with a fixed-point state.
-        end: the state after its last step.
-        baths: what was put aside, by the step before which it was.
+        end: the state after the last step of the rollout.
+        baths: for each step at which the forward run emptied its bath, the bits stored before that step.
 
     Raises:
-        InputError: the state is not a fixed-point one.
+        InputError: the state is not a fixed-point state.
     """
 
     def __init__(
@@ -152,10 +152,10 @@ class BackwardRun:
         self.back: Back = _undrifted(self._leaves, self._structure, end)
 
     def stretches(self) -> Iterator[Stretched]:
-        """Steps in stretches, last stretch first; `back` is where it stands.
+        """Yield the steps in stretches, the last stretch first; `back` is the current state of the reversal.
 
         Raises:
-            NumericalError: the bath of a thermostat is not as it was.
+            NumericalError: the thermostat's bath differs from that of the forward run.
         """
         simulation = self.simulation
         while int(self.back.step) >= 0:
@@ -176,7 +176,7 @@ class BackwardRun:
         self._check_bath()
 
     def _change_bath(self) -> None:
-        """Where the run had put a bath aside, it is taken up again."""
+        """Restore the stored bath if the forward run emptied its bath before this step."""
         step, period = int(self.back.step), self.simulation.propagator.pause
         if period is None or step % int(period):
             return
@@ -186,7 +186,7 @@ class BackwardRun:
         self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
-        """A bath that was begun anew must have come back to nothing."""
+        """Raise `NumericalError` unless the bath is zero, as it was when the forward run emptied it."""
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(
@@ -196,6 +196,6 @@ class BackwardRun:
 
 
 def _rolled(record: EpochRecord, rows: int) -> EpochRecord:
-    """The rows that were filled from the end, brought to the front; a copy on the host."""
+    """Move the rows that were filled from the end to the front; return a copy on the host."""
     columns: list[Any] = [np.roll(np.asarray(column), rows, axis=0) for column in record[:-2]]
     return EpochRecord(*columns)

@@ -1,4 +1,4 @@
-"""How the atoms and axes of one run are those of another: labels, a symmetry of the box, a shift."""
+"""Comparison of two runs whose atoms and axes differ by relabeling, a symmetry of the box and a shift."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mdnum.md.neighbors import PairTable
 
 @dataclass(frozen=True)
 class ReferenceFrame:
-    """A run seen from the labels and axes of another."""
+    """Mapping of one run's atom labels and axes to those of another run."""
 
     labels: Int[np.ndarray, "atoms"]  # atom b of this run is atom labels[b] of the other, shape (atoms,)
     axes: Int[np.ndarray, "3"]  # axis a of the other run is axis axes[a] of this one, shape (3,)
@@ -27,12 +27,12 @@ class ReferenceFrame:
 
     @classmethod
     def same(cls, atoms: int) -> ReferenceFrame:
-        """Nothing is different."""
+        """Return the identity mapping."""
         return cls(np.arange(atoms), np.arange(3), np.ones(3), np.zeros(3))
 
     @property
     def is_same(self) -> bool:
-        """Whether nothing is different."""
+        """True if the mapping is the identity."""
         return (
             bool((self.labels == np.arange(len(self.labels))).all())
             and bool((self.axes == np.arange(3)).all())
@@ -42,7 +42,7 @@ class ReferenceFrame:
 
     @property
     def inverse(self) -> ReferenceFrame:
-        """The other run, seen from the labels and axes of this one."""
+        """Mapping from the other run's labels and axes to those of this run."""
         shift = -self.signs * self.shift[self.axes]
         axes = np.argsort(self.axes)
         return ReferenceFrame(np.argsort(self.labels), axes, self.signs[axes], shift)
@@ -50,10 +50,10 @@ class ReferenceFrame:
     def positions(
         self, x: Float[np.ndarray, "rows 3 atoms"], by: Float[np.ndarray, "rows 3 3"] | None = None
     ) -> Float[np.ndarray, "rows 3 atoms"]:
-        """Positions of this run as the other run would have them, up to lattice vectors.
+        """Convert positions of this run to the other run's labels and axes, up to lattice vectors.
 
         Args:
-            by: how the box has deformed since the start, at each row, where it moves.
+            by: deformation of the box since the start, for each row; None if the box is fixed.
         """
         if self.is_same:
             return x
@@ -61,10 +61,10 @@ class ReferenceFrame:
         return self.vectors(x - shift[:, :, None])
 
     def boxes(self, cells: Sequence[Cell], first: Cell) -> tuple[Cell, ...]:
-        """Boxes of this run as the other run would have them.
+        """Convert boxes of this run to the axes of the other run.
 
         Args:
-            first: the box of both at the start, which other axes leave as it is.
+            first: the box of both runs at the start, which the change of axes does not alter.
         """
         if bool((self.axes == np.arange(3)).all()) and bool((self.signs == 1).all()):
             return tuple(cells)
@@ -78,7 +78,7 @@ class ReferenceFrame:
         return tuple(Cell.create(matrix, first.pbc) for matrix in matrices)
 
     def vectors(self, v: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows 3 atoms"]:
-        """Velocities, likewise."""
+        """Convert velocities of this run to the other run's labels and axes."""
         if self.is_same:
             return v
         out = np.empty_like(v)
@@ -86,11 +86,11 @@ class ReferenceFrame:
         return out
 
     def keys(self, own: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """Keys of pairs of this run, in the other's labels."""
+        """Convert keys of pairs of this run to the other run's labels, sorted."""
         return np.sort(self.keys_of(*np.divmod(own, len(self.labels))))
 
     def keys_of(self, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """As `keys`, for pairs given by their ends, in their order."""
+        """Return keys, in the other run's labels, of pairs given by their atoms, in the same order."""
         atoms = len(self.labels)
         channel, i = np.divmod(i, atoms)
         a, b = self.labels[i], self.labels[j]
@@ -102,7 +102,7 @@ class ReferenceFrame:
 
 @dataclass(frozen=True)
 class CrossFlip:
-    """A pair that the two runs decide differently from this step on, or no longer."""
+    """A pair whose decisions in two runs begin or cease to differ at this step."""
 
     step: int  # of the flip
     # i, j: the pair, labels of the first run, i < j
@@ -118,7 +118,7 @@ class CrossFlip:
 
 @dataclass(frozen=True)
 class PairFlips(Columns):
-    """Flips of one run, in the labels of the first run, a column each."""
+    """Flips of one run as columns, in the labels of the first run."""
 
     step: Int[np.ndarray, "flips"]  # of the flip
     key: Int[np.ndarray, "flips"]  # i * atoms + j of the pair, i < j
@@ -130,7 +130,7 @@ class PairFlips(Columns):
 
 @dataclass(frozen=True)
 class CrossFlips(Sequence[CrossFlip]):
-    """Cross-run flips in order; objects are made only of those that are looked at: there may be millions."""
+    """Cross-run flips in order; objects are created only on access because there may be millions of flips."""
 
     flips: PairFlips  # of either run
     from_b: Bool[np.ndarray, "flips"]  # which of them are the second run's
@@ -165,7 +165,7 @@ class CrossFlips(Sequence[CrossFlip]):
 
 
 class CrossRecorder:
-    """The pairs on which two runs differ now.
+    """Record of the pairs on which the decisions of two runs currently differ.
 
     Args:
         a, b: keys of the pairs inside at the first step, in the labels of the first run.
@@ -177,7 +177,7 @@ class CrossRecorder:
         self.differing: Int[np.ndarray, "pairs"] = np.setxor1d(a, b, assume_unique=True)
 
     def opening(self) -> list[CrossFlip]:
-        """The pairs on which they differ from the start, as flips at step 0."""
+        """Return the pairs on which the runs differ from the start, as flips at step 0."""
         i, j = np.divmod(self.differing, self.atoms)
         pairs = zip(i.tolist(), j.tolist(), strict=True)
         return [CrossFlip(0, i, j, True, "B", False, np.nan, np.nan) for i, j in pairs]
@@ -185,12 +185,13 @@ class CrossRecorder:
     def take(
         self, first: int, rows: int, a: PairFlips, b: PairFlips
     ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
-        """Number of pairs that differ at each of the next steps, and how that came about.
+        """Count the pairs that differ at each of the next steps; return also the flips that change the count.
+        count.
 
         Args:
             first: step of the first row.
             rows: number of steps.
-            a, b: the flips of either run among them.
+            a, b: flips of each run during these steps.
         """
         every = PairFlips.concatenate([a, b])
         from_b = np.repeat([False, True], [len(a.step), len(b.step)])
@@ -211,7 +212,7 @@ class CrossRecorder:
 
 
 def _times_before(keys: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """How often each key was there before."""
+    """For each key, count its earlier occurrences in the array."""
     order = np.argsort(keys, kind="stable")
     ranked = keys[order]
     starts = np.flatnonzero(np.append(True, ranked[1:] != ranked[:-1])) if len(keys) else np.zeros(0, int)
@@ -235,7 +236,7 @@ def _place(values, order, out):
 def in_user_order(
     values: Float[np.ndarray, "rows 3 atoms"], order: Int[np.ndarray, "atoms"]
 ) -> Float[np.ndarray, "rows 3 atoms"]:
-    """Columns of a record in the user's order of atoms, float64.
+    """Return columns of a record in the user's order of atoms, in float64.
 
     Args:
         order: atom k of the record is atom order[k].
@@ -300,12 +301,13 @@ def separations(
     b: Float[np.ndarray, "rows 3 atoms"],
     others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
-    """Largest distance between the same atoms of two runs at each row; NaN where a position is not a number.
+    """Largest distance between the same atoms of two runs for each row; NaN if a position is not a number.
 
     Args:
-        cells: the box, or one for each row; distances are those of nearest images.
-        others: the second run's box of each row, where it has its own: its positions relative to it are put
-            into that of the first, so that boxes that differ are no motion of atoms far from the origin.
+        cells: the box, or one box for each row; distances are to the nearest image.
+        others: boxes of the second run, for each row, if they differ: its positions are transformed to the
+            first run's box, so that a difference between boxes does not count as a displacement of distant
+            atoms.
     """
     out = np.empty(len(a))
     if others:
@@ -316,7 +318,7 @@ def separations(
 
 
 def strains(cells: Sequence[Cell], others: Sequence[Cell]) -> Float[np.ndarray, "rows"]:
-    """The largest relative change of a length from one box to another, at each row."""
+    """Largest relative change of a length between two boxes, for each row."""
     by = np.array([cell.deformation(other) for cell, other in zip(cells, others, strict=True)])
     out, known = np.full(len(by), np.nan), np.flatnonzero(np.isfinite(by).all(axis=(1, 2)))
     # a rotation is no strain
@@ -333,14 +335,15 @@ def overridden(
     species: Int[np.ndarray, "atoms"],
     r_cut: Float[np.ndarray, "channels species species"],
 ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
-    """How many pairs are decided otherwise in two records, and the furthest of them from its cutoff.
+    """Count the pairs whose decisions differ between two records; find their largest distance to the cutoff.
+    cutoff.
 
     Args:
         cells: as for `separations`.
-        own, imposed: packed decisions of one list, the table.
-        x: positions in its order of atoms.
-        species: of each atom, in the user's order.
-        r_cut: cutoff of each channel by species, length.
+        own, imposed: packed decisions on the same neighbor list, `table`.
+        x: positions in the list's order of atoms.
+        species: species of each atom, in the user's order.
+        r_cut: cutoff of each channel for each pair of species, length.
     """
     count, furthest = np.zeros(len(own), np.int64), np.zeros(len(own))
     order, boxes = table.order, stacked(cells)
@@ -351,5 +354,5 @@ def overridden(
 def differ(
     a: Float[np.ndarray, "rows 3 atoms"], b: Float[np.ndarray, "rows 3 atoms"]
 ) -> Bool[np.ndarray, "rows"]:
-    """Whether any number of a row differs between two runs (one that is not a number does)."""
+    """For each row, True if any number differs between the two runs or is not a number."""
     return (a != b).any(axis=(1, 2))

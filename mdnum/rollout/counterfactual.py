@@ -1,4 +1,4 @@
-"""A run with its own arithmetic and another run's decisions: the counterfactual."""
+"""Counterfactual runs, which use their own arithmetic but another run's decisions."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from mdnum.systems.simulation import Simulation
 
 
 class Counterfactual:
-    """A run with its own arithmetic and the decisions of another run, imposed step by step.
+    """A run with its own arithmetic and the decisions of another run, the leader, imposed step by step.
 
-    Its own decisions are computed all the same, and counted where they differ. It listens to the other run,
-    and keeps its rows until they are asked for.
+    The run's own decisions are also computed, and those that differ are counted. The object is called with
+    each segment of the leader, and keeps the resulting rows until `until` returns them.
 
     Args:
-        simulation: whose arithmetic.
-        leader: whose decisions.
-        start: where it begins; default the simulation's own start.
-        frame: how its atoms and axes are the leader's.
-        guard: length; it ends when an imposed decision is further than this from its cutoff: it would no
-            longer be a decision that rounding could have changed.
+        simulation: the run whose arithmetic is used.
+        leader: the run whose decisions are imposed.
+        start: initial state; by default the simulation's own start.
+        frame: mapping of this run's atoms and axes to those of the leader.
+        guard: length; the run ends when an imposed decision is further than this from its cutoff, because
+            rounding could no longer have changed that decision.
 
     Attributes:
-        failed: one of `FAILURES` where it ended that way.
+        failed: one of `FAILURES` if the run failed, else empty.
 
     Raises:
-        InputError: many-body potentials decide inside their energy function.
+        InputError: a potential is many-body, so its decisions are made inside the energy function.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Counterfactual:
         self._record: EpochRecord | None = None
 
     def __call__(self, segment: Segment) -> None:
-        """Act on the decisions of a stretch of the leader's run."""
+        """Run one segment of the leader's steps under the leader's decisions, and keep the rows."""
         if self._over:
             return
         rows = self.follow(segment)
@@ -82,11 +82,11 @@ class Counterfactual:
             self._ahead.append(rows)
 
     def until(self, last: int) -> Rows | None:
-        """The steps up to one that were not yet asked for; None after it was ended."""
+        """Return the rows up to a step that have not been returned before; None if there are none."""
         return taken(self._ahead, last)
 
     def follow(self, segment: Segment) -> Rows:
-        """The steps of a stretch of the leader's run, under its decisions."""
+        """Run one segment of the leader's steps under the leader's decisions, and return the rows."""
         parts: list[Rows] = []
         row = 0
         while row < segment.rows and not self.failed:
@@ -145,7 +145,7 @@ class Counterfactual:
         return tuple(leaves), structure
 
     def _list(self, segment: Segment):
-        """This run's own list, and where the leader's decision of each of its slots stands."""
+        """Return this run's own list, and for each of its slots the position of the leader's decision."""
         simulation = self.simulation
         if self._own is None:
             home, cell = self.state.x, jax.tree.map(np.asarray, self.state.cells[0])
@@ -160,7 +160,7 @@ class Counterfactual:
 
 
 def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species species"]:
-    """The cutoff of each channel and pair of species, length."""
+    """Return the cutoff of each channel and pair of species, length."""
     radii = np.array(simulation.decider.r_cut).reshape(simulation.channels, -1)
     count = len(simulation.symbols)
     if radii.shape[1] == 1:
@@ -172,7 +172,7 @@ def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species s
 def _places(
     table: PairTable, led: PairTable, labels: Int[np.ndarray, "atoms"]
 ) -> Int[np.ndarray, "slots atoms"]:
-    """For each slot of a list where the same directed pair stands in another list; its size for nowhere."""
+    """Return, for each slot of a list, where another list has the same directed pair (its size if absent)."""
     atoms = len(labels)
     slot, column = np.nonzero(led.index < atoms)
     keys = led.order[column].astype(np.int64) * atoms + led.order[led.index[slot, column]]
@@ -190,7 +190,7 @@ def _places(
 def _mapped(
     bits: UInt8[Array, "rows words atoms"], place: Int[Array, "slots atoms"], channels: int = 1
 ) -> UInt8[Array, "rows own atoms"]:
-    """The decisions of one list in the slots of another."""
+    """Rearrange the decisions of one list into the slots of another list."""
     rows, _, atoms = bits.shape
     shift = jnp.arange(8, dtype=jnp.uint8)[None, None, :, None]
     each = ((bits[:, :, None, :] >> shift) & jnp.uint8(1)).reshape(rows * channels, -1)

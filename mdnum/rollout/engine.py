@@ -1,8 +1,8 @@
-"""Epoch after epoch: the host's side of a rollout.
+"""Host side of a rollout, epoch after epoch.
 
-The engine builds lists, starts jitted epochs and hands out what they recorded. While the device computes
-an epoch, the caller works on the record of the one before: that is why a segment is yielded only after
-its successor has been started.
+The engine builds neighbor lists, starts jitted epochs and yields their records. While the device computes an
+epoch, the caller works on the previous record: a segment is therefore yielded only after the next epoch has
+been started.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ FAILURES = ("blow-up", "runaway", NARROW)
 
 @dataclass(frozen=True)
 class Segment:
-    """What one stretch of steps with one list left behind, on the host."""
+    """Record of consecutive steps with one neighbor list, on the host."""
 
     first: int  # step of the first row
     rows: int  # number of rows
@@ -85,26 +85,26 @@ class Segment:
         return self.first + self.rows - 1
 
     def rows_of(self, name: str) -> np.ndarray:
-        """The filled rows of a column of the record; where it has none, the steps are made once more."""
+        """Return the filled rows of a column; steps are recomputed if the record lacks this column."""
         lacks = self.changes is not None and name in ("x", "v", "images", "bits")
         return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """The box of each row, on the host, where the integrator moves it; else none."""
+        """The box of each row, on the host; empty if the box is fixed."""
         return self.record.boxes(self.rows, self.cell.pbc)
 
     def cell_of(self, row: int) -> Cell:
-        """The box at a row, on the host."""
+        """Return the box at a row, on the host."""
         return self.cells[row] if self.cells else self.cell
 
     @property
     def last_positions(self) -> Float[Array | np.ndarray, "3 atoms"]:
-        """Wrapped positions at the last row, in the user's order of atoms."""
+        """Return wrapped positions at the last row, in the user's order of atoms."""
         return self.unsorted("x", self.rows - 1).T if self.closes == "blow-up" else self.state.x_before
 
     def unsorted(self, name: str, row: int) -> np.ndarray:
-        """A row of a per-atom column in the user's order of atoms, shape (atoms, 3)."""
+        """Return a row of a per-atom column in the user's order of atoms, shape (atoms, 3)."""
         if name == "x" and row == 0:
             return np.asarray(self.start.x).T
         if name == "x" and row == self.rows - 1 and self.closes != "blow-up":
@@ -117,7 +117,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Start:
-    """Where an engine begins: the start of a rollout, or a checkpoint of one."""
+    """Initial state of an engine: the start of a rollout, or a checkpoint."""
 
     state: EpochState  # the state to go on from
     home: Float[Array, "3 atoms"]  # wrapped positions at which the list in use was built, shape (3, atoms)
@@ -127,17 +127,16 @@ class Start:
 
     @property
     def reference(self) -> Float[np.ndarray, "atoms 3"]:
-        """`home` on the host, an atom a row, in float64."""
+        """Return `home` on the host, one atom per row, in float64."""
         return np.asarray(self.home, np.float64).T
 
     def check_box(self, simulation: Simulation, which: int = -1) -> None:
-        """Refuse one of the boxes, by default of the list's build, that is too narrow for a list, with an
-        `InputError`."""
+        """Raise `InputError` if a box (default: of the list's build) is too narrow for a neighbor list."""
         cell = jax.tree.map(np.asarray, self.state.cells[which])
         check_radius(cell, simulation.r_cut, simulation.rule.skin)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Plain arrays for a checkpoint."""
+        """Return plain arrays for a checkpoint."""
         parts = self.state._asdict()
         parts |= {f"extra_{k}": leaf for k, leaf in enumerate(jax.tree.leaves(parts.pop("extra")))}
         # boxes with their inverses, as the loop had them: no others have their bits
@@ -148,7 +147,9 @@ class Start:
 
     @classmethod
     def from_arrays(cls, arrays, simulation: Simulation) -> Start:
-        """The inverse of `to_arrays`, bit for bit; one without a box has that of the simulation."""
+        """Restore a start from the arrays of `to_arrays`, bit for bit; the default box is the
+        simulation's.
+        """
         places: Any = (jnp.asarray(arrays[f"state_{name}"]) for name in EpochState._fields[:-2])
         first = first_state(simulation).state
         leaves, structure = jax.tree.flatten(first.extra)
@@ -166,7 +167,7 @@ class Start:
 
 
 def first_state(simulation: Simulation) -> Start:
-    """The start of a rollout: positions wrapped, velocities as the system has them."""
+    """Return the start of a rollout, with positions wrapped and the system's velocities."""
     dtype = simulation.policy.dtype("state")
     positions, velocities = simulation.first_frame()
     wrapped, images = wrap_positions(simulation.cell, positions)
@@ -184,7 +185,7 @@ def first_state(simulation: Simulation) -> Start:
 
 
 def room_for(rows: int, per_row: int) -> int:
-    """Rows, a power of two above `rows`, to record them in; more where that costs little memory."""
+    """Number of rows to allocate for at least `rows`: a power of two, larger where memory permits."""
     few = max(2, min(_MOST_ROWS, _SMALL_BYTES // per_row))
     return 1 << max(few.bit_length() - 1, rows.bit_length())
 
@@ -195,14 +196,14 @@ class Engine:
     Args:
         simulation: the system as objects.
         last: last step to evaluate.
-        start: where to begin; default the system's own start.
-        record: whether decisions and positions leave the loop. Energies do in any case, and trajectories
-            have the same bits either way.
-        rows: whether they are kept for every step. Without, only changes of decisions leave the loop, in
-            double precision a tenth of the memory, and `Segment.rows_of` makes the steps of a segment once
-            more where somebody asks.
-        pins: decisions to act on instead of the run's own. The record holds its own all the same.
-        inputs: whether rows also have what a derivative of their step is taken at.
+        start: initial state; by default the system's own start.
+        record: whether to record decisions and positions. Energies are always recorded, and the choice does
+            not change a bit of the trajectory.
+        rows: whether to keep decisions and positions of every step. If False, only changes of decisions are
+            recorded, which in double precision takes a tenth of the memory, and `Segment.rows_of` recomputes
+            a segment's steps on request.
+        pins: decisions that replace the run's own. The record still contains the run's own decisions.
+        inputs: whether to record also the inputs of each step that are needed for its derivatives.
     """
 
     def __init__(
@@ -249,7 +250,7 @@ class Engine:
         self.leaves = tuple(leaves)
 
     def _room(self, words: int) -> int:
-        """Rows of a record: a power of two within the memory allowed."""
+        """Number of rows of a record: a power of two within the memory limit."""
         kept = self.record and self.rows
         per_row = self.simulation.atoms * (2 * 24 + 12 + words) if kept else 64
         per_row += sum(leaf.size * 8 for leaf in jax.tree.leaves(self._inputs))
@@ -258,7 +259,7 @@ class Engine:
         return min(1 << (rows.bit_length() - 1), room_for(int(self.last + 1), per_row))
 
     def take(self, turn: int, words: int) -> EpochRecord:
-        """The record buffer whose turn it is; it is donated to the epoch that fills it."""
+        """Return the record buffer for this turn; the buffer is donated to the epoch that fills it."""
         rows, held, most = self._room(words), self._records[turn], self.program.most
         self._records[turn] = None
         # as many as a list's life brings, or a large system sorts its atoms several times for one list
@@ -271,11 +272,11 @@ class Engine:
         return empty_record(rows, words, self.simulation.atoms, dtype, self.record, *rest)
 
     def give(self, turn: int, record: EpochRecord) -> None:
-        """Return a record that nobody reads any more."""
+        """Return a record that is no longer in use to the engine."""
         self._records[turn] = record
 
     def segments(self) -> Iterator[Segment]:
-        """Stretches of steps in order; the last one has `closes` set to "end" or one of FAILURES."""
+        """Yield segments of steps in order; the last has `closes` equal to "end" or to one of FAILURES."""
         here, turn, held = self.start, 0, None
         listed = self._listed(here)
         waiting: Segment | None = None
@@ -296,10 +297,10 @@ class Engine:
                 listed = self._listed(here)
 
     def again(self, start: Start) -> Segment:
-        """The one segment that begins at a start, made anew with the bits that it had.
+        """Recompute the segment that begins at a start, with the same bits.
 
         Args:
-            start: where a segment of this engine began (`resume_point` of the one before).
+            start: where a segment of this engine began (`resume_point` of the segment before).
         """
         self.verlet.slots = start.slots
         listed = self._listed(start)
@@ -308,7 +309,7 @@ class Engine:
         return made
 
     def _listed(self, start: Start) -> tuple[PairTable, Tables]:
-        """The list of a start, searched for, and as the loop reads it."""
+        """Build the neighbor list of a start; return the list and the tables that the loop reads."""
         cell = self._cell
         if self._moves:
             cell = jax.tree.map(np.asarray, start.state.cells[-1])
@@ -320,7 +321,7 @@ class Engine:
         """Start the compiled loop on the device.
 
         Args:
-            held: decisions of the list at the step before; None where it has to look back.
+            held: decisions of the list at the step before; None if they must be computed.
         """
         table, tables = listed
         words = self.simulation.channels * table.slots // 8
@@ -340,7 +341,7 @@ class Engine:
     def _segment(
         self, listed, start: Start, held, turn: int, begun: tuple[EpochOutcome, EpochRecord]
     ) -> tuple[Segment, np.ndarray | jax.Array | None]:
-        """What the loop left behind, and the decisions at its last row; waits for it."""
+        """Wait for the loop; return its segment and the decisions at its last row."""
         outcome, record = begun
         rows, rebuild, finite, _ = np.asarray(outcome.flags).tolist()
         while (changes := record.changes) is not None and finite and changes.found > len(changes.pairs):
@@ -366,7 +367,7 @@ class Engine:
         return segment, last
 
     def _with_rows(self, start: Start, last: int) -> EpochRecord:
-        """The steps from a start to a last one of the same list, recorded row by row."""
+        """Recompute the steps from a start to a last step of the same list, recorded row by row."""
         engine = Engine(self.simulation, last, start=start, pins=self.pins)
         parts: list[list[Any]] = [
             [np.array(segment.rows_of(name)) for name in EpochRecord._fields[:-2]]
@@ -376,13 +377,13 @@ class Engine:
         return EpochRecord(*whole)
 
     def _pinned(self, table: PairTable, first: int, words: int) -> tuple[UInt8[np.ndarray, "..."], ...]:
-        """What the rows of the next epoch are told, and where; nothing without pins."""
+        """Return the decisions imposed on the rows of the next epoch, and where; empty without pins."""
         if self.pins is None:
             return ()
         return self.pins.rows(table, first, self._room(words), self.simulation.channels)
 
     def failure(self, outcome: EpochOutcome) -> str:
-        """One of FAILURES, where a stretch of steps has ended in one; else empty."""
+        """Return one of FAILURES if the steps ended in a failure, else an empty string."""
         _, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
         if not finite:
             return "blow-up"
@@ -404,7 +405,7 @@ class Engine:
 
 
 def resume_point(segment: Segment) -> Start:
-    """Where a rollout goes on after a segment: with its list, or with a new one where its list is used up."""
+    """Return the start from which a rollout continues after a segment, with a new list if it is due."""
     state, slots = segment.state, segment.table.slots
     if segment.due:
         return Start(state, state.x, segment.last + 1, segment.epoch + 1, slots)
@@ -416,5 +417,5 @@ def unwrapped(
     x: Float[np.ndarray, "atoms 3"],
     images: Int[np.ndarray, "atoms 3"],
 ):
-    """Positions as if the box had no faces: wrapped positions plus the lattice vectors taken off."""
+    """Return unwrapped positions: wrapped positions plus the lattice vectors that wrapping removed."""
     return x + images @ np.asarray(cell_matrix)

@@ -1,4 +1,4 @@
-"""Decisions of single pairs that a run is told, while it makes all others itself."""
+"""Epochs: the compiled loop over steps with one neighbor list, its state, records and imposed decisions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mdnum.md.pairforce import Forces
 
 @dataclass(frozen=True)
 class Pin:
-    """What a run is told about one pair."""
+    """Imposed decisions of one pair."""
 
     # i, j: the pair, i < j; to i the number of atoms is added for each channel before that of the decision
     i: int
@@ -35,29 +35,29 @@ class Pin:
     inside: bool = False  # what it is told before the first of them
 
     def at(self, steps: Int[np.ndarray, "steps"]) -> Bool[np.ndarray, "steps"]:
-        """What it is told at given steps."""
+        """Return the imposed decision at each of the given steps, True for inside."""
         turned = np.searchsorted(np.asarray(self.changes, np.int64), steps, side="right")
         return (turned % 2 == 1) ^ self.inside
 
 
 @dataclass(frozen=True)
 class Pins:
-    """The pairs whose decisions a run is told."""
+    """Imposed decisions of selected pairs; all other decisions are the run's own."""
 
     pins: Sequence[Pin]
 
     def rows(
         self, table: PairTable, first: int, count: int, channels: int = 1
     ) -> tuple[UInt8[np.ndarray, "rows words atoms"], UInt8[np.ndarray, "rows words atoms"]]:
-        """Packed decisions and where they hold, for consecutive steps of one list.
+        """Return packed decisions and a mask of where they are imposed, for consecutive steps of one list.
 
-        A pair that the list does not hold is too far away to be inside, and cannot be told to be.
+        A pair that is not in the list is too distant to be inside; no decision can be imposed on it.
 
         Args:
-            table: the list.
+            table: the neighbor list.
             first: step of the first row.
             count: number of rows.
-            channels: decisions of a pair.
+            channels: number of decisions per pair.
         """
         atoms = len(table.order)
         shape = (count, channels * table.slots // 8, atoms)
@@ -83,7 +83,7 @@ class Pins:
 
 
 class EpochProgram(eqx.Module):
-    """Everything about a rollout that stays the same from epoch to epoch."""
+    """The constant data of a rollout, which do not change between epochs."""
 
     force: eqx.Module  # PairForce or ManyBodyForce: forces and decisions over a list, in the box of a row
     integrator: Integrator  # between force evaluations
@@ -103,7 +103,7 @@ class EpochProgram(eqx.Module):
 
 
 class EpochState(NamedTuple):
-    """Where a rollout stands between two force evaluations, in the user's order of atoms."""
+    """State of a rollout between two force evaluations, in the user's order of atoms."""
 
     step: Int[Array, ""]  # the step whose forces come next
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
@@ -118,7 +118,7 @@ class EpochState(NamedTuple):
 
 
 class StepInputs(NamedTuple):
-    """What a step is made of beside its positions, box and virial, for derivatives; atoms sorted."""
+    """Inputs of a step for its derivatives, except positions, box and virial; atoms in the list's order."""
 
     v: Float[Array, "3 atoms"]  # velocities that lead there, as the step before left them
     extra: Any  # the extra state then
@@ -127,7 +127,7 @@ class StepInputs(NamedTuple):
 
 
 class EpochRecord(NamedTuple):
-    """One row per step of an epoch, atoms in the order of its tables."""
+    """Record of an epoch with one row per step, atoms in the order of its tables."""
 
     # x, v: positions and full-step velocities, shape (rows, 3, atoms), or (rows, 3, 0) without rows
     x: Float[Array, "rows 3 atoms"]
@@ -149,7 +149,7 @@ class EpochRecord(NamedTuple):
     inputs: Any = ()  # `StepInputs` of each row, where they were asked for
 
     def boxes(self, rows: int, pbc: tuple[bool, bool, bool]) -> tuple[Cell, ...]:
-        """The boxes of the first rows, on the host; none where there is one for all."""
+        """Return the boxes of the first rows, on the host; empty if all rows share one box."""
         if not self.cell.size:
             return ()
         return tuple(Cell.create(one, pbc) for one in np.asarray(self.cell)[:rows])
@@ -159,7 +159,7 @@ _NUMBERS = ("potential", "kinetic", "virial", "heat", "work", "nearest", "moved"
 
 
 class EpochOutcome(NamedTuple):
-    """How an epoch's loop ended."""
+    """State, flags and decisions at the end of an epoch's loop."""
 
     state: EpochState  # where to go on
     # four numbers that travel together: how many rows were recorded; whether the list must be rebuilt before
@@ -188,12 +188,12 @@ def empty_record(
     cells: bool = False,
     inputs: Any = (),
 ) -> EpochRecord:
-    """Room for the rows of an epoch; without recording only the per-step numbers have room.
+    """Allocate the rows of an epoch; if `record` is False, allocate only per-step numbers.
 
     Args:
-        changes: room for so many instead of for decisions and positions.
-        cells: whether rows have their own box.
-        inputs: `StepInputs` of any step, where rows have them.
+        changes: allocate this number of changes of decisions instead of rows of decisions and positions.
+        cells: whether each row has its own box.
+        inputs: `StepInputs` of any step, if they are to be recorded.
     """
     record = record and changes is None
     shape = (rows, 3, atoms) if record else (rows, 3, 0)
@@ -210,7 +210,7 @@ def empty_record(
 
 
 def inside_of(bits: UInt8[Array, "words atoms"]) -> Int[Array, ""]:
-    """How many decisions are yes; a pair has two."""
+    """Count the decisions that are yes; each pair has two."""
     return jnp.sum(jnp.bitwise_count(bits), dtype=jnp.int64)
 
 
@@ -227,10 +227,11 @@ def write_row(record: EpochRecord, row, **values) -> EpochRecord:
 def over_rows(
     step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, used: Any, *, backward: bool = False
 ) -> tuple[Any, Any]:
-    """As `jax.lax.scan`, but over the first `used` rows alone, last one first where it goes `backward`.
+    """Scan like `jax.lax.scan`, but only over the first `used` rows; `backward` begins with the last row.
+    first.
 
-    Every stretch has the room of the longest, so that one program serves all; a loop over that room would
-    spend most of its time on rows that hold nothing. Outputs of unused rows are zero.
+    Buffers have the size of the longest segment so that one program serves all segments; a loop over the
+    whole buffer would spend most of its time on empty rows. Outputs of unused rows are zero.
     """
     first = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
     _, out = jax.eval_shape(step, carry, first)
@@ -266,21 +267,22 @@ def run_epoch(
     pinned: UInt8[Array, "rows words atoms"] | None = None,
     held: UInt8[Array, "words atoms"] | None = None,
 ) -> tuple[EpochOutcome, EpochRecord]:
-    """Advance with one list until it is used up, the record is full or the last step is done.
+    """Advance with one list until the skin is used up, the record is full or the last step is done.
 
     Args:
         leaves, structure: the program, flattened by jax.tree.flatten.
-        tables: the list.
-        state: where the rollout stands, user's order.
-        reference: wrapped positions at which the list was built, user's order.
+        tables: the neighbor list.
+        state: state of the rollout, in the user's order of atoms.
+        reference: wrapped positions at which the list was built, in the user's order of atoms.
         built: step at which the list was built.
         last: last step to evaluate.
-        look_back: whether to decide the step before with this list too.
+        look_back: whether to evaluate the decisions of the step before with this list too.
         record: rows to fill; donated.
-        told: decisions of each row to act on instead of the list's own, which are recorded all the same;
-            pair potentials only.
-        pinned: the slots of each row at which it acts on what it is told; everywhere when None.
-        held: decisions of the list at the step before, where that is not decided again; needed without rows.
+        told: imposed decisions of each row, which replace those of the list; the list's own decisions are
+            still recorded. Only for pair potentials.
+        pinned: slots of each row at which decisions are imposed; None for all slots.
+        held: decisions of the list at the step before, if they are not evaluated again; required without
+            rows.
     """
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order

@@ -1,4 +1,4 @@
-"""From packed decisions to ledger rows: which pair flipped when, by how much, and what it did."""
+"""Conversion of packed decisions to ledger rows: pair, step, margin and effect of each flip."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mdnum.systems.simulation import Simulation
 
 @njit
 def _mixed(key):
-    """A well-mixed 64-bit number for a key (the finalizer of splitmix64)."""
+    """Return a well-mixed 64-bit hash of a key (the finalizer of splitmix64)."""
     z = np.uint64(key) + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -34,7 +34,7 @@ def _mixed(key):
 
 @njit
 def fingerprint_of_bits(bits, index, order):
-    """Number and mixed sum of the keys of all pairs inside; the same for every list that decides alike."""
+    """Count and hash sum of the pairs inside; both are equal for all lists with the same decisions."""
     count, total = 0, np.uint64(0)
     atoms, listed = order.shape[0], index.shape[0] // 8
     for w in range(bits.shape[0]):
@@ -62,7 +62,7 @@ def _fingerprint_of_keys(keys):
 
 @njit
 def _note_rows(before, rows, index, x, v, pairs, ends, count):
-    """`Changes` of consecutive rows of one list."""
+    """Record the `Changes` between consecutive rows of one list."""
     held = before.copy()
     for r in range(len(rows)):
         note(held, rows[r], index, x[r], v[r], r, pairs, ends, count)
@@ -71,19 +71,20 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
 # atoms in one place have no radial speed: not a number, as in numpy
 @njit(error_model="numpy")
 def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, narrow, back, first, factor):
-    """Columns of a ledger from `Changes`, sorted, and whether a margin contradicts its decision.
+    """Sorted columns of a ledger, computed from `Changes`, and whether a margin contradicts its decision.
 
     Args:
-        labels: of sorted atoms. species: by label. kinds: pair type of two species.
+        labels: labels of the sorted atoms. species: species by label. kinds: pair type of two species.
         by_type: thresholds, energy and force jumps, shape (3, types). bounds: shape (rows, types).
-        rule: whether distances are compared, not their squares; and whether a margin of 0 is inside.
-        boxes, narrow: `stacked` in float64, and in float32 where decisions are made in that.
-        back: deformations to the box of the row before, shape (rows, 3, 3); no rows where it does not move.
-        first: step of the first row. factor: from velocities to those of the ledger.
+        rule: whether distances are compared rather than their squares; and whether a margin of 0 is inside.
+        boxes, narrow: `stacked` in float64, and in float32 if decisions are made in single precision.
+        back: deformation from each row's box to the previous row's, shape (rows, 3, 3); no rows if the box is
+            fixed.
+        first: step of the first row. factor: factor that converts velocities to the units of the ledger.
 
     Returns:
-        step, labels, shape (2, flips), and decision; then margin, bound, energy jump, distance, radial
-        speed, force jump and what the box did to the distance, shape (7, flips).
+        step, labels, shape (2, flips), and decision; then margin, bound, energy jump, distance, radial speed,
+        force jump and the change of the distance due to the box, shape (7, flips).
     """
     flips, (root, inclusive) = len(pairs), rule
     i, j = np.empty(flips, np.int64), np.empty(flips, np.int64)
@@ -138,7 +139,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
 
 
 def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
-    """Deformations from the box of each row to that of the row before; none where it does not move."""
+    """Return deformations from each row's box to the previous row's box; empty if the box is fixed."""
     if not segment.cells:
         return np.empty((0, 3, 3))
     before = jax.tree.map(np.asarray, segment.start.cells[1]), *segment.cells[:-1]
@@ -146,7 +147,7 @@ def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
 
 
 def _noted(before, bits, index, x, v) -> Changes:
-    """The changes in consecutive rows of one list, as the loop notes them."""
+    """Return the changes in consecutive rows of one list, in the format of the compiled loop."""
     room = len(bits) * max(64, bits.shape[2] // 4)
     while True:
         made = np.empty((room, 4), np.int32), np.empty((room, 12), x.dtype), np.zeros(3, np.int64)
@@ -158,7 +159,7 @@ def _noted(before, bits, index, x, v) -> Changes:
 
 @dataclass(frozen=True)
 class AmbiguousPairs(Columns):
-    """Pair decisions that another legitimate rounding could have made otherwise, a row each."""
+    """Pair decisions that a different but equally valid rounding could have reversed, one row each."""
 
     step: Int[np.ndarray, "rows"]  # of the decision
     # i, j: the pair, i < j
@@ -170,16 +171,15 @@ class AmbiguousPairs(Columns):
 
 
 class PairRecorder:
-    """Writes the `pair` channel of a simulation.
+    """Recorder of the `pair` channel of a simulation.
 
-    A flip is a difference between what the program acted on at two steps, also where a new list came in
-    between: one that a spent list had missed enters when the new list finds it, one that has flown beyond the
-    new list leaves.
+    A flip is a difference between the decisions that the program used at two consecutive steps, even if the
+    list was rebuilt in between: a pair missed by a used-up list enters when the new list contains it, and a
+    pair beyond the range of the new list leaves.
 
     Args:
         simulation: the system as objects.
-        held: keys of the pairs that the list before the first one counted as inside, where a run goes on
-            with a new list.
+        held: keys of the pairs that the previous list counted as inside, if a run continues with a new list.
     """
 
     def __init__(self, simulation: Simulation, held: Int[np.ndarray, "pairs"] | None = None):
@@ -198,11 +198,11 @@ class PairRecorder:
         self._by_type = np.stack([thresholds, *simulation.jumps()])
 
     def inside(self, bits: UInt8[np.ndarray, "words atoms"]) -> int:
-        """Number of pairs inside; a full list holds each twice."""
+        """Return the number of pairs inside; a full list contains each pair twice."""
         return self._once(int(count_set(bits)))
 
     def _once(self, both: int) -> int:
-        """Pairs, of which both ends were counted."""
+        """Return the number of pairs from a count that includes each pair twice."""
         if both % 2:
             raise MdnumError(
                 "the decision of a pair differs between its two atoms", remedy="Report this as a bug"
@@ -210,18 +210,18 @@ class PairRecorder:
         return both // 2
 
     def counts(self, segment: Segment) -> Int[np.ndarray, "rows"]:
-        """Pairs inside at every step of a segment."""
+        """Return the number of pairs inside at every step of a segment."""
         if segment.changes is None:
             return np.array([self.inside(bits) for bits in segment.rows_of("bits")], np.int64)
         return np.array([self._once(int(both)) for both in segment.rows_of("inside")], np.int64)
 
     def _stacked(self, cells: Sequence[Cell]) -> tuple[Any, Any]:
-        """Boxes in double precision, and in the dtype of decisions where that is another."""
+        """Return boxes in double precision, and in the dtype of decisions if it is different."""
         dtype = self.simulation.decider.dtype
         return stacked(cells), None if dtype == "float64" else stacked(cells, dtype)
 
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
-        """Bounds on the rounding error of margins at every step of a segment, in the quantity's space."""
+        """Bounds on the rounding error of margins at each step of a segment, in the space of the quantity."""
         decider = self.simulation.decider
         if not decider.grows and not segment.cells:
             return np.repeat([decider.bounds], segment.rows, axis=0)
@@ -232,11 +232,11 @@ class PairRecorder:
         return np.concatenate([one.bounds_at(x[[row]]) for row, one in enumerate(each)])
 
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
-        """Pairs whose decision another legitimate rounding could have changed, at every step of a segment."""
+        """Number of pairs at every step of a segment whose decision another valid rounding could change."""
         return np.bincount(self.doubtful(segment).step - segment.first, minlength=segment.rows)
 
     def doubtful(self, segment: Segment) -> AmbiguousPairs:
-        """The pairs that `ambiguous` counts, in the order of their steps."""
+        """Return the pairs that `ambiguous` counts, ordered by step."""
         parts = [AmbiguousPairs.none()]
         bounds, table, dtype = self.bounds(segment), segment.table, np.dtype(self.simulation.decider.dtype)
         # almost always no pair comes that close; where one does, the host looks again
@@ -258,14 +258,14 @@ class PairRecorder:
         return AmbiguousPairs.concatenate(parts)
 
     def flips(self, segment: Segment) -> FlipTable:
-        """The flips of a segment, sorted by step, i and j (user's labels, i < j; channels as in `type_of`).
+        """Return the flips of a segment by step, i and j (user's labels, i < j; channels as in `type_of`).
 
-        Distance, margin and radial speed are those of the step of the flip, the margin with the bits that the
-        decision was made with.
+        Distance, margin and radial speed are those at the step of the flip; the margin has the bits that the
+        program used for the decision.
 
         Raises:
-            MdnumError: a flip was recorded for one atom of a pair only, or a margin contradicts its
-                decision, so the arithmetic of the compiled program differs from that of the host.
+            MdnumError: a flip was recorded for one atom of a pair only, or a margin contradicts its decision,
+                so the arithmetic of the compiled program differs from that of the host.
         """
         table, changes = segment.table, segment.changes
         replaced = self._replace(segment)
@@ -323,8 +323,7 @@ class PairRecorder:
         )  # fmt: skip
 
     def caused_by_box(self, ledger: FlipTable) -> Bool[np.ndarray, "flips"]:
-        """Which flips would not have been with the box of the step before, in which the atoms moved as they
-        did; of a box that moves."""
+        """Select the flips that would not occur, for the same motion of atoms, in the previous step's box."""
         root, inclusive = self._rule
         # the same margin, at the distance in that box
         change = ledger.by_box if root else ledger.by_box * (2 * ledger.distance - ledger.by_box)
@@ -332,21 +331,23 @@ class PairRecorder:
         return (margin >= 0 if inclusive else margin > 0) != ledger.entered
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
-        """Keys of the pairs inside at the last step, where a list has ended with it."""
+        """Return the keys of the pairs inside at the last step, if a list ended with this step."""
         if self._held_segment is not None:
             table, bits, _ = self._held_segment
             self._held_keys = _keys(self.simulation, table, np.asarray(bits))
         return self._held_keys
 
     def _cannot_differ(self, segment: Segment) -> bool:
-        """Whether the two lists hold the same pairs inside for certain."""
+        """True if the old and the new list certainly have the same pairs inside."""
         rule = self.simulation.rule
         if self._held_segment is None or not rule.safe:
             return False
         return 2 * float(segment.leap) < rule.skin and self._held_segment[2] == int(segment.inside)
 
     def _replace(self, segment: Segment) -> tuple[np.ndarray, np.ndarray] | None:
-        """Where a new list and the one before it disagree on the step before: the flips between the two."""
+        """Return the flips due to a new list whose decisions at the previous step differ from the old
+        list's.
+        """
         self.missed = 0
         if not segment.opens or (self._held_segment is None and self._held_keys is None):
             return None
@@ -372,19 +373,19 @@ class PairRecorder:
 def pair_keys(
     i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], atoms: int
 ) -> Int[np.ndarray, "pairs"]:
-    """One sorted integer for each pair i < j; to i the channel of a decision is added, as in `type_of`."""
+    """One sorted integer for each pair i < j; the channel of a decision is included in i as in `type_of`."""
     return np.sort(i.astype(np.int64) * atoms + j)
 
 
 def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "words atoms"]):
-    """Sorted keys of the pairs inside."""
+    """Return the sorted keys of the pairs inside."""
     keys = np.empty(count_set(bits), np.int64)
     return keys[: _write_keys(bits, table.index, table.order, table.place, keys)].copy()
 
 
 @njit
 def _write_keys(bits, index, order, place, keys):
-    """Keys atom after atom, each with its neighbors in order; returns how many there are."""
+    """Write the keys of each atom's pairs inside, neighbors in ascending order; return the number of keys."""
     atoms, listed, at = order.shape[0], index.shape[0] // 8, 0
     # the channel of a decision counts as one of its first atom
     for first in range(atoms * (bits.shape[0] // listed)):
@@ -405,19 +406,19 @@ def _write_keys(bits, index, order, place, keys):
 
 
 def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.ndarray, "pairs"]:
-    """Keys of the pairs that the program counted as inside at a row of a segment."""
+    """Return the keys of the pairs that the program counted as inside at a row of a segment."""
     return _keys(simulation, segment.table, bits_of(segment, row))
 
 
 def bits_of(segment: Segment, row: int) -> UInt8[np.ndarray, "words atoms"]:
-    """Packed decisions at a row of a segment; those of the last one without making its steps once more."""
+    """Return packed decisions at a row of a segment; for the last row, steps are not recomputed."""
     if row == segment.rows - 1 and segment.held is not None and segment.closes != "blow-up":
         return np.asarray(segment.held)
     return segment.rows_of("bits")[row]
 
 
 def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "pairs"]:
-    """Keys of all pairs inside, from a fresh search; same convention and bits as the program's."""
+    """Return the keys of all pairs inside, from a new search with the program's convention and bits."""
     decider = simulation.decider
     table = simulation.verlet_list(skin=0.0).build(np.asarray(wrapped, np.float64), simulation.cell)
     _, _, i, j = table.listed(simulation.channels)

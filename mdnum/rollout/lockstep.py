@@ -1,8 +1,8 @@
-"""Two runs side by side, and counterfactuals that have the arithmetic of one and the decisions of the other.
+"""Lockstep of two runs and of counterfactuals with the arithmetic of one run and the decisions of the other.
 
-Each free run is the run that it would be alone, bit for bit: its own lists, its own compiled epochs. What is
-shared is the clock. Decisions are compared through the flips of both runs, so the cost does not depend on
-how many pairs there are, and nothing of the past is kept but the pairs that differ now.
+Each free run is identical, bit for bit, to the same run on its own: it has its own lists and compiled epochs,
+and only the step counter is shared. Decisions are compared through the flips of both runs, so the cost does
+not depend on the number of pairs, and only the pairs that currently differ are stored.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from mdnum.systems.simulation import Simulation
 
 
 def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactual]) -> Iterator[PairRows]:
-    """Advance both runs, and what is compared with them, a stretch of the leader's steps at a time.
+    """Advance two runs and their counterfactuals, one segment of the leader at a time.
 
     Args:
-        leader, follower: the runs, A and B, each with the counterfactual under its decisions as listener.
-        imposed: "B|A", B's arithmetic under A's decisions, and "A|B", the other way around, where wanted.
+        leader, follower: the runs, A and B; the counterfactual under the decisions of each is its listener.
+        imposed: the requested counterfactuals: "B|A" has B's arithmetic and A's decisions, "A|B" the reverse.
     """
     tracks = {"A": leader, "B": follower}
     runs: dict[str, Track | Counterfactual] = {**tracks, **imposed}
@@ -86,16 +86,17 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
 def beside(
     leader: Track, runs: Sequence[Track | Counterfactual]
 ) -> Iterator[list[Float[np.ndarray, "rows"]]]:
-    """Separations of runs from one, a stretch of its steps at a time."""
+    """Yield separations of runs from a leader, one segment of the leader at a time."""
     while leader.segment() is not None:
         rows = leader.until(end := leader.ready)
         yield [separation_of(rows, run.until(end)) for run in runs]
 
 
 def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Largest distance between the same atoms of two runs at each step; NaN where the second has ended.
+    """Largest distance between the same atoms of two runs at each step; NaN after the end of the second run.
 
-    Positions are compared relative to the box, as lengths and nearest images in that of the first run.
+    Positions are compared relative to the box; distances are nearest-image lengths in the box of the first
+    run.
     """
     out = np.full(0 if a is None else len(a), np.nan)
     if a is not None and b is not None:
@@ -106,7 +107,7 @@ def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
 
 
 def strain_of(a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """The strain between the boxes of two runs at each step; NaN where the second has ended."""
+    """Strain between the boxes of two runs at each step; NaN after the end of the second run."""
     out = np.full(len(a), np.nan)
     if b is not None:
         rows = min(len(a), len(b))
@@ -115,7 +116,7 @@ def strain_of(a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
 
 
 def _differ(a: Rows, b: Rows) -> bool:
-    """Whether two runs may have different boxes."""
+    """True if the boxes of two runs may differ."""
     return bool(a.cells or b.cells) or not np.array_equal(a.box.matrix, b.box.matrix)
 
 
@@ -139,7 +140,7 @@ def _per_row(doubts: AmbiguousPairs, rows: Rows) -> Int[np.ndarray, "rows"]:
 
 
 def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarray, "rows"]:
-    """The smallest |margin| of each step as a length: at least so far is every pair from its cutoff."""
+    """Convert the smallest |margin| of each step to a length, a lower bound on distances to the cutoff."""
     if rows is None or rows.nearest is None:
         return np.full(len(clock), np.nan)
     margin = rows.nearest
@@ -154,7 +155,7 @@ def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarra
 
 
 def _bound(track: Track, rows: Rows | None) -> Float[np.ndarray, "rows"]:
-    """The largest rounding bound of any pair type at each step of a run as a length."""
+    """Largest rounding bound over all pair types at each step of a run, as a length."""
     if rows is None:
         return np.zeros(0)
     decider = track.simulation.decider

@@ -1,4 +1,4 @@
-"""What the pressure of a run consists of, and what its cutoff leaves out of it."""
+"""Components of a run's pressure, and the pressure that the cutoff neglects."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ _SHELL, _MOST = 0.02, 2_000
 
 @dataclass
 class PressureParts:
-    """The pressure of some steps, in parts: kinetic, virial, of each term, and impulsive.
+    """Components of the pressure: kinetic, virial (total and per term) and impulsive.
 
-    The impulsive part is that of the jump of the energy at a cutoff, 2/3 π ρ² g(r_cut) r_cut³ u(r_cut) of one
-    kind of pairs (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). A step of molecular dynamics
-    does not have it, nor does a barostat: it is the difference to the pressure of the truncated energy.
+    The impulsive component is due to the jump of the energy at a cutoff: 2/3 π ρ² g(r_cut) r_cut³ u(r_cut)
+    for one kind of pairs (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). Neither the forces of
+    molecular dynamics nor a barostat include it; it is the difference from the pressure of the truncated
+    energy.
 
     Args:
-        samples: of each step the volume, and these parts, energy/length³.
+        samples: for each sampled step, the volume and these components, energy/length³.
     """
 
     simulation: Simulation
@@ -40,11 +41,11 @@ class PressureParts:
 
     @cached_property
     def _jumps(self) -> Float[np.ndarray, "kinds"]:
-        """What a pair of each kind brings as it enters; they do not depend on the box."""
+        """Energy jump of each kind of pair at its cutoff, independent of the box."""
         return self.simulation.jumps()[0] if self.simulation.pairwise else np.zeros(1)
 
     def take(self, segment: Segment) -> None:
-        """Add the last step of a segment, of a run in a box with a volume."""
+        """Add the last step of a segment if the box is periodic and has a finite volume."""
         simulation, row = self.simulation.in_row(segment.cell_of(segment.rows - 1)), segment.rows - 1
         volume = simulation.cell.volume
         if not (np.isfinite(volume) and all(simulation.pbc)):
@@ -74,8 +75,12 @@ class PressureParts:
         self.samples.append(parts)
 
     def summary(self) -> dict[str, Any] | None:
-        """Means in the user's unit with their standard errors, as if samples were independent; and what pairs
-        beyond the cutoff would add at the mean volume. None without a sample."""
+        """Return means and standard errors in the user's unit, and cutoff corrections; None without samples.
+        samples.
+
+        Standard errors assume independent samples; the correction for pairs beyond the cutoff is evaluated at
+        the mean volume.
+        """
         if not self.samples:
             return None
         count, factor = len(self.samples), self.simulation.units.pressure_factor
@@ -105,7 +110,7 @@ _OWN = ("volume", "kinetic", "virial", "total")
 def _virials(
     simulation: Simulation, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], r: np.ndarray
 ) -> Mapping[str, float]:
-    """Sum over pairs of r · F of each term; i as for `Simulation.type_of`."""
+    """Sum of r · F over pairs for each term; i as for `Simulation.type_of`."""
     found, channel, i = {}, i // simulation.atoms, i % simulation.atoms
     for number, part in enumerate(simulation.model.parts):
         here = channel == number
@@ -123,7 +128,7 @@ def _virials(
 def _impulsive(
     r: Float[np.ndarray, "pairs"], r_cut: Float[np.ndarray, "pairs"], jump: Float[np.ndarray, "pairs"]
 ) -> float:
-    """Sum of r_cut u(r_cut) times the number of pairs per length there, which two shells inside tell."""
+    """Sum of r_cut u(r_cut) times the pair density at the cutoff, extrapolated from two shells inside it."""
     shell = np.floor((r_cut - r) / (_SHELL * r_cut))
     # the line through both shells, at the cutoff
     line = np.select([shell <= 0, shell == 1], [1.5, -0.5], 0.0)

@@ -1,4 +1,4 @@
-"""Molecular dynamics as a `Program`: run side by side, under imposed decisions, nudged and varied."""
+"""Molecular dynamics as a `Program`: runs in lockstep, with imposed decisions, perturbed or varied."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ Loss = Callable[[Simulation, Float[np.ndarray, "atoms 3"], Float[np.ndarray, "at
 
 
 def squared_displacement(simulation: Simulation, x: np.ndarray, v: np.ndarray) -> float:
-    """Mean squared displacement from the start, length squared: the loss unless another is asked for."""
+    """Mean squared displacement from the start, length squared; the default loss."""
     return float(np.mean(np.sum((x - simulation.positions) ** 2, axis=1)))
 
 
 @dataclass(frozen=True)
 class MdProgram:
-    """A simulation, where it begins, and how its atoms and axes are those that it is compared in."""
+    """A simulation with its start and the mapping of its atoms and axes to another program's."""
 
     simulation: Simulation  # the system as objects
     begin: Start | None = None  # its start; None for the system's own
@@ -48,47 +48,47 @@ class MdProgram:
 
     @property
     def steps(self) -> int:
-        """That the system's own run makes."""
+        """Number of steps of the system's own run."""
         return self.simulation.steps
 
     @property
     def timestep(self) -> float:
-        """In the user's unit of time."""
+        """Time step in the user's unit of time."""
         return self.simulation.timestep
 
     @property
     def scale(self) -> float:
-        """The longest cutoff."""
+        """Longest cutoff, the length scale of the program."""
         return self.simulation.r_cut
 
     @property
     def ulp(self) -> float:
-        """Of the largest coordinate of the start."""
+        """Unit in the last place of the largest coordinate at the start."""
         x = np.asarray(self.start.state.x)
         return float(np.spacing(np.abs(x).max().astype(x.dtype)))
 
     @property
     def streams(self) -> bool:
-        """A run may go on for as long as a verdict needs."""
+        """True: a run can be continued for as many steps as a verdict needs."""
         return True
 
     @property
     def imposable(self) -> str | None:
-        """Only pair potentials act on decisions that they are given."""
+        """None if decisions can be imposed, else the reason; they can only be imposed on pair potentials."""
         if self.simulation.imposable:
             return None
         return "a many-body potential decides inside its energy function"
 
     @cached_property
     def start(self) -> Start:
-        """Where it begins."""
+        """Initial state of the program."""
         return self.begin or first_state(self.simulation)
 
     def check(self, other: MdProgram) -> None:
-        """Check that both have the same number of atoms.
+        """Check that both programs have the same number of atoms.
 
         Raises:
-            InputError: they do not.
+            InputError: the numbers of atoms differ.
         """
         if self.size != other.size:
             raise InputError(
@@ -99,7 +99,7 @@ class MdProgram:
     def lockstep(
         self, other: MdProgram, last: int, *, forward: bool, back: bool, guard: float | None
     ) -> Iterator[PairRows]:
-        """Both runs, and counterfactuals, a stretch at a time (see `Program.lockstep`)."""
+        """Advance both runs and their counterfactuals, one segment at a time (see `Program.lockstep`)."""
         a, b = self.simulation, other.simulation
         frame, imposed = other.frame or ReferenceFrame.same(a.atoms), {}
         if forward:
@@ -112,7 +112,7 @@ class MdProgram:
     def repeats(
         self, others: Sequence[MdProgram], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Separations of perturbed runs, all beside one run of this program (see `Program.repeats`)."""
+        """Separations of perturbed runs from one run of this program (see `Program.repeats`)."""
         a = self.simulation
         frame = others[0].frame or ReferenceFrame.same(a.atoms)
         imposed = [Counterfactual(b.simulation, a, b.begin, frame, guard) for b in others]
@@ -132,9 +132,10 @@ class MdProgram:
         return list(zip(whole[: len(free)], whole[len(free) :], strict=True))
 
     def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
-        """The program with its atoms displaced at random, the furthest by about `size`.
+        """Return copies of the program with random displacements of atoms, the largest of about `size`.
 
-        By an ulp at least: a smaller displacement would be lost in the first addition.
+        The largest displacement is at least one ulp, because a smaller one would be lost in the first
+        addition.
         """
         rng = np.random.default_rng(seed)
         x, ulp = np.asarray(self.start.state.x), self.ulp
@@ -149,7 +150,7 @@ class MdProgram:
         return programs
 
     def decision(self, other: MdProgram, flips: Sequence[CrossFlip], separation: float) -> Decision:
-        """The decision at a fork: of the pairs that differ there, the one nearest to its cutoff."""
+        """Return the decision at a fork: among the pairs that differ there, the one nearest to its cutoff."""
         differing = [flip for flip in flips if flip.differs]
         flip = min(differing, key=lambda flip: abs(flip.margin) if np.isfinite(flip.margin) else np.inf)
         if np.isfinite(flip.margin):
@@ -169,7 +170,7 @@ class MdProgram:
         )  # fmt: skip
 
     def number(self, key: str) -> Number:
-        """A number of the system, by its path."""
+        """Return a number of the system, given its path."""
         simulation = self.simulation
         name = parameters.resolve(simulation, key, parameters.numbers(simulation))
 
@@ -180,7 +181,9 @@ class MdProgram:
         return Number(name, here, unit, at, parameters.is_positive(simulation, name))
 
     def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
-        """What a run decides (see `Program.history`); the loss is the squared displacement by default."""
+        """Return the decisions of a run (see `Program.history`); by default the loss is
+        `squared_displacement`.
+        """
         marks, segment = [], None
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             marks.append(marks_of(segment))
@@ -199,7 +202,7 @@ class MdProgram:
         return DecisionHistory(every, digest, x, value, energy, failed)
 
     def differing(self, other: MdProgram, steps: int, step: int, key: str = "") -> Differing:
-        """The pairs that differ at a step, the one nearest to its cutoff in both programs."""
+        """Among the pairs that differ at a step, return the one nearest to its cutoff in both programs."""
         sides = [one._pairs_at(steps, step) for one in (self, other)]
         keys = np.setxor1d(sides[0][0], sides[1][0], assume_unique=True)
         pairs = [divmod(int(key), self.size) for key in keys]
@@ -215,8 +218,7 @@ class MdProgram:
         return Differing(nearest)
 
     def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], Simulation, np.ndarray]:
-        """Keys of the pairs inside at a step, the simulation in its box then, and the positions; by the
-        program that makes all the steps."""
+        """Keys of the pairs inside at a step of a full run, the simulation in its box, and the positions."""
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             if segment.last >= step:
                 row = step - segment.first
@@ -225,8 +227,9 @@ class MdProgram:
         raise IndexError(f"the run has no step {step}")
 
     def state_at(self, step: int, last: int) -> tuple[Simulation, Float[np.ndarray, "atoms 3"]] | None:
-        """The simulation in its box at a step of a run to a last step, and wrapped positions, in the frame;
-        None where it ended before."""
+        """Simulation in its box and wrapped positions, in the frame, at a step; None if the run ended
+        before.
+        """
         track = Track(self.simulation, last, self.begin, self.frame, flips=False)
         while track.segment() is not None:
             rows = track.until(track.ready)
@@ -238,7 +241,7 @@ class MdProgram:
 
 
 def marks_of(segment: Segment) -> UInt64[np.ndarray, "rows"]:
-    """The marks of the steps of a segment: hashes of the pairs inside, whatever their order and list."""
+    """Hashes of the pairs inside at each step of a segment, independent of order and neighbor list."""
     table = segment.table
     rows = segment.rows_of("bits")
     return np.array([fingerprint_of_bits(bits, table.index, table.order)[1] for bits in rows], np.uint64)
@@ -247,11 +250,11 @@ def marks_of(segment: Segment) -> UInt64[np.ndarray, "rows"]:
 def pair_margin(
     simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int, labels: Simulation | None = None
 ) -> float:
-    """Threshold minus quantity of a pair, with the bits that the program decides by.
+    """Threshold minus quantity of a pair, with the bits of the program's own decision.
 
     Args:
         x: wrapped positions.
-        labels: whose labels i and j are; default the simulation's own.
+        labels: simulation whose labels i and j are; by default this one.
     """
     decider = simulation.decider
     kind = int((labels or simulation).type_of(np.array([i]), np.array([j]))[0])
@@ -260,6 +263,6 @@ def pair_margin(
 
 
 def pair_bound(simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int) -> float:
-    """Bound on the rounding error of the margin of a pair at these positions."""
+    """Return the bound on the rounding error of a pair's margin at the given positions."""
     kind = int(simulation.type_of(np.array([i]), np.array([j]))[0])
     return float(simulation.decider.bounds_at(x.T[None])[0, kind])

@@ -1,4 +1,4 @@
-"""A rollout into a run folder: record, check the record, and survive a kill."""
+"""Rollouts that write a run folder, check their record and can be resumed after being killed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _FRAMES_APART = 25
 
 @result
 class RunResult:
-    """What a run left behind."""
+    """Result of a run: its folder, summary, simulation and first and last frames."""
 
     folder: Path  # the run folder
     summary: dict[str, Any]  # the content of summary.json
@@ -65,7 +65,7 @@ class RunResult:
 
 @dataclass
 class _Progress:
-    """What has been done so far; all of it goes into a checkpoint."""
+    """Totals of the run so far, all of which are stored in a checkpoint."""
 
     tally: RunTally
     health: ListHealth
@@ -81,17 +81,17 @@ class _Progress:
 
 @dataclass
 class Rollout:
-    """One run on its way into its folder.
+    """One run in progress, which writes its folder.
 
     Attributes:
         simulation: the system as objects.
-        folder: where it goes.
+        folder: folder of the run.
         steps: last step.
-        save_every: a trajectory frame every so many steps; 0 for none.
+        save_every: number of steps between trajectory frames; 0 for no frames.
         progress: called with step, steps and a dictionary of figures.
         began: time.perf_counter() at the start, for the time to the first step.
-        shown: called with the simulation in its box, and the first and the last positions, as soon as there
-            are any.
+        shown: called with the simulation in its box, and the first and the last positions, as soon as they
+            are available.
         ended: the simulation in its box at the last step.
     """
 
@@ -112,7 +112,7 @@ class Rollout:
         self._earlier_seconds = 0.0
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Continue from a checkpoint's state instead of from the beginning."""
+        """Continue from the state of a checkpoint instead of from the start."""
         self.start = Start.from_arrays(saved, self.simulation)
         done = saved["done"]
         self.done = _Progress(
@@ -127,10 +127,10 @@ class Rollout:
         self.recorder = PairRecorder(self.simulation, saved.get("held"))
 
     def run(self) -> dict[str, Any]:
-        """Run to the last step and write everything but the report; returns the summary.
+        """Run to the last step, write all files except the report, and return the summary.
 
         Raises:
-            NumericalError: a number stopped being finite; everything up to the step before it is kept.
+            NumericalError: a number is no longer finite; all results up to the step before are kept.
             FolderError: the folder cannot be written.
         """
         engine = Engine(self.simulation, self.steps, start=self.start, rows=self._needs_rows())
@@ -182,7 +182,7 @@ class Rollout:
             self.shown(here, np.asarray(positions, np.float64))
 
     def _needs_rows(self) -> bool:
-        """Whether rows of the record are asked for so often that they are better kept."""
+        """True if rows of the record are needed so often that storing them is better than recomputing."""
         simulation = self.simulation
         policy = simulation.policy
         # in single precision most steps have a margin within its bound, and a bad list misses pairs
@@ -268,7 +268,9 @@ class Rollout:
         self.folder.checkpoint_beside(lambda: state if held is None else {**state, "held": held()})
 
     def _to_dict(self, point: Start) -> dict[str, Any]:
-        """What a resumed run needs to go on from a point; after a spent list also what that one held."""
+        """Return the data from which a run can be resumed; after a used-up list also its last pairs
+        inside.
+        """
         last = None if self.done.last is None else np.asarray(self.done.last).T
         frames = {"first": self.done.first, "last": last}
         return {
@@ -337,7 +339,7 @@ class Rollout:
 
 
 def _finite_rows(segment: Segment) -> Segment:
-    """The segment without the last row where that is the one that is not finite."""
+    """Return the segment without its last row if this row is not finite."""
     return replace(segment, rows=segment.rows - 1) if segment.closes == "blow-up" else segment
 
 
@@ -353,24 +355,25 @@ def run(
     progress: Progress | None = None,
     shown: Shown | None = None,
 ) -> RunResult:
-    """Simulate a system and record every flip into a run folder.
+    """Simulate a system and record every flip in a run folder.
 
     Args:
-        system: a simulation, a system, a shipped name or the path of a system file; None when resuming, but
-            for a simulation that was made of objects.
-        layout: of the new run folder, which is declared by who calls this.
+        system: a simulation, a system, a shipped name or the path of a system file; None when resuming,
+            except for a simulation that was made from objects.
+        layout: layout of the new run folder, declared by the caller.
         out: the new run folder; default runs/<name>-<n>.
-        steps: last step; default the system's.
-        save_every: a trajectory frame every so many steps; default the system's.
+        steps: last step; by default the system's.
+        save_every: number of steps between trajectory frames; by default the system's.
         overrides: dotted keys to values, as for `mdnum.systems.load`.
-        resume: continue the run in this folder; bit for bit what it would have been without the stop.
-        progress: called now and then with step, steps and a dictionary of figures.
+        resume: folder of a run to continue; the result is the same, bit for bit, as without the interruption.
+        progress: called occasionally with step, steps and a dictionary of figures.
         shown: called with the simulation in its box, and the first and the last positions, shape (atoms, 3),
-            wrapped, length, as soon as there are any; not where the run in the folder has nothing left to do.
+            wrapped, length, as soon as they are available; not called if the run in the folder is already
+            complete.
 
     Raises:
         InputError: the system cannot be run. FolderError: the folder cannot be used.
-        NumericalError: the run blew up; what came before is in the folder.
+        NumericalError: the run blew up; the results before this step are in the folder.
     """
     began = time.perf_counter()
     if resume is not None:
@@ -414,7 +417,7 @@ def _fresh(simulation: Simulation, layout: Layout, out, steps, save_every, progr
 
 
 def _finished(path: Path, steps: int | None, given: Simulation | None) -> RunResult | None:
-    """The result of a run that has nothing left to do; None where it has."""
+    """Return the result of a run that is already complete, else None."""
     folder = RunFolder.open(path)
     summary = folder.summary
     if summary.get("status") != "complete" or not folder.has_checkpoint():

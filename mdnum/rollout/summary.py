@@ -1,4 +1,4 @@
-"""What a rollout keeps of itself: totals, energy budget, health of its lists, and the summary they end in."""
+"""Totals of a rollout, its energy budget, the health of its neighbor lists, and its summary."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from mdnum.systems.simulation import Simulation
 
 @dataclass
 class LineFit:
-    """A least-squares line through points that are not kept: a run's memory must not grow with its steps.
+    """A least-squares line through points that are not stored, so that memory does not grow with the steps.
 
-    Values are taken relative to the first, so the sums carry the drift and not the energy itself.
+    Values are taken relative to the first value, so that the sums contain the drift and not the energy
+    itself.
     """
 
     count: int = 0
@@ -34,7 +35,7 @@ class LineFit:
     xy: float = 0.0
 
     def add(self, x: Float[np.ndarray, "rows"], y: Float[np.ndarray, "rows"]) -> None:
-        """Take more points."""
+        """Add points to the fit."""
         if not self.count:
             self.first = float(y[0])
         relative = y - self.first
@@ -46,7 +47,7 @@ class LineFit:
 
     @property
     def slope(self) -> float | None:
-        """dy/dx; None for fewer than three points, or where their squares are out of a float's range."""
+        """Slope dy/dx; None for fewer than three points, or if their squares underflow or overflow."""
         spread = self.count * self.xx - self.x * self.x
         if self.count < 3 or not 1e-280 < spread < np.inf:
             return None
@@ -55,7 +56,7 @@ class LineFit:
 
 @dataclass
 class RunTally:
-    """Totals over the rows seen so far."""
+    """Totals over the rows recorded so far."""
 
     step: int = -1
     entered: int = 0
@@ -99,18 +100,18 @@ class RunTally:
         self.without_jumps.add(rows["time"], rows["conserved"] - jumps)
 
     def to_dict(self) -> dict:
-        """Plain values, for a checkpoint."""
+        """Return the totals as plain values for a checkpoint."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict) -> RunTally:
-        """The inverse of `to_dict`."""
+        """Restore the totals from the values of `to_dict`."""
         lines = {name: LineFit(**values[name]) for name in ("conserved", "without_jumps")}
         return cls(**{**values, **lines})
 
 
 def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, flips: int) -> str:
-    """A line of log.txt: a row of a segment with the pairs inside and the flips up to there."""
+    """Format a line of log.txt for a row of a segment, with pairs inside and flips up to this step."""
     potential, kinetic = segment.rows_of("potential")[row], segment.rows_of("kinetic")[row]
     temperature = 2 * kinetic / (degrees_of_freedom(simulation) * simulation.units.k_B)
     step = segment.first + row
@@ -122,7 +123,7 @@ def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, fli
 
 
 def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dict[str, Any]:
-    """The content of summary.json, without the references' and the report's part."""
+    """Return the content of summary.json, except the entries of the references and the report."""
     tally, health, budget = done.tally, done.health, done.budget
     jumps = energy_jump, force_jump = simulation.jumps()
     pairs = pair_names(simulation.symbols)
@@ -192,7 +193,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
 
 
 def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> str:
-    """Words that name the two atoms closest to one another, to follow a sentence about a blow-up."""
+    """Return a phrase that names the closest two atoms, to be appended to a message about a blow-up."""
     if simulation.atoms < 2 or not np.all(np.isfinite(positions)):
         return ""
     wrapped, _ = wrap_positions(simulation.cell, positions)
@@ -212,7 +213,7 @@ def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]
 
 
 def degrees_of_freedom(simulation: Simulation) -> int:
-    """3 N, less the three of a center of mass that nothing moves."""
+    """Number of degrees of freedom: 3 N, minus three if the momentum of the center of mass is conserved."""
     return simulation.integrator.freedom(simulation.masses)
 
 
@@ -224,15 +225,15 @@ def series_columns(
     ledger: FlipTable,
     by_box: Bool[np.ndarray, "flips"] | None = None,
 ) -> dict[str, np.ndarray]:
-    """The rows of series.parquet for a segment.
+    """Return the rows of series.parquet for a segment.
 
     Args:
         simulation: the system as objects.
-        segment: what the engine recorded.
-        pairs: pairs inside at each row.
-        ambiguous: pairs within the rounding bound at each row.
+        segment: the engine's record.
+        pairs: number of pairs inside at each row.
+        ambiguous: number of pairs within the rounding bound at each row.
         ledger: the flips of the segment.
-        by_box: which of them the box has caused, where it moves.
+        by_box: mask of the flips that the box caused; None if the box is fixed.
     """
     units = simulation.units
     step = np.arange(segment.first, segment.first + segment.rows)
@@ -274,7 +275,7 @@ def series_columns(
 
 
 def _lattice(vectors: Float[np.ndarray, "rows 3 3"]) -> dict[str, np.ndarray]:
-    """Lengths of lattice vectors, and the angles between them in degrees."""
+    """Lengths of the lattice vectors, and the angles between them in degrees."""
     lengths = np.linalg.norm(vectors, axis=2)
     pairs = np.array([1, 2, 0]), np.array([2, 0, 1])
     dots, products = (np.prod([one[:, k] for k in pairs], axis=0) for one in (vectors, lengths))
@@ -297,7 +298,7 @@ _NOISES = 20.0
 
 @dataclass
 class EnergyBudget:
-    """Checks the ledger against an evaluation that shares no list with the run."""
+    """Check of the ledger's energy jumps against an evaluation that does not use the run's neighbor lists."""
 
     simulation: Simulation  # the system as objects
     start: float | None = None  # hard energy minus reference energy at step 0, or None before it was seen
@@ -316,13 +317,13 @@ class EnergyBudget:
     def check(
         self, step: int, positions: Float[np.ndarray, "atoms 3"], potential: float, cell: Cell | None = None
     ) -> dict:
-        """Close the budget at one step; returns the numbers behind the energy there (`Simulation.numbers`).
+        """Check the budget at one step; return the numbers computed with its energy (`Simulation.numbers`).
 
         Args:
             step: the step.
-            positions: wrapped positions at it, shape (atoms, 3).
-            potential: potential energy that the run computed there.
-            cell: the box there; needed where the integrator moves it.
+            positions: wrapped positions at this step, shape (atoms, 3).
+            potential: potential energy that the run computed at this step.
+            cell: the box at this step; required if the integrator changes the box.
         """
         energy, numbers = self._reference.in_row(cell).numbers(positions)
         difference = potential - energy
@@ -338,7 +339,7 @@ class EnergyBudget:
 
     @property
     def tolerance(self) -> float:
-        """Deviation below which the budget closes: a tenth of the smallest jump, or rounding."""
+        """Largest deviation at which the budget closes: a tenth of the smallest jump, or rounding error."""
         if self._reference is not self.simulation:
             jumps = np.abs(self.simulation.jumps()[0])
             return _SHARE_OF_A_JUMP * float(jumps[jumps > 0].min())
@@ -349,16 +350,16 @@ class EnergyBudget:
 
     @property
     def closes(self) -> bool:
-        """Whether every check stayed within the tolerance."""
+        """True if every check was within the tolerance."""
         return abs(self.residual) <= self.tolerance
 
     def to_dict(self) -> dict:
-        """Plain values, for a checkpoint."""
+        """Return the budget as plain values for a checkpoint."""
         return {name: getattr(self, name) for name in self._fields}
 
     @classmethod
     def from_dict(cls, simulation: Simulation, values: dict) -> EnergyBudget:
-        """The inverse of `to_dict`."""
+        """Restore the budget from the values of `to_dict`."""
         return cls(simulation, **values)
 
 
@@ -367,7 +368,7 @@ class EnergyBudget:
 
 @dataclass
 class Epoch:
-    """One list in use: what has been seen of it so far."""
+    """Statistics of the neighbor list in use, up to the current step."""
 
     epoch: int
     start: int
@@ -384,28 +385,28 @@ class Epoch:
 
     @classmethod
     def of(cls, segment: Segment) -> Epoch:
-        """The epoch that a segment belongs to, before its first row."""
+        """Return the statistics of the epoch of a segment, before its first row."""
         table = segment.table
         return cls(
             segment.epoch, segment.built, table.pairs, table.slots, table.occupancy, 1e3 * table.build_seconds
         )
 
     def to_dict(self) -> dict:
-        """Plain values, for a checkpoint."""
+        """Return the statistics as plain values for a checkpoint."""
         return {**self.__dict__, "lost": sorted(self.lost)}
 
     @classmethod
     def from_dict(cls, values: dict) -> Epoch:
-        """The inverse of `to_dict`."""
+        """Restore the statistics from the values of `to_dict`."""
         return cls(**{**values, "lost": set(values["lost"])})
 
 
 @dataclass
 class ListHealth:
-    """Follows the lists of a run and counts what went wrong.
+    """Monitor of a run's neighbor lists, which counts missed pairs and dangerous rebuilds.
 
-    A list can only lose a pair once two atoms together have used up the skin. With a safe rebuild rule that
-    never happens; where it does, every such step is audited against a fresh search.
+    A list can miss a pair only after two atoms together have used up the skin. With a safe rebuild rule this
+    never happens; otherwise, every such step is compared with a new search.
     """
 
     simulation: Simulation  # the system as objects
@@ -419,11 +420,11 @@ class ListHealth:
     mismatches: int = 0
 
     def take(self, segment: Segment, missed: int) -> list[dict[str, np.ndarray]]:
-        """Account for a segment; returns the rows of the epochs that are known to have ended.
+        """Add a segment; return the rows of the epochs that are known to have ended.
 
         Args:
-            segment: what the engine recorded.
-            missed: pairs that the list before had missed at its last step, as this one found.
+            segment: the engine's record.
+            missed: number of pairs that the previous list missed at its last step, according to the new list.
         """
         self.mismatches += missed > 0
         rows = []
@@ -447,7 +448,7 @@ class ListHealth:
         return rows
 
     def last_row(self) -> dict[str, np.ndarray] | None:
-        """The row of the list that is in use when a run comes to its end."""
+        """Return the row of the list that is in use when a run ends."""
         return None if self.current is None else self._close(self.current, "end")
 
     def _audit(self, segment: Segment, moved, epoch: Epoch) -> None:
@@ -494,14 +495,14 @@ class ListHealth:
         return {name: np.array([value]) for name, value in values.items()}
 
     def to_dict(self) -> dict:
-        """Plain values, for a checkpoint."""
+        """Return the monitor's counts as plain values for a checkpoint."""
         values = {k: v for k, v in self.__dict__.items() if k not in ("simulation", "current", "lost")}
         current = None if self.current is None else self.current.to_dict()
         return {**values, "lost": sorted(self.lost), "current": current}
 
     @classmethod
     def from_dict(cls, simulation: Simulation, values: dict) -> ListHealth:
-        """The inverse of `to_dict`."""
+        """Restore a monitor from the values of `to_dict`."""
         current = None if values["current"] is None else Epoch.from_dict(values["current"])
         rest = {k: v for k, v in values.items() if k not in ("lost", "current")}
         return cls(simulation, current=current, lost=set(values["lost"]), **rest)

@@ -1,4 +1,4 @@
-"""Steps of one run in order, in the labels and axes of another, with the flips among them."""
+"""Consecutive steps of one run, and the flips among them, in the labels and axes of another run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mdnum.systems.simulation import Simulation
 
 @dataclass(frozen=True)
 class Rows:
-    """Some steps of one run, in the labels and the frame of the first run."""
+    """Consecutive steps of one run, in the labels and axes of the first run."""
 
     first: int  # step of the first row
     # x, v: wrapped positions and full-step velocities, shape (rows, 3, atoms), float64
@@ -47,11 +47,11 @@ class Rows:
 
     @property
     def boxes(self) -> tuple[Cell, ...]:
-        """The box of each row."""
+        """Box of each row."""
         return self.cells or (self.box,) * len(self)
 
     def seen_by(self, frame: ReferenceFrame) -> Rows:
-        """The same in the labels and axes of another run."""
+        """Return the rows in the labels and axes of another run."""
         if frame.is_same:
             return self
         by = np.array([self.box.deformation(cell) for cell in self.cells]) if self.cells else None
@@ -59,7 +59,7 @@ class Rows:
         return replace(self, x=x, v=v, cells=frame.boxes(self.cells, self.box))
 
     def cut(self, count: int) -> tuple[Rows, Rows]:
-        """The first rows, and the rest."""
+        """Split the rows into the first `count` rows and the remaining ones."""
 
         def part(rows: slice, **changed: Any) -> Rows:
             columns = {name: getattr(self, name) for name in _COLUMNS}
@@ -70,7 +70,7 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: list[Rows]) -> Rows:
-        """Consecutive rows as one."""
+        """Join consecutive rows."""
         if len(parts) == 1:
             return parts[0]
         columns = {name: [getattr(part, name) for part in parts] for name in _COLUMNS}
@@ -87,7 +87,7 @@ _COLUMNS = ("x", "v", "energy", "nearest", "overridden", "furthest")
 
 
 def taken(ahead: list[Rows], last: int) -> Rows | None:
-    """The rows up to a step, taken off those that were read ahead; None where there are none."""
+    """Remove the rows up to a step from those already read, and return them; None if there are none."""
     parts: list[Rows] = []
     while ahead and ahead[0].first <= last:
         rows = ahead.pop(0)
@@ -104,11 +104,11 @@ class Track:
     Args:
         simulation: the run.
         last: last step.
-        start: where it begins; default the system's own start.
-        frame: how its atoms and axes are those of the first run.
-        flips: whether to read its flips.
+        start: initial state; by default the system's own start.
+        frame: mapping of this run's atoms and axes to those of the first run.
+        flips: whether to read the run's flips.
         listener: called with each segment as it is read, while its decisions are still on the device.
-        pins: decisions that are imposed on it.
+        pins: decisions imposed on the run.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class Track:
         self.failed = ""
 
     def segment(self) -> Segment | None:
-        """The next stretch of this run, its rows and flips kept for `until`; None at the end."""
+        """Read the next segment of this run; keep its rows and flips for `until`. Return None at the end."""
         segment = next(self._segments, None)
         if segment is None:
             return None
@@ -153,24 +153,24 @@ class Track:
 
     @property
     def ready(self) -> int:
-        """The last step that has been read."""
+        """Last step that has been read."""
         return self._ahead[-1].last
 
     def until(self, last: int) -> Rows | None:
-        """The rows up to a step that were not yet asked for; fewer where the run ends, None without any."""
+        """Rows up to a step that were not returned before; fewer if the run ends, None if there are none."""
         while not self._ahead or self.ready < last:
             if self.segment() is None:
                 break
         return taken(self._ahead, last)
 
     def flips(self, last: int) -> PairFlips:
-        """The flips up to a step that were not yet asked for."""
+        """Return the flips up to a step that have not been returned before."""
         every = PairFlips.concatenate(self._flips)
         self._flips = [every[every.step > last]]
         return every[every.step <= last]
 
     def doubts(self, last: int) -> AmbiguousPairs:
-        """The ambiguous decisions up to a step that were not yet asked for, in the first run's labels."""
+        """Ambiguous decisions up to a step that were not returned before, in the labels of the first run."""
         every = AmbiguousPairs.concatenate(self._doubts)
         taken = every[every.step <= last]
         self._doubts = [every[every.step > last]]
@@ -179,13 +179,13 @@ class Track:
 
 
 def _flips_of(ledger: FlipTable, frame: ReferenceFrame) -> PairFlips:
-    """The columns that a comparison needs, in the labels of the first run."""
+    """Return the columns of a ledger that a comparison needs, in the labels of the first run."""
     keys = frame.keys_of(ledger.i, ledger.j)
     return PairFlips(ledger.step, keys, ledger.entered, ledger.margin, ledger.bound)
 
 
 def rows_of(simulation: Simulation, segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
-    """A segment's rows in the user's order of atoms, as another run has them."""
+    """Return a segment's rows in the user's order of atoms, in the labels and axes of another run."""
     x, v = (in_user_order(segment.rows_of(name), segment.table.order) for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
     nearest = segment.rows_of("nearest").astype(np.float64)
