@@ -147,9 +147,7 @@ class Start:
 
     @classmethod
     def from_arrays(cls, arrays, simulation: Simulation) -> Start:
-        """Restore a start from the arrays of `to_arrays`, bit for bit; the default box is the
-        simulation's.
-        """
+        """Restore a start from the arrays of `to_arrays`, bit for bit; the box defaults to the system's."""
         places: Any = (jnp.asarray(arrays[f"state_{name}"]) for name in EpochState._fields[:-2])
         first = first_state(simulation).state
         leaves, structure = jax.tree.flatten(first.extra)

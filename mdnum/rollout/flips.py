@@ -345,9 +345,7 @@ class PairRecorder:
         return 2 * float(segment.leap) < rule.skin and self._held_segment[2] == int(segment.inside)
 
     def _replace(self, segment: Segment) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the flips due to a new list whose decisions at the previous step differ from the old
-        list's.
-        """
+        """Return the flips due to a new list that decides the previous step differently from the old list."""
         self.missed = 0
         if not segment.opens or (self._held_segment is None and self._held_keys is None):
             return None

@@ -181,9 +181,7 @@ class MdProgram:
         return Number(name, here, unit, at, parameters.is_positive(simulation, name))
 
     def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
-        """Return the decisions of a run (see `Program.history`); by default the loss is
-        `squared_displacement`.
-        """
+        """Return a run's decisions (see `Program.history`); the default loss is `squared_displacement`."""
         marks, segment = [], None
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             marks.append(marks_of(segment))
@@ -227,9 +225,7 @@ class MdProgram:
         raise IndexError(f"the run has no step {step}")
 
     def state_at(self, step: int, last: int) -> tuple[Simulation, Float[np.ndarray, "atoms 3"]] | None:
-        """Simulation in its box and wrapped positions, in the frame, at a step; None if the run ended
-        before.
-        """
+        """Simulation in its box and wrapped positions, in the frame, at a step; None after the run's end."""
         track = Track(self.simulation, last, self.begin, self.frame, flips=False)
         while track.segment() is not None:
             rows = track.until(track.ready)

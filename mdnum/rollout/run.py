@@ -268,7 +268,7 @@ class Rollout:
         self.folder.checkpoint_beside(lambda: state if held is None else {**state, "held": held()})
 
     def _to_dict(self, point: Start) -> dict[str, Any]:
-        """Return the data from which a run can be resumed; after a used-up list also its last pairs
+        """Return the data for resuming a run from a point; after a used-up list also its last pairs
         inside.
         """
         last = None if self.done.last is None else np.asarray(self.done.last).T

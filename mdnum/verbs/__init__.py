@@ -1,16 +1,16 @@
-"""The verbs, a module each; their functions are those of `mdnum`.
+"""The verbs, one module each; their functions are the functions of `mdnum`.
 
-A verb declares itself in its module and the text file beside it, and nothing else keeps a list of what is in
-them. The text file has
+Each verb is declared in its module and in the text file of the same name; there is no other list of its
+commands and folders. In addition to the verb's sentences, the text file contains
 
-    [command], or [group] and [commands.NAME]   what is typed (see `mdnum.cli.commands`)
-    [kinds.KIND]                                folders that it makes (see `mdnum.store.layout.Layout`)
+    [command], or [group] and [commands.NAME]   commands as typed (see `mdnum.cli.commands`)
+    [kinds.KIND]                                folders that the verb writes (see `mdnum.store.layout.Layout`)
 
-beside its sentences, and the module
+and the module contains the functions that its commands call and
 
-    KINDS = {"KIND": Verb(judge, page)}         how those are judged and shown (see `mdnum.verbs.frame`)
+    KINDS = {"KIND": Verb(judge, page)}         how folders are judged and shown (see `mdnum.verbs.frame`)
 
-with the functions that its commands call. Nothing of a verb is imported before it is asked.
+A verb's module is imported only when the verb is used.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mdnum.registry import Registry
 
 
 def _check(module: Any) -> None:
-    """Refuses the module of another package that has not what its text file declares."""
+    """Raise an error if another package's module lacks something that its text file declares."""
     from mdnum.store import Layout
 
     texts, name = beside(module.__file__), module.__name__
@@ -66,7 +66,7 @@ PARTIAL, UNDECIDED = "partial", "undecided"
 
 @dataclass(frozen=True)
 class Reply:
-    """What a command says on the spot, without a folder."""
+    """Result of a command that is printed immediately, without a folder."""
 
     document: Mapping[str, Any]  # for JSON
     # for people: lines, findings, and tables of a title, columns and rows, or of a title and records
@@ -75,10 +75,10 @@ class Reply:
 
 
 def assigned(text: str, example: str) -> tuple[str, str]:
-    """The key and the value of "key=value".
+    """Split "key=value" into key and value.
 
     Raises:
-        InputError: it is not of that form; `example`, an option and its value, is.
+        InputError: the text is not of the form key=value; `example`, an option and its value, is shown.
     """
     key, equals, value = (part.strip() for part in text.partition("="))
     if not equals or not key:
@@ -88,24 +88,24 @@ def assigned(text: str, example: str) -> tuple[str, str]:
 
 
 def declared(name: str) -> Mapping[str, Any]:
-    """The text file of an entry of `VERBS`.
+    """Return the text file of an entry of `VERBS`.
 
     Raises:
-        InputError: the package that adds it has none.
+        InputError: the package that adds the entry has no text file.
     """
     return beside(_file(name))
 
 
 def of_command(command: str) -> Iterator[str]:
-    """Entries of `VERBS` that are of one command of the command line."""
+    """Yield the entries of `VERBS` that belong to one command of the command line."""
     return (name for name in VERBS if name.split()[0] == command)
 
 
 def home(kind: str) -> str:
-    """The entry of `VERBS` that declares a kind of folder.
+    """Return the entry of `VERBS` that declares a kind of folder.
 
     Raises:
-        InputError: no verb of this installation does.
+        InputError: no installed verb declares the kind.
     """
     # a text file without that heading need not be parsed
     heading = re.compile(rf"^\[kinds\.{re.escape(kind)}[].]", re.MULTILINE)
@@ -121,10 +121,10 @@ def home(kind: str) -> str:
 
 
 def schema(kind: str) -> dict[str, Any]:
-    """The JSON Schema of a kind's documents: mdnum's, that of the package with the kind, or answer.json.
+    """Return the JSON Schema of a kind's documents: of mdnum, of the package with the kind, or answer.json.
 
     Raises:
-        InputError: no verb of this installation makes such documents.
+        InputError: no installed verb makes such documents.
     """
     shipped = Path(__file__).parents[1] / "schemas"
     file = shipped / f"{kind}.json"
@@ -136,7 +136,7 @@ def schema(kind: str) -> dict[str, Any]:
 
 
 def _file(name: str) -> str:
-    """The file of a module, found without importing it or a package that it is in."""
+    """Return the file of a module, found without importing the module or its packages."""
     first, *rest = VERBS.place(name).split(".")
     spec = importlib.util.find_spec(first)
     places = [] if spec is None else spec.submodule_search_locations or [str(Path(str(spec.origin)).parent)]

@@ -1,8 +1,8 @@
-"""`mdnum audit`: is this ASE calculator safe to run and to differentiate?
+"""`mdnum audit`: tests of whether an ASE calculator is safe to run and to differentiate.
 
-Every check of `mdnum.audit.checks.CHECKS` is asked in its order; the folder fills up check by check, so
-whatever ends an audit, what was found is in it and the rest can be asked later. A check gives codes and
-values, and its sentences are in audit.toml.
+The checks of `mdnum.audit.checks.CHECKS` run in order, and each result is saved in the folder at once. If an
+audit is interrupted, its results so far are in the folder and the remaining checks can be done later. A check
+returns codes and values; the corresponding sentences are in audit.toml.
 """
 
 from __future__ import annotations
@@ -60,41 +60,42 @@ def audit(
     report: bool = True,
     progress: Wanted = None,
 ) -> Outcome:
-    """Ask a calculator whether it is safe to run and to differentiate.
+    """Test whether a calculator is safe to run and to differentiate.
 
-    How much is asked is counted in calls of the calculator and does not depend on how fast it answers: some
-    6,000 calls for one element, and 12,000 at most. What leads to a verdict is asked first. Whatever ends an
-    audit, the checks that were done are in its folder.
+    The effort is limited by the number of calls of the calculator, independent of its speed: about 6,000
+    calls for one element, and at most 12,000. Calls that lead to a verdict come first. If an audit is
+    interrupted, the completed checks are in its folder.
 
     Example:
         >>> mdnum.audit_calculator(ase.calculators.emt.EMT(), "copper.xyz").verdict
 
     Args:
-        calculator: as the command line names one, or a function that makes a new ASE calculator; may be left
-            out where an audit of one that was named in words is resumed. The Python that it names is run.
-        structure: ASE's atoms or a file that ASE reads; by default what comes with the calculator, or one
-            that is built for it.
+        calculator: a name as on the command line, or a function that makes a new ASE calculator; may be
+            omitted when resuming an audit of a named calculator. The Python code that the name refers to is
+            run.
+        structure: an ASE `Atoms` object or a file that ASE can read; by default the calculator's own
+            structure, or one that is built for it.
         checks: names of `CHECKS`; default all.
-        temperature: K, of kT and of the run; default the system's own, or 300.
-        timestep: of the run, fs (τ of a system in reduced units); default a fraction of the fastest
-            vibration.
-        steps: of the run; default 200.
-        time: minutes, after which nothing more is asked; what was not asked by then is listed, and can be
-            resumed.
+        temperature: temperature of kT and of the run, K; by default the system's own, or 300.
+        timestep: time step of the run, fs (τ for a system in reduced units); by default a fraction of the
+            period of the fastest vibration.
+        steps: number of steps of the run; default 200.
+        time: time limit in minutes, after which the calculator is not called again; unfinished checks are
+            listed and can be resumed.
         out: the new audit folder; default runs/audit-<name>-<n>.
-        resume: the folder of an audit that was killed, stopped or short of time: the checks that it holds are
-            kept, the others are made as it was asked for.
+        resume: folder of an audit that was killed, stopped or out of time: its results are kept, and the
+            remaining checks are run with the original options.
         report: write report.html.
         progress: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        an outcome whose `result` holds what each check found, by its name.
+        an outcome whose `result` contains the findings of each check by its name.
 
     Raises:
-        InputError: no such calculator, structure or check; something that a resumed audit has already.
+        InputError: no such calculator, structure or check; an option that a resumed audit already has.
         FolderError: the folder cannot be used.
-        frame.Interrupted: control-C was pressed after a check was done; what was found till then has been
-            written, its page included, and is the exception's `outcome`.
+        frame.Interrupted: control-C was pressed after a check was done; the results so far, including the
+            report, have been written and are the exception's `outcome`.
     """
     from mdnum.audit.record import AuditState, encoded, kept
     from mdnum.deadline import Deadline
@@ -146,7 +147,7 @@ def _ask_all(
     report: bool,
     progress: Progress | None,
 ) -> Outcome:
-    """Asks the checks that are not done, keeping each answer, and finishes the folder."""
+    """Run the checks that are not done, save each result, and finish the folder."""
     from mdnum.audit.subject import CalculatorSubject
     from mdnum.audit.thresholds import find_thresholds
     from mdnum.deadline import interrupting
@@ -219,9 +220,10 @@ def _ask_all(
 def answer_of(
     check: AuditCheck, subject: CalculatorSubject, log: frame.Progress, before: Iterable[CheckResult]
 ) -> CheckResult:
-    """A check's answer; where the calculator fails and it cannot continue, the failure as a finding.
+    """Return a check's result; if the calculator fails and the check cannot continue, the failure is a
+    finding.
 
-    With the finding that one question has had two answers, where no result before has it.
+    A finding is added if the calculator gave two results for one input, unless an earlier result has it.
     """
     named: dict[str, Any] = {"name": check.name, "title": check.title}
     rest = f"the rest of {check.name}"
@@ -242,7 +244,7 @@ def answer_of(
 
 
 def _keep_evidence(folder: RunFolder, loaded: LoadedCalculator, check: AuditCheck) -> None:
-    """Structures that show a finding, to the last bit, and a script that shows it without mdnum."""
+    """Write structures that reproduce a finding to the last bit, and a script that does so without mdnum."""
     from mdnum.audit.record import STRUCTURES, script
 
     _write_structures(folder, check.structures)
@@ -289,7 +291,7 @@ def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
 
 
 def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: Path) -> LoadedCalculator:
-    """The calculator of an audit that is resumed."""
+    """Return the calculator of an audit that is resumed."""
     if calculator is None and not state.named:
         raise InputError(
             "the calculator of this audit was an object without a name",
@@ -319,7 +321,7 @@ def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator, d
 
 
 def _internal(timestep: float | None, given: units.Units) -> float | None:
-    """A time step in length * sqrt(mass / energy), of one in fs, or in τ for reduced units."""
+    """Convert a time step from fs (τ for reduced units) to length * sqrt(mass / energy)."""
     if timestep is None:
         return None
     if not timestep > 0:
@@ -333,7 +335,7 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
 
 
 def _summary(state: AuditState) -> dict[str, Any]:
-    """The content of summary.json, without what is judged."""
+    """Return the content of summary.json, except the verdict."""
     atoms, given = state.atoms, units.get(state.units)
     texts, said = Texts(__file__, given), conclusion.answers(state.shown, state.checks)
     why = state.why or "not finished"
@@ -368,7 +370,7 @@ def _summary(state: AuditState) -> dict[str, Any]:
 
 
 def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
-    """Points of the figures, and what checks recorded."""
+    """Return the points of the figures and the data that checks recorded."""
     lines = [
         (result.name, f"{result.name}-{place}", label, chart.x, values)
         for result in state.shown
@@ -384,7 +386,7 @@ def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _named(value: Any, given: units.Units) -> Any:
-    """What checks found with the names of units where their text leaves room for them."""
+    """Return a check's values with the names of units in place of their placeholders."""
     if isinstance(value, units.Measured):
         return value.to("", vars(given))
     if isinstance(value, str):
@@ -402,7 +404,7 @@ def _named(value: Any, given: units.Units) -> Any:
 
 
 def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]]:
-    """(finding, those that may follow from it) of each that is listed by itself."""
+    """Group findings as (finding, findings that may follow from it)."""
     above = heads([(one.code, one.severity) for one in found])
     return [
         (one, [other for k, other in enumerate(found) if k != place and above[k] == place])
@@ -412,7 +414,9 @@ def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]
 
 
 def _finding(one: Observed, section: str, cause: str, texts: Texts = TEXTS) -> Finding:
-    """The sentences of what was found; of a check of another package, those that it gave."""
+    """Return the sentences of a finding; for a check of another package, the sentences that the check
+    provides.
+    """
     if one.code not in TEXTS.entries:
         given = {name: str(one.values.get(name, "")) for name in ("title", "text", "remedy")}
         return Finding(one.code, one.severity, **given, values=one.values, section=section, cause=cause)
@@ -425,20 +429,20 @@ def _finding(one: Observed, section: str, cause: str, texts: Texts = TEXTS) -> F
 
 @dataclass(frozen=True)
 class AuditView(View):
-    """The folder of an audit."""
+    """View of an audit's folder."""
 
     given: AuditState | None = None  # what it has found, where that is known; it is read otherwise
 
     @cached_property
     def state(self) -> AuditState:
-        """What was found."""
+        """State of the audit, with the results of its checks."""
         from mdnum.audit.record import kept
 
         return kept(self.folder) if self.given is None else self.given
 
 
 def _judge(view: AuditView) -> Verdict:
-    """Findings, errors first, and both answers in one sentence."""
+    """Return the findings, errors first, and the conclusions on both questions in one sentence."""
     state = view.state
     given, titles, more = units.get(state.units), {}, conclusion.concluded(state.shown)
     texts, observed = Texts(__file__, given), []
@@ -460,7 +464,7 @@ def _judge(view: AuditView) -> Verdict:
 
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
-    """Both answers, what they do not rest on, and the worst that was found."""
+    """State both conclusions, the checks that are missing from them, and the most severe finding."""
     shown, early = state.shown, conclusion.to_come(state.shown, state.checks)
     said, begun = conclusion.answers(shown, state.checks), {one.name for one in shown}
     name = TEXTS("on", name=state.name, formula=state.atoms.get_chemical_formula())
@@ -543,7 +547,7 @@ def _ways(part: Mapping[str, Any]) -> str:
 
 
 def _marked(rows: Sequence[Mapping[str, Any]], title: str) -> Any:
-    """A table with what went wrong on top, where it is seen."""
+    """Format a table with the rows of failed tests at the top."""
     order = sorted(rows, key=lambda row: not any(value is False for value in row.values()))
     bad = frozenset(n for n, row in enumerate(order) if any(value is False for value in row.values()))
     return replace(records(order, title, shown=8), bad=bad)

@@ -1,4 +1,6 @@
-"""`mdnum ball` as a function: bounce a ball, compare variants and gradients, judge, show."""
+"""`mdnum ball` as a function: bouncing balls, variants of a run and their gradients, with verdict and
+report.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,7 @@ def bounce(
 
     Args:
         system: a loaded system, a shipped name or the path of a system file.
-        steps: instead of the system's.
+        steps: number of steps, instead of the system's.
         against: further variants to compare with: "key=value", or several keys in a mapping.
         keep: see `frame.Keep`.
 
@@ -70,10 +72,10 @@ def bounce(
 
 
 def command(system: str | None = None, *, demo: str | None = None, **given: Any) -> Outcome | Reply:
-    """`mdnum ball`: a ball, a demonstration, or what there is of both for somebody who named nothing.
+    """Execute `mdnum ball`: run a ball or a demonstration; without a name, list what is available.
 
     Raises:
-        InputError: a demonstration and something about a ball.
+        InputError: a demonstration is combined with options of a ball.
     """
     from mdnum import systems
     from mdnum.verbs import demos
@@ -115,7 +117,7 @@ def _loaded(
 
 
 def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun, float | None]:
-    """The run, and steps per second after the part that holds the compilation (None for a short one)."""
+    """Return the run, and the steps per second after compilation (None for a short run)."""
     marks: list[tuple[float, int]] = []
 
     def rate() -> float | None:
@@ -143,7 +145,7 @@ def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun,
 def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Loss, derivatives, closed form and variants; and the separations from the variants."""
+    """Return loss, derivatives, closed form and variants; and the separations of the variants."""
     from mdnum.ball.rollout import first_difference
     from mdnum.verbs import ball_record
 
@@ -172,7 +174,7 @@ def _differentiated(
 
 
 def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dict[str, Any]]:
-    """Each derivative that was requested, as a plain mapping.
+    """Return each requested derivative as a plain mapping.
 
     Args:
         asked: the [gradient] table.
@@ -199,7 +201,7 @@ def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dic
 
 
 def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
-    """The loss, taken from a derivative of the program itself where there is one: it is compiled already."""
+    """Return the loss, if possible from a derivative of the program itself, which is already compiled."""
     same = ("unrolled", "frozen", "event-aware")
     known = [made["value"] for made in gradient if made["method"] in same and not made["refused"]]
     return known[0] if known else problem.value()
@@ -209,7 +211,7 @@ def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
 
 
 def judge(view: BallView) -> Verdict:
-    """Findings, and what is right, from the folder alone."""
+    """Return findings and evidence for a correct run, from the folder alone."""
     summary = view.summary
     rules = (
         _finite, _ledger, _finite_gradient, _independent, _ambiguous, _cap, _disagree, _forks, _iterations,
@@ -250,7 +252,7 @@ def _evidence(view: BallView, codes: set[str]) -> Iterator[str]:
 
 
 def differs(first: float | None, second: float | None) -> bool:
-    """Whether two derivatives differ by more than one percent of the larger; missing ones differ."""
+    """True if two derivatives differ by more than one percent of the larger, or if only one is missing."""
     if first is None or second is None:
         return first is not second
     return abs(first - second) > _DISAGREE * max(abs(first), abs(second))
@@ -410,7 +412,7 @@ def _iterations(view: BallView) -> Iterator[Finding]:
 
 
 def _remarks(view: BallView) -> Iterator[Finding]:
-    """What the system file says that runs, and is probably not what was meant."""
+    """Yield remarks on valid settings in the system file that were probably not intended."""
     from pydantic import ValidationError
 
     from mdnum.systems.ball import BallSpec, remarks

@@ -1,4 +1,4 @@
-"""What the page of a run of the ball shows: heights, solver, margins, derivatives, and every decision."""
+"""Report page of a ball's run: heights, solver, margins, derivatives, and every decision."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ _REASONS = ("", "none", "tolerance", "cap", "fixed", "not finite", "rest")
 
 
 class BallView(View):
-    """The folder of a run of the ball."""
+    """View of the folder of a ball's run."""
 
     @property
     def applied(self) -> list[Mapping[str, Any]]:
-        """Derivatives by method, without those that do not apply."""
+        """Derivatives by method, without the methods that are not applicable."""
         return [made for made in self.summary["gradient"] if not made["refused"]]
 
     @property
     def exact(self) -> Mapping[str, Any]:
-        """What is known in closed form; empty where nothing is."""
+        """Quantities known in closed form; empty if there are none."""
         return self.summary["exact"] or {}
 
     @property
     def parameters(self) -> list[str]:
-        """What the loss was differentiated by."""
+        """Names of the parameters with respect to which the loss was differentiated."""
         return list(dict.fromkeys(name for made in self.applied for name in made["gradient"]))
 
     @property
     def ended(self) -> dict[str, int]:
-        """How many solves ended, by what ended them."""
+        """Number of solves by the reason why they ended."""
         return {word: n for word, n in self.summary["ended"].items() if n and word != "none"}
 
     @property
     def located(self) -> bool:
-        """Whether impacts are located inside a step: what is counted are impacts, not iterations."""
+        """True if impacts are located within a step; the counts are then impacts, not iterations."""
         return self.summary["integrator"] == "event-located"
 
     def first_step(self, reason: str) -> int:
-        """The first step that something ended."""
+        """Return the first step whose solve ended for the given reason."""
         series = self.table("steps")
         return int(series["step"][np.argmax(series["reason"].astype(str) == reason)])
 
     def time(self, step: np.ndarray) -> np.ndarray:
-        """When steps were, s."""
+        """Return the times of steps, s."""
         return np.interp(step, self.table("steps")["step"], self.table("steps")["time"])
 
     @cached_property
@@ -70,7 +70,7 @@ def decision(variant: Mapping[str, Any]) -> str:
 
 
 def page(view: BallView, verdict: Verdict) -> Page:
-    """Heights, solver, margins, derivatives, closed form, variants, and every decision."""
+    """Return the page: heights, solver, margins, derivatives, closed form, variants, and every decision."""
     summary = view.summary
     about = TEXTS(
         "about", balls=summary["balls"], steps=summary["steps"], contact=summary["contact_kind"],
@@ -99,7 +99,7 @@ def page(view: BallView, verdict: Verdict) -> Page:
 
 
 def _groups(x: np.ndarray, y: np.ndarray, *groups: tuple[np.ndarray, str, Role]) -> tuple[Series, ...]:
-    """A set of points for each group that has any finite ones."""
+    """Return a set of points for each group that has finite points."""
     return tuple(
         Series(label, x[mine], y[mine], "points", role)
         for mine, label, role in groups
@@ -146,7 +146,7 @@ def _nearest(view: BallView) -> Iterator[Plot]:
 
 
 def _ranges(view: BallView) -> Iterator[Any]:
-    """What each quantity asks of a format, and the steps at which narrower ones would not hold it."""
+    """Yield the range of magnitudes of each quantity, and the steps at which a narrower format would fail."""
     table = range_table(lambda name: TEXTS(f"range_{name}"), view.table("steps"))
     if table.rows:
         yield table
@@ -291,7 +291,7 @@ def _variants(view: BallView) -> Iterator[Any]:
 
 
 def _contacts(view: BallView) -> Iterator[Any]:
-    """The contact flips nearest to the threshold, in the order of steps."""
+    """Yield the contact flips nearest to the threshold, ordered by step."""
     rows, ratio = view.table("contacts"), view.ratio
     if not len(ratio):
         yield TEXTS("no_contacts")
@@ -303,7 +303,7 @@ def _contacts(view: BallView) -> Iterator[Any]:
 
 
 def _stop_decisions(view: BallView) -> Iterator[Any]:
-    """The stop decisions nearest to their tolerance, in the order of steps."""
+    """Yield the stop decisions nearest to their tolerance, ordered by step."""
     rows = view.table("solver")
     if not len(rows["step"]):
         return

@@ -1,4 +1,4 @@
-"""What a run of the ball leaves in its folder: tables of every decision, a summary, the closed form."""
+"""Content of the folder of a ball's run: tables of every decision, a summary, and the closed form."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _WORST = (Reason.NONE, Reason.FIXED, Reason.TOLERANCE, Reason.REST, Reason.CAP, 
 
 
 def tables(run: BallRun) -> dict[str, dict[str, np.ndarray]]:
-    """The rows of every table."""
+    """Return the rows of every table."""
     made = {"steps": steps(run), "contacts": contacts(run), "solver": decisions(run)}
     return made | ({"heights": heights(run)} if run.kept else {})
 
 
 def steps(run: BallRun) -> dict[str, np.ndarray]:
-    """A row per state 0..steps: contacts, flips, the solver's end, margins, mean height and energy."""
+    """One row per state 0..steps: contacts, flips, the solver's end, margins, mean height and energy."""
     entered, left = run.contacts.counts(run.steps)
     inside = run.contact.sum(axis=1)
     first = inside[0] - entered[1] + left[1]
@@ -52,7 +52,7 @@ def steps(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def ranges(run: BallRun) -> dict[str, np.ndarray]:
-    """Largest and smallest magnitude in each step of the state, of the penetration and of its penalty."""
+    """Largest and smallest magnitude, at each step, of the state, of the penetration and of its penalty."""
     if not run.kept:
         return {}
     y, v = run.y.astype(np.float64), run.v.astype(np.float64)
@@ -64,7 +64,7 @@ def ranges(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def contacts(run: BallRun) -> dict[str, np.ndarray]:
-    """A row per contact flip."""
+    """Return one row per contact flip."""
     flips = run.contacts
     lift = 0.0 if run.world.lift is None else float(run.world.lift)
     return {
@@ -75,10 +75,10 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
-    """A row per stop decision of the steps that had something to solve.
+    """Return one row per stop decision, for the steps that had something to solve.
 
-    Every one where one rule stops all balls and histories were kept; else the last one of each solve, and
-    the one before.
+    All decisions are included if one rule stops all balls and histories were kept; otherwise, the last two of
+    each solve.
     """
     rule = rule_of(run)
     if rule is None:
@@ -130,7 +130,7 @@ def _histories(run: BallRun, rule: Any, busy: np.ndarray) -> dict[str, np.ndarra
 
 
 def heights(run: BallRun) -> dict[str, np.ndarray]:
-    """Height and velocity of the first balls at every step."""
+    """Return height and velocity of the first balls at every step."""
     count = min(run.balls, FOLLOWED)
     shape = (run.steps + 1, count)
     return {
@@ -142,7 +142,7 @@ def heights(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
-    """A row per step: how far the heights of a variant are from those of the run."""
+    """Return one row per step: the separation between the heights of a variant and those of the run."""
     size = len(found.separation)
     return {"variant": np.full(size, name), "step": np.arange(size), "separation": found.separation}
 
@@ -151,7 +151,7 @@ def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
 
 
 def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
-    """The run in numbers."""
+    """Return the numbers that summarize the run."""
     spec = simulation.system.spec
     entered = int(run.contacts.entered.sum())
     busy = solved(run)
@@ -182,12 +182,12 @@ def compared(
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Where a variant diverges from the run, and what that does to the loss and its gradient.
+    """Return where a variant diverges from the run, and the effect on the loss and its gradient.
 
     Args:
-        found: where it diverges from the run.
-        other: the run with the change.
-        gradient, theirs: derivatives of both, the first method's first.
+        found: where the variant diverges from the run.
+        other: the run of the variant.
+        gradient, theirs: derivatives of the run and of the variant, the first method's first.
     """
     own, their = (dict(made[0]["gradient"]) if made else {} for made in (gradient, theirs))
     forked, separation = found.fork is not None, found.separation
@@ -204,10 +204,10 @@ def compared(
 
 
 def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Errors against the closed form, or None where there is none.
+    """Return errors relative to the closed form, or None if there is none.
 
-    There is one for a ball above the floor under a constant acceleration downward, with an impact or a
-    projection (the ball with restitution) or a sharp penalty (the ball on a spring).
+    A closed form exists for a ball above the floor under a constant downward acceleration, with an impact or
+    a projection (the ball with restitution) or a sharp penalty (the ball on a spring).
 
     Args:
         gradient: derivatives, of which those of the final height are compared.
@@ -266,7 +266,7 @@ def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]
 
 
 def rule_of(run: BallRun) -> Any:
-    """The rule that stops this run's solver, or None where nothing is solved."""
+    """Return the stopping rule of this run's solver, or None if nothing is solved."""
     contact = run.world.contact
     if isinstance(contact, Projection):
         return contact.stop
@@ -274,7 +274,7 @@ def rule_of(run: BallRun) -> Any:
 
 
 def solved(run: BallRun) -> np.ndarray:
-    """Steps (and balls, where each has a solve of its own) with something to solve or locate."""
+    """True for each step (and ball, if each has its own solve) with something to solve or locate."""
     if rule_of(run) is None:
         return run.reason != Reason.NONE.value
     if isinstance(run.world.contact, Penalty):
@@ -284,12 +284,12 @@ def solved(run: BallRun) -> np.ndarray:
 
 
 def ambiguous_flips(run: BallRun) -> np.ndarray:
-    """Contact flips that another rounding could have dated otherwise; an exact height is not one."""
+    """Select contact flips whose step depends on rounding; flips with an exact height do not."""
     return run.contacts.ambiguous & (run.contacts.bound > 0)
 
 
 def ambiguous_stops(run: BallRun) -> np.ndarray:
-    """Stop decisions of each step that another order of the residual's sum could have made otherwise."""
+    """Count the stop decisions of each step that depend on the order of summation of the residual."""
     rule = rule_of(run)
     if rule is None or isinstance(rule, FixedCount):
         return np.zeros(run.steps, np.int64)
@@ -303,7 +303,9 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step; of the ball nearest to its tolerance where each has its own."""
+    """Residual and stop margin of each step; with a rule per ball, those of the ball nearest to its
+    tolerance.
+    """
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

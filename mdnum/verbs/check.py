@@ -1,4 +1,4 @@
-"""`mdnum check`: a system against ASE and against other neighbor searches, answered on the spot."""
+"""`mdnum check`: comparison of a system with ASE and with other neighbor searches, printed immediately."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _OTHER = 3.0
 
 @dataclass(frozen=True)
 class Checked:
-    """The answer of a check."""
+    """Result of a comparison with other codes."""
 
     report: Any  # what was compared, with `ok` and rows for people
     verdict: Verdict  # its findings
@@ -42,7 +42,7 @@ class Checked:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """For JSON."""
+        """Summary of the comparison for JSON."""
         worst = {"worst": self.report.worst} if hasattr(self.report, "worst") else {}
         head = {"status": "complete" if self.report.ok else "failed", "seconds": self.seconds}
         found = {**head, "ok": self.report.ok, **vars(self.report), **worst}
@@ -59,7 +59,7 @@ def check(question: str, system: Simulation | System | str | Path, *, allow_code
     Args:
         question: "energy", "pairs" or "dynamics".
         system: a simulation, a system, a shipped name or the path of a system file.
-        allow_code: whether Python that the system file names may be executed.
+        allow_code: whether Python code that the system file names may be executed.
 
     Raises:
         InputError: the system cannot be run.
@@ -87,7 +87,7 @@ def check(question: str, system: Simulation | System | str | Path, *, allow_code
 def _replied(
     question: str, system: str, overrides: Mapping[str, str] | None = None, allow_code: bool = False
 ) -> Reply:
-    """`mdnum check energy SYSTEM`, or another question."""
+    """Execute `mdnum check energy SYSTEM`, or the check of pairs or dynamics."""
     from mdnum.systems import load
 
     loaded: Any = load(system, overrides, world="md")
@@ -101,7 +101,7 @@ energy, pairs, dynamics = (partial(_replied, question) for question in ("energy"
 
 
 def structure_findings(system: System) -> Iterator[Finding]:
-    """Where a run takes a structure otherwise than its author may think: temperature, velocities, size."""
+    """Yield findings on a structure's temperature, velocities and size that its author may not expect."""
     atoms = system.atoms
     frame = Frame(0, 0.0, atoms.positions, Box(np.asarray(atoms.cell), np.asarray(atoms.pbc)))
     if (far := far_out(frame)) is not None:
@@ -119,9 +119,10 @@ def structure_findings(system: System) -> Iterator[Finding]:
 
 
 def temperature_findings(start: float, requested: float, atoms: int, unit: str) -> Iterator[Finding]:
-    """A warning where velocities are those of quite another temperature than the one requested.
+    """Yield a warning if the temperature of the velocities differs greatly from the requested one.
 
-    A crystal that begins to move takes half of its kinetic energy back, and few atoms scatter: both are fine.
+    There is no warning for a crystal, which loses half of its kinetic energy at first, nor for the scatter of
+    few atoms.
     """
     ratio = start / requested if requested > 0 else 1.0
     if 1 / _OTHER <= ratio <= _OTHER or abs(ratio - 1) <= 5 * math.sqrt(2 / (3 * atoms)):
@@ -132,7 +133,7 @@ def temperature_findings(start: float, requested: float, atoms: int, unit: str) 
 
 
 def would_show(report: Any, units: Units) -> Iterator[str]:
-    """How far two evaluations differ, and from where on that would not agree."""
+    """Yield the difference between two evaluations, and the smallest difference that would be reported."""
     from mdnum.references.energy_check import FORCE, ROUNDINGS
 
     if frames := getattr(report, "frames", ()):
@@ -147,7 +148,7 @@ def would_show(report: Any, units: Units) -> Iterator[str]:
 
 
 def energy_findings(report: EnergyReport) -> Iterator[Finding]:
-    """What to know of energies, forces and stresses beside a reference."""
+    """Yield findings of a comparison of energies, forces and stresses with a reference."""
     from mdnum.references.ase_models import ENERGY, ITSELF
     from mdnum.references.energy_check import LAMMPS
 
@@ -173,7 +174,7 @@ def energy_findings(report: EnergyReport) -> Iterator[Finding]:
 
 
 def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
-    """What to know of a trajectory beside ASE's."""
+    """Yield findings of a comparison of a trajectory with ASE's."""
     if not report.ok:
         yield TEXTS.finding(
             "DYNAMICS_DIFFER", *["sudden"] * (report.sudden is not None), steps=len(report.position) - 1,
@@ -184,7 +185,7 @@ def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
 
 
 def pair_findings(report: PairsReport) -> Iterator[Finding]:
-    """What to know of the pair sets of searches."""
+    """Yield findings of a comparison of pair sets from several neighbor searches."""
     for one in report.results:
         if one.verdict in ("differs", "failed"):
             code = "PAIRS_DIFFER" if one.verdict == "differs" else "SEARCH_FAILED"

@@ -1,4 +1,4 @@
-"""`mdnum conform`: does a neighbor list list the right pairs? The conformance suite, into a folder."""
+"""`mdnum conform`: the conformance suite, which tests whether a neighbor list contains the right pairs."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _RETURNS = "(i, j), (i, j, shift), (i, j, shift, distance) or a mapping with i a
 
 @dataclass(frozen=True)
 class Options:
-    """What an examination was begun with."""
+    """Options with which an examination was started."""
 
     cases: Annotated[int, Ge(0), Le(MOST_CASES)]
     seed: int = 0
@@ -56,10 +56,10 @@ class Options:
     limits: tuple[str, ...] = ()
 
     def declared(self, tested: PairList) -> PairList:
-        """A list with what its user declares about it.
+        """Return a neighbor list with the properties that its user declares.
 
         Raises:
-            InputError: a precision, a limit or a number of cases that there is not.
+            InputError: an invalid precision, limit or number of cases.
         """
         if not 0 <= self.cases <= MOST_CASES:
             raise InputError(
@@ -78,7 +78,7 @@ class Options:
 
 @dataclass
 class Examination(CaseAnswers):
-    """What answers.json holds, and an examination is resumed from."""
+    """Content of answers.json, from which an examination is resumed."""
 
     word: str = field(kw_only=True)  # what names the list; empty where it has no name
     tested: tuple[str, str | None] = field(kw_only=True)  # name and version of the list
@@ -103,9 +103,9 @@ def conform(
     report: bool = True,
     progress: Wanted = None,
 ) -> Outcome:
-    """Put a neighbor list through the conformance suite.
+    """Test a neighbor list with the conformance suite.
 
-    The folder is filled as answers come: one that was stopped, however, is resumed by `resume`.
+    Results are saved in the folder as they arrive: an interrupted examination can be continued with `resume`.
 
     Example:
         >>> mdnum.conform("vesin", time=60)
@@ -113,31 +113,32 @@ def conform(
     Args:
         pairs: a name (`references.conformance.known`), `package.module:function`, `file.py:function`, or a
             function of (positions, cell, pbc, r_cut) that returns (i, j), (i, j, shift), (i, j, shift,
-            distance) or a mapping; or a class with `allocate` and `update`. What has a name is called in a
-            process of its own, so that a crash is a finding. With `resume`, the list that was examined, where
-            it had no name; else none.
-        cases: random cases beside those with a name, `MOST_CASES` at most; 500 by default.
-        seed: of the random ones.
-        large: ask about 5,000 and 100,000 atoms, too.
-        full: every pair is listed from both of its atoms (True) or once (False); found out by default.
-        precision: of its arithmetic, "float64" or "float32"; found out by default.
-        superset: pairs beyond the cutoff may be listed.
-        limits: what it does not claim to do, words of `LIMITS`: such cases are not asked.
-        time: minutes, after which nothing is asked and no failure is reproduced.
+            distance) or a mapping; or a class with `allocate` and `update`. A list with a name is called in a
+            separate process, so that a crash is a finding. With `resume`, the examined list if it had no
+            name; otherwise omitted.
+        cases: number of random cases in addition to the named cases, at most `MOST_CASES`; default 500.
+        seed: seed of the random cases.
+        large: include cases with 5,000 and 100,000 atoms.
+        full: whether every pair is listed from both of its atoms (True) or once (False); by default detected.
+        precision: precision of the list's arithmetic, "float64" or "float32"; by default detected.
+        superset: whether pairs beyond the cutoff may be listed.
+        limits: unsupported features of the list, words of `LIMITS`: such cases are skipped.
+        time: time limit in minutes, after which no further case is tested and no failure is reproduced.
         out: the new folder; default runs/conform-<name>-<n>.
-        resume: a folder to resume instead, with the options that it was begun with.
+        resume: a folder to resume instead, with its original options.
         report: write report.html.
         progress: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        the outcome; its result is the `references.conformance.Report`. Status "partial" in its summary: time
-        was up after `BREADTH` cases of each area, "undecided": before.
+        the outcome; its result is the `references.conformance.Report`. The status in its summary is "partial"
+        if the time limit was reached after `BREADTH` cases of each area, "undecided" if it was reached
+        before.
 
     Raises:
-        InputError: there is no such list, or it cannot be called, or what it returns is no list of pairs; or
-            it is not the one that a folder was begun with.
+        InputError: there is no such list, or it cannot be called, or its return value is no list of pairs; or
+            the list differs from the one with which the folder was started.
         FolderError: the folder cannot be used.
-        Interrupted: by control-C or SIGTERM; what was answered is in the folder, with its page.
+        Interrupted: by control-C or SIGTERM; the results so far are in the folder, with its page.
     """
     from mdnum.references.conformance.lists import from_object
     from mdnum.references.conformance.peers import load
@@ -193,7 +194,7 @@ def conform(
             return summary_of(found, _write_scripts(folder, found), options.seed)
 
         def saved(urgent: bool) -> None:
-            """Keeps an answer; scripts and summary follow now and then."""
+            """Save a result; write scripts and summary at intervals."""
             nonlocal due
             kept.save(urgent)
             if (now := monotonic()) >= due:
@@ -226,7 +227,7 @@ def conform(
 
 
 def command(pairs: str | None = None, *, resume: Path | None = None, **given: Any) -> Outcome | Reply:
-    """`mdnum conform`: without a list those that have a name."""
+    """Execute `mdnum conform`; without a neighbor list, show the known ones."""
     from mdnum.references.conformance.peers import known
 
     if pairs is not None or resume is not None:
@@ -242,12 +243,12 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
 
 
 def _script(code: str) -> str:
-    """The end of the name of a failure's script."""
+    """Return the end of the file name of a failure's script."""
     return f"{code.lower().replace('_', '-')}.py"
 
 
 def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
-    """Writes a script for each failure, and removes those of mdnum that stand for none; their names."""
+    """Write a script for each failure, remove mdnum's obsolete scripts, and return the names."""
     from mdnum.references.conformance.reproduction import script
 
     scripts = []
@@ -268,7 +269,7 @@ def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
 
 
 def summary_of(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
-    """The content of summary.json but what is judged; `scripts` are names, one for each failure."""
+    """Return the content of summary.json except the verdict; `scripts` are names, one for each failure."""
     tested = found.tested
     own = ("superset", "found_out", "keeps_order", "shifts", "aliased", "questions", "left", "breadth",
            "running", "padding", "asked", "wrong", "conforms", "seconds")  # fmt: skip
@@ -321,7 +322,7 @@ def summary_of(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
 
 
 def _cases(summary: Mapping[str, Any], code: str) -> int:
-    """Cases whose worst failure has a code."""
+    """Return the number of cases whose worst failure has the given code."""
     return sum(row["codes"].get(code, 0) for row in summary["areas"])
 
 
@@ -330,7 +331,7 @@ def _total(summary: Mapping[str, Any], name: str) -> int:
 
 
 def judge(view: View) -> Verdict:
-    """Headline, evidence and findings of an examination, from its folder alone."""
+    """Return headline, evidence and findings of an examination, from its folder alone."""
     summary = view.summary
     asked, wrong, left = summary["asked"], summary["wrong"], summary["left"]
     silent = {code.lower(): _cases(summary, code) for code in SILENT}
@@ -383,7 +384,7 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """A finding for each code of the failures, below the one that may be its cause."""
+    """Yield a finding for each code of the failures, below the finding that may be its cause."""
     by_code: dict[str, list[Mapping[str, Any]]] = {}
     for row in summary["failures"]:
         by_code.setdefault(row["code"], []).append(row)
@@ -415,7 +416,7 @@ def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
-    """What is nobody's mistake and good to know."""
+    """Yield findings on properties of the list that are not errors."""
     ties = summary["ties"]
     if ties["counted"] and ties["not_counted"]:
         yield TEXTS.finding("TIES", **ties)
@@ -449,7 +450,7 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Everything else that is shown."""
+    """Return the remaining content of the page."""
     summary = view.summary
     wrong, kinds = summary["wrong"] - summary["silent"], len(summary["failures"])
     totals = {name: _total(summary, name) for name in ("passed", "skipped")}
@@ -482,7 +483,9 @@ def page(view: View, verdict: Verdict) -> Page:
 
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
-    """A row for each area: of lists at one moment, and of lists in use."""
+    """Yield tables with one row per area: for single neighbor searches, and for lists updated during a
+    run.
+    """
     columns: dict[str, Any] = {
         "area": "area", "asked": "asked", "right": "passed",
         "wrong": lambda row: row["failed"] - row["silent"] or None,
@@ -525,7 +528,7 @@ def _figure(summary: Mapping[str, Any]) -> Figure:
 
 
 def _conventions(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What kind of list it is."""
+    """Return rows that describe the conventions of the neighbor list."""
     more = "pairs of its skin" if summary["kept"] else "pairs beyond the cutoff"
     ties = {name: pairs_of or None for name, pairs_of in summary["ties"].items()}
     inside = "counts as inside (r ≤ r_cut)" if ties["counted"] else "does not count (r < r_cut)"

@@ -1,7 +1,7 @@
-"""`mdnum ball --demo` as a function: each classic effect in seconds, with the number that shows it.
+"""`mdnum ball --demo` as a function: classic effects, shown within seconds, with the numbers that prove them.
 
-A demonstration is a script in the folder `demos` beside the systems, `NN_its_name.py`: its first line says
-what it is about, and its `run()` returns a `Demo`. To add one, add a file.
+A demonstration is a script in the folder `demos` next to the systems, `NN_its_name.py`: its first line states
+the subject, and its `run()` returns a `Demo`. To add a demonstration, add a file.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LISTED = 16
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of a demonstration that was tested while it ran."""
+    """A statement of a demonstration that was tested while the demonstration ran."""
 
     what: str  # the statement, in words
     seen: Any  # the number or word that was found
@@ -61,12 +61,12 @@ class Demo:
 
     @property
     def ok(self) -> bool:
-        """Whether every check held."""
+        """True if every claim of the demonstration was confirmed."""
         return all(claim.ok for claim in self.checks)
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
-    """A table of a demonstration, its title first."""
+    """Return a table of a demonstration; the title is the first argument."""
     return Table(tuple(columns), rows, title)
 
 
@@ -78,11 +78,11 @@ def demonstrate(name: str, **keep: Unpack[Keep]) -> Outcome:
         >>> mdnum.demonstrate("fork")
 
     Args:
-        name: of one, or "all".
+        name: name of a demonstration, or "all".
         keep: see `frame.Keep`; without overrides.
 
     Returns:
-        its numbers, checks and curves; `result` is the list of `Demo`.
+        the outcome with numbers, checks and curves; `result` is the list of `Demo`.
 
     Raises:
         InputError: there is no demonstration of that name.
@@ -115,21 +115,21 @@ def demonstrate(name: str, **keep: Unpack[Keep]) -> Outcome:
 
 
 def names() -> list[str]:
-    """The demonstrations, in the order in which they are best read."""
+    """Return the names of the demonstrations, in the recommended order of reading."""
     return list(_files())
 
 
 def about(name: str) -> str:
-    """The first line of a demonstration's file, read without importing it (and jax)."""
+    """Return the first line of a demonstration's file, read without importing the file (and jax)."""
     text = ast.get_docstring(ast.parse(_files()[_known(name)].read_text(encoding="utf-8")))
     return (text or "").partition("\n")[0].rstrip(".")
 
 
 def load(name: str) -> Callable[[], Demo]:
-    """What runs a demonstration.
+    """Return the function that runs a demonstration.
 
     Raises:
-        InputError: there is none of that name.
+        InputError: there is no demonstration of that name.
     """
     path = _files()[_known(name)]
     spec = importlib.util.spec_from_file_location(f"mdnum_demo_{path.stem}", path)
@@ -156,7 +156,7 @@ def _known(name: str) -> str:
 
 
 def _document(name: str, demo: Demo) -> dict[str, Any]:
-    """A demonstration as plain values; the points of its plots are in a table of their own."""
+    """Return a demonstration as plain values; the points of its plots are in a separate table."""
     document = {"name": name, "ok": demo.ok, **plain(demo)}
     for table in document["tables"]:
         del table["shown"], table["bad"]
@@ -168,7 +168,7 @@ def _document(name: str, demo: Demo) -> dict[str, Any]:
 
 
 def _plots(document: Mapping[str, Any], curves: Mapping[str, np.ndarray]) -> Iterator[Plot]:
-    """The plots of a demonstration as it declared them, their names those of files."""
+    """Yield the plots that a demonstration declared, with names for their files."""
     mine = curves["part"].astype(str) == document["name"]
     for stored in document["plots"]:
         here = mine & (curves["curve"].astype(str) == stored["name"])
@@ -190,7 +190,7 @@ def _plots(document: Mapping[str, Any], curves: Mapping[str, np.ndarray]) -> Ite
 
 
 def judge(view: View) -> Verdict:
-    """A finding for every demonstration that did not come out."""
+    """Return a finding for every demonstration whose checks failed."""
     demos = _demos(view)
     found = []
     for demo in demos:
@@ -211,7 +211,9 @@ def judge(view: View) -> Verdict:
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Of each demonstration its result and first figure; then the answer at length, numbers and the rest."""
+    """Return a page with each demonstration's result and first figure, then its full answer, numbers and
+    the rest.
+    """
     demos, curves = _demos(view), view.table("curves")
     sections: list[Section] = []
     for demo in demos:
@@ -240,17 +242,19 @@ def _demos(view: View) -> Sequence[Mapping[str, Any]]:
 
 
 def _heading(demo: Mapping[str, Any], demos: Sequence[Any]) -> str:
-    """Of a demonstration's section; on a page of its own its title stands above already."""
+    """Return the heading of a demonstration's section; if the page shows only this one, its title is
+    already shown.
+    """
     return demo["title"] if len(demos) > 1 else TEXTS("detail")
 
 
 def _result(demo: Mapping[str, Any]) -> str:
-    """What a demonstration shows."""
+    """Return the result of a demonstration, typeset."""
     return typeset(demo["result"] or demo["answer"])
 
 
 def _table(stored: Mapping[str, Any]) -> Table:
-    """A table whose numbers have the fewest digits, five at least, that tell those of a column apart."""
+    """Format a table with the fewest digits (at least five) that distinguish the numbers in each column."""
     columns = []
     for values in zip(*stored["rows"], strict=True):
         digits = _digits(values, 10)
@@ -261,14 +265,14 @@ def _table(stored: Mapping[str, Any]) -> Table:
 
 
 def _digits(values: Iterable[Any], least: int) -> int:
-    """The fewest significant digits that tell numbers apart."""
+    """Return the smallest number of significant digits that distinguishes all numbers."""
     floats = {value for value in values if isinstance(value, float)}
     apart = (n for n in range(least, 17) if len({f"{x:.{n}g}" for x in floats}) == len(floats))
     return next(apart, 17)
 
 
 def shown(value: Any, digits: int = 10) -> str:
-    """A plain value as people read it: numbers to a number of significant digits, lists in brackets."""
+    """Format a plain value for reading: numbers with the given significant digits, lists in brackets."""
     if isinstance(value, Mapping):
         return ", ".join(f"{str(key).replace('_', ' ')} {shown(item, digits)}" for key, item in value.items())
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""`mdnum doctor`: whether numbers that are computed here can be trusted."""
+"""`mdnum doctor`: tests of whether numbers that are computed on this machine can be trusted."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mdnum.verbs import Reply
 
 
 def diagnose() -> Reply:
-    """What each test saw, and what to do."""
+    """Return the result of each test, and remedies for failures."""
     found = doctor.diagnose()
     rows = [(row.status, row.name, row.seen) for row in found.rows]
     remedies = [f"{row.name}: {row.remedy}" for row in found.rows if row.remedy]
