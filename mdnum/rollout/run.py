@@ -268,9 +268,7 @@ class Rollout:
         self.folder.checkpoint_beside(lambda: state if held is None else {**state, "held": held()})
 
     def _to_dict(self, point: Start) -> dict[str, Any]:
-        """Return the data for resuming a run from a point; after a used-up list also its last pairs
-        inside.
-        """
+        """Return the data for resuming a run at a point; after a used-up list also its last pairs inside."""
         last = None if self.done.last is None else np.asarray(self.done.last).T
         frames = {"first": self.done.first, "last": last}
         return {

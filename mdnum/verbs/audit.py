@@ -220,7 +220,7 @@ def _ask_all(
 def answer_of(
     check: AuditCheck, subject: CalculatorSubject, log: frame.Progress, before: Iterable[CheckResult]
 ) -> CheckResult:
-    """Return a check's result; if the calculator fails and the check cannot continue, the failure is a
+    """Return a check's result; a failure of the calculator that ends the check is returned as a finding.
     finding.
 
     A finding is added if the calculator gave two results for one input, unless an earlier result has it.
@@ -414,9 +414,7 @@ def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]
 
 
 def _finding(one: Observed, section: str, cause: str, texts: Texts = TEXTS) -> Finding:
-    """Return the sentences of a finding; for a check of another package, the sentences that the check
-    provides.
-    """
+    """Return the sentences of a finding; a check of another package provides its own sentences."""
     if one.code not in TEXTS.entries:
         given = {name: str(one.values.get(name, "")) for name in ("title", "text", "remedy")}
         return Finding(one.code, one.severity, **given, values=one.values, section=section, cause=cause)

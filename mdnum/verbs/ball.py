@@ -1,6 +1,4 @@
-"""`mdnum ball` as a function: bouncing balls, variants of a run and their gradients, with verdict and
-report.
-"""
+"""`mdnum ball` as a function: bouncing balls, their variants and gradients, with verdict and report."""
 
 from __future__ import annotations
 

@@ -303,9 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step; with a rule per ball, those of the ball nearest to its
-    tolerance.
-    """
+    """Residual and stop margin of each step; if balls have their own, of the one nearest to its tolerance."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

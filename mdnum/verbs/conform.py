@@ -483,9 +483,7 @@ def page(view: View, verdict: Verdict) -> Page:
 
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
-    """Yield tables with one row per area: for single neighbor searches, and for lists updated during a
-    run.
-    """
+    """Yield tables with one row per area: for single searches, and for lists that are updated in a run."""
     columns: dict[str, Any] = {
         "area": "area", "asked": "asked", "right": "passed",
         "wrong": lambda row: row["failed"] - row["silent"] or None,

@@ -211,9 +211,7 @@ def judge(view: View) -> Verdict:
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Return a page with each demonstration's result and first figure, then its full answer, numbers and
-    the rest.
-    """
+    """Return a page with each demonstration's result and first figure, then answer, numbers and the rest."""
     demos, curves = _demos(view), view.table("curves")
     sections: list[Section] = []
     for demo in demos:
@@ -242,9 +240,7 @@ def _demos(view: View) -> Sequence[Mapping[str, Any]]:
 
 
 def _heading(demo: Mapping[str, Any], demos: Sequence[Any]) -> str:
-    """Return the heading of a demonstration's section; if the page shows only this one, its title is
-    already shown.
-    """
+    """Return the heading of a demonstration's section; on a page of its own, its title is already shown."""
     return demo["title"] if len(demos) > 1 else TEXTS("detail")
 
 

@@ -1,4 +1,4 @@
-"""`mdnum flips`: anybody's trajectory to a ledger of flips; for two trajectories, see flips_compare."""
+"""`mdnum flips`: the ledger of flips of any program's trajectory; for two trajectories, see flips_compare."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def flips(
     drop_repeats: bool = False,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Finds which pairs entered or left a threshold between the frames of a file, and what follows.
+    """Find the pairs that cross a threshold between the frames of a trajectory, and derive statistics.
 
     Example:
         >>> mdnum.flips("run.dcd", topology="start.pdb", cutoffs=[8.5])
@@ -87,33 +87,34 @@ def flips(
         >>> mdnum.flips(states.position, box=box, fractional=True, cutoffs=2.5)
 
     Args:
-        trajectory: a file that MDAnalysis or ASE reads, or the folder of an mdnum run; a slice of its frames
-            may stand behind an @ ("run.xtc@100:", "run.xtc@::10"). Or an array (frames, atoms, 3) of lengths,
-            or a list of ASE's Atoms; `Recorder` takes neighbor lists and energies too.
-        other: another file of the same atoms: where do the two diverge?
-        cell, box, velocities: of an array: lengths, or lattice vectors as rows (cell) or columns (box), of
-            all frames or one for each; velocities (frames, atoms, 3) need a timestep.
-        pbc, fractional, species, timestep, length, time: of an array, as of `Recorder`; `timestep` is the
-            time from a frame to the next.
-        topology: what the atoms are, where the trajectory does not say.
-        cutoffs: a length in the file's unit, or several, a rule each; default the cutoff of the mdnum run
-            that the file belongs to. One rule needs no sequence here, nor in `pairs` and `nearest`.
-        pairs: cutoffs by pair of species, a rule each: "O-H=2.5,O-O=3.5" or {"O-H": 2.5, "O-O": 3.5}.
-        nearest: numbers of neighbors, a rule each: the k nearest of every atom.
-        most: neighbors an atom can have inside a cutoff; the nearest are kept.
-        between: two selections in MDAnalysis's language; only pairs with an atom in each are examined.
-        by: what pairs are of, "atom" or "residue"; two residues are inside while their smallest distance is.
+        trajectory: a file that MDAnalysis or ASE can read, or the folder of an mdnum run; to select frames,
+            append @ and a slice ("run.xtc@100:", "run.xtc@::10"). Or an array (frames, atoms, 3) of lengths,
+            or a list of ASE `Atoms`; `Recorder` accepts neighbor lists and energies too.
+        other: another file of the same atoms, to find where the two trajectories diverge.
+        cell, box, velocities: for an array: lengths, or lattice vectors as rows (cell) or columns (box), one
+            for all frames or one per frame; velocities (frames, atoms, 3) require a timestep.
+        pbc, fractional, species, timestep, length, time: for an array, as for `Recorder`; `timestep` is the
+            time between consecutive frames.
+        topology: file that identifies the atoms, if the trajectory does not.
+        cutoffs: one or more lengths in the file's unit, one rule each; by default the cutoff of the mdnum run
+            that the file belongs to. A single rule needs no sequence here, in `pairs` or in `nearest`.
+        pairs: cutoffs by pair of species, one rule each: "O-H=2.5,O-O=3.5" or {"O-H": 2.5, "O-O": 3.5}.
+        nearest: numbers of neighbors, one rule each: the k nearest neighbors of every atom.
+        most: maximum number of neighbors of an atom inside a cutoff; the nearest are kept.
+        between: two selections in MDAnalysis syntax; only pairs with one atom in each are examined.
+        by: "atom" for pairs of atoms, "residue" for pairs of residues; two residues are inside if their
+            smallest distance is.
         hydrogens: whether hydrogens and virtual sites count in contacts between residues.
-        window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
-            overlooked in an intermittent contact.
-        format: of the files, where their names do not tell.
-        drop_repeats: leave out every frame that is an earlier one again, or has its time; the others keep
-            their numbers. Such frames are reported either way.
+        window: number of frames within which a reversed flip is chatter, and up to which an absence is
+            ignored in an intermittent contact.
+        format: format of the files, if their names do not reveal it.
+        drop_repeats: omit every frame that repeats an earlier one or its time; the others keep their numbers.
+            Such frames are reported in any case.
         keep: see `frame.Keep`; without overrides.
 
     Raises:
-        InputError: a file or an option cannot be used. A frame in the middle that cannot be read is no
-            exception: what came before is kept, and the summary names the frame.
+        InputError: a file or an option cannot be used. An unreadable frame in the middle of a file raises no
+            exception: the results before it are kept, and the summary names the frame.
         FolderError: the folder cannot be used.
     """
     from mdnum.trajectories.arrays import ArrayFrames
@@ -158,7 +159,7 @@ def flips(
 
 @dataclass
 class FrameExamination:
-    """Frames on their way into a folder: a file's are pulled, those of a `Recorder` are pushed."""
+    """Examination of frames into a folder; frames are read from a file or pushed by a `Recorder`."""
 
     answer: Answer  # its folder takes what follows from the tables, when all frames were examined
     rows: HeldRows  # to be handed over to the folder by then
@@ -172,12 +173,12 @@ def examining(
     opened: Trajectory, asked: tuple[Rule, ...], between: tuple[str, str] | None, window: int,
     live: bool = False, hydrogens: bool | None = None, **keep: Unpack[Keep],
 ) -> Iterator[FrameExamination]:  # fmt: skip
-    """A new folder whose tables are filled inside, with what follows from them; arguments as of `flips`.
+    """Context manager of a new folder whose tables are filled inside; arguments as for `flips`.
 
     Args:
-        live: whether frames are those of a program that runs: their numbers are steps, between which it
-            decides nothing, and it may be killed, so that rows are kept in part files.
-        hydrogens: whether they count in contacts between residues; None for pairs of atoms.
+        live: whether frames come from a running program: frame numbers are then steps, between which no
+            decisions are made, and rows are kept in part files because the program may be killed.
+        hydrogens: whether hydrogens count in contacts between residues; None for pairs of atoms.
     """
     from mdnum.trajectories.follow import follow
     from mdnum.trajectories.lost import FrameMotion
@@ -255,10 +256,10 @@ def rules(
     nearest: int | Sequence[int] = (),
     most: int | None = None,
 ) -> tuple[Rule, ...]:
-    """The membership rules asked for, in this order; arguments as of `flips`.
+    """Return the requested membership rules, in this order; arguments as for `flips`.
 
     Raises:
-        InputError: a word is not understood, a rule comes twice, or `most` has no cutoff to go with.
+        InputError: a value is not understood, a rule is repeated, or `most` is given without a cutoff.
     """
     from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, SpeciesCutoffs
 
@@ -280,12 +281,12 @@ def rules(
 
 
 def _listed(given: Any) -> tuple[Any, ...]:
-    """One rule's value or several, as several."""
+    """Return a tuple of rule values from a single value or several."""
     return (given,) if isinstance(given, str | Real | Mapping) else tuple(given)
 
 
 def _species_cutoffs(words: _Pairs) -> Mapping[Any, float]:
-    """Lengths by pair of species of "O-H=2.5,O-O=3.5", or {"O-H": 2.5} as systems have it."""
+    """Parse lengths by pair of species from "O-H=2.5,O-O=3.5", or from {"O-H": 2.5} as in system files."""
     if isinstance(words, Mapping):
         if all(isinstance(pair, tuple) and len(pair) == 2 for pair in words):
             return words
@@ -309,7 +310,7 @@ def _species_cutoffs(words: _Pairs) -> Mapping[Any, float]:
 
 
 def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
-    """The cutoff with which mdnum made the file, from what says beside it what was run."""
+    """Return the cutoff of the mdnum run that made the file, as recorded in the run's folder."""
     radius = None
     # no run of mdnum's
     with suppress(OSError, MdnumError, AttributeError):
@@ -323,7 +324,7 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
 
 
 def _refuse_topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
-    """Refuses "TOPOLOGY TRAJECTORY", the order that other programs have."""
+    """Raise an error for the order "TOPOLOGY TRAJECTORY", which other programs use."""
     from mdnum.trajectories.readers import IN_MEMORY, open_trajectory
 
     for one in (first, second):
@@ -348,7 +349,7 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
 def _with_other_box(
     trajectory: Trajectory, frame: Any, found: Pass, of: Groups | ByResidue
 ) -> dict[str, Any] | None:
-    """The pairs of each rule in a frame with another box that it may be taken to have; None without one."""
+    """Count each rule's pairs in a frame if another plausible box is used; None if there is no other box."""
     from mdnum.trajectories.tracker import Tracker
 
     if (other := trajectory.other_box(frame.index)) is None:
@@ -365,7 +366,7 @@ def _with_other_box(
 
 
 def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
-    """Whether reading stopped at a frame that is not whole, the last of the file as far as that is known."""
+    """True if reading stopped at an incomplete frame that, as far as is known, is the last of the file."""
     from mdnum.reading import UnreadableFrame
 
     if not isinstance(error, UnreadableFrame):
@@ -376,7 +377,7 @@ def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
 
 
 def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str, Any]:
-    """Times of the frames: how far apart, evenly or not, and whether a simulation can have them."""
+    """Summarize the times of the frames: interval, uniformity, and whether a simulation can have them."""
     timed = trajectory.time != "frame"
     times = frames["time"][frames["rule"] == 0]
     steps = np.diff(times)
@@ -401,7 +402,7 @@ def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str
 
 
 def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
-    """Where frames are missing, if any are: most are evenly spaced, others whole multiples of that apart."""
+    """Find missing frames if most intervals are equal and the rest are integer multiples; else None."""
     steps = np.diff(times)
     usual = float(np.median(steps)) if len(steps) else 0.0
     ratio = steps / usual if usual > 0 else np.ones_like(steps)
@@ -419,10 +420,10 @@ def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
-    """(part, parts, history of some of the pairs) until every pair of a rule had its turn.
+    """Yield (part, parts, history of some of the pairs) until every pair of a rule is included.
 
-    The ledger is in the order of frames and may be larger than memory; a part has all flips of its pairs. It
-    is read once for as many parts as are held together.
+    The ledger is ordered by frame and may be larger than memory; a part contains all flips of its pairs. The
+    ledger is read once for each group of parts that fit into memory together.
     """
     from mdnum.trajectories.history import History
 
@@ -430,7 +431,7 @@ def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, 
     parts = max(1, -(-sum(stream.flushed for stream in streams.values()) // _PART_ROWS))
 
     def columns(name: str, wanted: range, kinds: list[str]) -> Iterator[dict[str, np.ndarray]]:
-        """Of one part after the other."""
+        """Yield the columns of one part after another."""
         found: list[list[dict[str, np.ndarray]]] = [[] for _ in wanted]
         names, stream = ["rule", *kinds], streams[name]
         for batch in chain([stream.read(names, rows=0)], stream.batches(names)):
@@ -464,7 +465,7 @@ def _rule_told(
     motion: FrameMotion | None,
     log: Progress,
 ) -> dict[str, Any]:
-    """What one rule's ledger says, worked out pair by pair; its tables go into the folder."""
+    """Return the statistics of one rule's ledger, computed pair by pair; write its tables to the folder."""
     from mdnum.trajectories.residues import Occupancy, contacts_over_time
     from mdnum.trajectories.statistics import Labels, Statistics
 
@@ -538,7 +539,7 @@ def _rule_told(
 def _counted(
     total: Statistics, motion: FrameMotion | None, flux: Mapping[str, Any] | None, reach: float | None
 ) -> dict[str, Any]:
-    """Plain values of what was counted, lengths of time in frames; what is lost is estimated with a reach."""
+    """Return statistics as plain values, durations in frames; with `reach`, lost flips are estimated."""
     from mdnum.trajectories.lost import lost_flips
     from mdnum.trajectories.statistics import Lifetime
 
@@ -565,13 +566,13 @@ def _counted(
 
 
 def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
-    """What atoms are called: "GLY 12 CA", or their names where there are no residues; residues "GLY 12"."""
+    """Name atoms as "GLY 12 CA" (or by atom name if there are no residues), and residues as "GLY 12"."""
     rows = ((table.residue_names[at], table.residue_ids[at], table.names[at]) for at in atoms)
     return [f"{residue} {number} {name}".rstrip() if residue else str(name) for residue, number, name in rows]
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:
-    """A pair of classes in the order of the two selections, where only one order fits them."""
+    """Order a pair of classes as the two selections, if only one order is consistent with them."""
     if groups[0] is None or groups[1] is None:
         return row
     first, second = ({classes.names[at] for at in np.unique(classes.of[group])} for group in groups)
@@ -582,7 +583,7 @@ def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str
 
 
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
-    """Crossings by the velocities, which a run would show that looked at every instant, against the flips."""
+    """Estimate the rate of crossings from velocities, as if continuously observed, and that of flips."""
     duration = steps["last_time"] - steps["first_time"]
     if not one.flux or not steps["timed"] or not duration > 0 or found.odd is not None:
         return None

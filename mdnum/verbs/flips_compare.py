@@ -1,4 +1,4 @@
-"""`mdnum flips A B`: two trajectories of the same atoms, frame by frame, until their neighbor sets differ."""
+"""`mdnum flips A B`: comparison of the neighbor sets of two trajectories of the same atoms, by frame."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ def compare(
     between: tuple[str, str] | None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Where two trajectories diverge; see `mdnum.verbs.flips.flips`.
+    """Find where two trajectories diverge; see `mdnum.verbs.flips.flips`.
 
     Raises:
-        InputError: they are not of the same atoms.
+        InputError: the trajectories do not contain the same atoms.
     """
     if a.atoms != b.atoms:
         message = f"{a.path.name} has {a.atoms:,} atoms and {b.path.name} {b.atoms:,}"
@@ -102,7 +102,7 @@ def compare(
 
 
 def _alike(a: Trajectory, b: Trajectory) -> bool:
-    """Whether the atoms of two files may be the same ones: of one species each, as far as the files say."""
+    """True if the atoms of two files may be the same: species agree as far as the files contain them."""
     first, second = ([str(one) for one in file.species] for file in (a, b))
     if not (a.table.named and b.table.named) or first == second:
         return True
@@ -116,28 +116,28 @@ def _alike(a: Trajectory, b: Trajectory) -> bool:
 
 
 class ComparisonView(FlipsView):
-    """A comparison as its sentences need it."""
+    """View of a comparison's folder, with the values that its sentences need."""
 
     @property
     def certain(self) -> bool:
-        """Whether anything that differs is beyond what the resolution of the two files explains."""
+        """True if any difference exceeds the resolution of the two files."""
         certain = any(one["certain"] is not None for one in self.summary["rules"])
         return certain or any(self.summary[name] is not None for name in ("beyond", "other_box"))
 
     @property
     def differ(self) -> bool:
-        """Whether any sets differ, and anything is certain."""
+        """True if any neighbor sets differ, and any difference exceeds the resolution."""
         return self.certain and any(one["first"] is not None for one in self.summary["rules"])
 
     @property
     def largest(self) -> tuple[str, str]:
-        """(largest separation at any frame, what resolution explains then)."""
+        """(largest separation at any frame, the separation that resolution explains at this frame)."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
 
     def frame(self, at: int | None) -> str:
-        """A frame: its place among those compared, and its numbers in the files if others."""
+        """Name a frame by its place in the comparison and, if different, by its numbers in the files."""
         if at is None:
             return "no frame"
         a, b = (int(self.table("apart")[f"number_{one}"][at]) for one in "ab")
@@ -149,7 +149,7 @@ class ComparisonView(FlipsView):
 
     @property
     def shift(self) -> dict[str, Any]:
-        """Of the shift of all atoms alike: size and vector where it begins, smallest and largest size."""
+        """Common shift of all atoms: size and vector where it begins, smallest and largest size."""
         table, at = self.table("apart"), self.summary["shift"]
         vectors = np.stack([table[f"shift_{one}"] for one in "xyz"], axis=1)
         sizes = np.sqrt((vectors**2).sum(axis=1))
@@ -162,13 +162,13 @@ class ComparisonView(FlipsView):
         }  # fmt: skip
 
     def by_boxes(self, first: Mapping[str, Any]) -> bool:
-        """Whether the boxes differ when the sets come to, and positions not beyond the resolution."""
+        """True if the boxes, but not the positions, already differ when the neighbor sets begin to differ."""
         boxes, beyond = self.summary["other_box"], self.summary["beyond"]
         same = beyond is None or beyond > first["frame"]
         return boxes is not None and boxes["frame"] <= first["frame"] and same
 
     def values(self, one: Mapping[str, Any]) -> dict[str, Any]:
-        """Of one rule, for sentences."""
+        """Return the values of one rule for sentences."""
         first = one["first"] or {}
         return {
             "rule": self.rule(one), "frames": self.summary["frames"], "pairs": first.get("pairs", 0),
@@ -183,12 +183,12 @@ class ComparisonView(FlipsView):
 
 
 def judge(view: ComparisonView) -> Verdict:
-    """Headline, evidence and findings of a comparison."""
+    """Return headline, evidence and findings of a comparison."""
     return conclude(_findings(view), _evidence(view), headline=_headline(view))
 
 
 def _headline(view: ComparisonView) -> str:
-    """The verdict on the first rule, and where there are several a sentence on each other."""
+    """Return the verdict on the first rule and, if there are more rules, a sentence on each of them."""
     first, *others = view.summary["rules"]
     text = TEXTS(f"head_{_head(view, first)}", **view.values(first))
     if view.summary["shift"] is not None:
@@ -220,7 +220,7 @@ def _in_short(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _evidence(view: ComparisonView) -> Iterator[str]:
-    """What the frames show: positions, the sets of the first rule, and in short those of the others."""
+    """Yield evidence from the frames: positions, neighbor sets of the first rule, and notes on others."""
     summary, (one, *others) = view.summary, view.summary["rules"]
     seed, beyond, first, values = summary["seed"], summary["beyond"], one["first"], view.values(one)
     if seed is not None:
@@ -248,14 +248,14 @@ def _evidence(view: ComparisonView) -> Iterator[str]:
 
 
 def _certain(one: Mapping[str, Any]) -> str:
-    """Since when the sets differ whatever the files have rounded."""
+    """Classify since when the neighbor sets differ irrespective of the rounding of the files."""
     if one["first"]["pairs"] > one["first"]["ambiguous"]:
         return "some"
     return "never" if one["certain"] is None else "later"
 
 
 def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
-    """Whether a difference of positions was there before one of sets."""
+    """Classify whether positions differed before the neighbor sets did."""
     at, beyond, certain = one["first"]["frame"], view.summary["beyond"], one["certain"]
     if beyond is not None and beyond < at:
         return "positions"
@@ -269,7 +269,7 @@ def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _leap(view: ComparisonView, first: Mapping[str, Any]) -> Iterator[str]:
-    """Whether the separation leaps when the sets come to differ, as it does nowhere before."""
+    """Yield a sentence if the separation grows faster than before when the sets begin to differ."""
     table, at = view.table("apart"), int(first["frame"])
     furthest = table["furthest"]
     # a difference that has just begun grows fast, whatever began it
@@ -346,7 +346,7 @@ def _findings(view: ComparisonView) -> Iterator[Finding]:
 
 
 def page(view: ComparisonView, verdict: Verdict) -> Page:
-    """The page of two trajectories."""
+    """Return the page of a comparison of two trajectories."""
     summary = view.summary
     table = view.table("apart")
     size = f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')} of both"
@@ -396,7 +396,7 @@ def _first_pairs(view: ComparisonView) -> Iterator[Table]:
 def _plot(
     view: ComparisonView, name: str, lines: Mapping[str, tuple[np.ndarray, Any]], unit: str = ""
 ) -> Plot:
-    """A figure along the frames, of values with a role; those that others are compared with are dashed."""
+    """Return a figure with lines along the frames, each with a role; reference lines are dashed."""
     table, summary = view.table("apart"), view.summary
     timed = summary["timed"] and bool(np.all(np.diff(table["time"]) > 0))
     x = table["time"] if timed else table["frame"]

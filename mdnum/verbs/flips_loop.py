@@ -1,4 +1,4 @@
-"""What a loop says of itself beside its positions: its neighbor lists and its energy, counted and judged."""
+"""Statistics and findings on neighbor lists and energy that a simulation loop records with positions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _POINTS = 2_000
 
 
 def loop_told(folder: RunFolder) -> dict[str, Any]:
-    """What the tables say of the program's own lists and energy; None of what it did not give."""
+    """Return statistics of a program's own neighbor lists and energy; None for data not recorded."""
     loop = folder.read("loop")
     return {"lists": _lists_told(loop, folder), "energy": _energy_told(loop, folder)}
 
@@ -53,7 +53,7 @@ def _lists_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, 
 
 
 def _energy_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, Any] | None:
-    """How far the energy gets, and how much of that comes with flips."""
+    """Return statistics of the energy, and the share of its changes that coincides with flips."""
     energy = loop["energy"]
     if len(energy) < 4 or not np.isfinite(energy).all():
         return None
@@ -81,7 +81,7 @@ def _energy_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str,
 def findings(
     view: FlipsView, lists: Mapping[str, Any] | None, energy: Mapping[str, Any] | None
 ) -> Iterator[Finding]:
-    """On lost pairs, overflow and the energy."""
+    """Yield findings on lost pairs, list overflow and the energy."""
     if lists and (worst := lists["worst"]) is not None:
         values = {"pair": f"{worst['i']}–{worst['j']}", "missed": worst["frames"]}
         again, deepest = ["again"] * (lists["times"] > lists["lost"]), view.length(worst["deepest"])
@@ -98,7 +98,7 @@ def findings(
 
 
 def sections(view: FlipsView) -> Iterator[Section]:
-    """On lists and on the energy, where the loop gave them."""
+    """Yield sections on neighbor lists and energy, if the loop recorded them."""
     rows, energy = view.table("loop"), view.summary.get("energy")
     some = slice(None, None, -(-len(rows["number"]) // _POINTS) or 1)
     drawn = {"lists": {"pairs lost": rows["lost"].astype(float)}, "energy": {"energy": rows["energy"]}}
@@ -111,7 +111,7 @@ def sections(view: FlipsView) -> Iterator[Section]:
 
 
 def unfinished(view: FlipsView) -> Verdict:
-    """What is known of a loop that ended before its recorder was closed."""
+    """Return the verdict on a loop that ended before its recorder was closed."""
     frames, one = view.table("frames"), view.summary["rules"][0]
     number, entered, left = (frames[name][frames["rule"] == 0] for name in ("number", "entered", "left"))
     flips, last = int((entered + left).sum()), int(number[-1])

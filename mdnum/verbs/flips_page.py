@@ -1,4 +1,4 @@
-"""What a ledger of flips shows and does not: findings, sections and figures, from its folder alone."""
+"""Findings, sections and figures of a ledger of flips, and its limits, from the folder alone."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Limit = tuple[str, tuple[str, ...], dict[str, Any]]
 
 
 def judge(view: FlipsView) -> Verdict:
-    """Headline, evidence and findings of a trajectory."""
+    """Return headline, evidence and findings of a trajectory."""
     if view.summary["status"] == "unfinished":
         return flips_loop.unfinished(view)
     told = (view.summary.get(name) for name in ("lists", "energy"))
@@ -110,7 +110,7 @@ def _ended(view: FlipsView) -> Iterator[Finding]:
 
 
 def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
-    """Frames whose pairs are not those before + entered - left."""
+    """Return the frames whose number of pairs is not the previous number + entered - left."""
     table = view.table("frames")
     rows = table["rule"] == place
     net = (table["entered"][rows] - table["left"][rows])[1:]
@@ -118,7 +118,7 @@ def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
 
 
 def _of_rules(view: FlipsView) -> Iterator[Finding]:
-    """One finding for each code: those of several rules are told one after the other, the reason once."""
+    """Yield one finding for each code: sentences on several rules are joined, the reason is given once."""
     by_code: dict[str, list[Finding]] = {}
     for place, one in enumerate(view.summary["rules"]):
         for code, variants, values in _limits(view, place, one):
@@ -133,7 +133,7 @@ def _of_rules(view: FlipsView) -> Iterator[Finding]:
 
 
 def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
-    """(code, variants, values) of what one rule's flips do not show."""
+    """Yield (code, variants, values) for the limits of one rule's flips."""
     if len(wrong := _disagreeing(view, place)):
         yield "EVENT_ALGEBRA", (), {"first": int(wrong[0]) + 1, "frames": len(wrong)}
     flips, frames = one["flips"], view.summary["frames"]
@@ -169,7 +169,7 @@ def _undecided(one: Rule) -> Iterator[Limit]:
 
 
 def _far_apart(one: Rule) -> bool:
-    """Whether half of the contacts that begin are over by the next frame."""
+    """True if half of the contacts that begin have ended by the next frame."""
     return one["flips"] >= FEW and one["lifetime"]["median"] == 1
 
 
@@ -253,7 +253,7 @@ def _others(view: FlipsView) -> Iterator[Finding]:
 
 
 def _time_goes_back(view: FlipsView) -> Finding:
-    """At which frames, and which frames have the times of earlier ones."""
+    """Return the finding on frames at which time decreases, and on frames with times of earlier frames."""
     rows = view.table("frames")
     numbers, times = (rows[name][rows["rule"] == 0] for name in ("number", "time"))
     told = view.again(view.summary["repeats"].get("again", ()))
@@ -267,12 +267,12 @@ def _time_goes_back(view: FlipsView) -> Finding:
 
 
 def _title(title: str, view: FlipsView, one: Rule) -> str:
-    """Of a section about a rule, which is named where there are several."""
+    """Return the title of a section about a rule; the rule is named if there are several."""
     return f"{title}, {view.rule(one)}" if len(view.summary["rules"]) > 1 else title
 
 
 def page(view: FlipsView, verdict: Verdict) -> Page:
-    """The page of a trajectory."""
+    """Return the page of a trajectory."""
     summary = view.summary
     size = many(summary["atoms"], "atom")
     if summary["status"] == "unfinished":
@@ -311,7 +311,7 @@ def _input(view: FlipsView, size: str) -> list[tuple[str, str]]:
 
 
 def _across(view: FlipsView, across: Mapping[str, Any]) -> Section:
-    """Jumps between cells of the box, and diffusion with them undone and not."""
+    """Return a section on jumps across the cell's faces, and on diffusion with and without these jumps."""
     diffusion, time = across["diffusion"] or {}, view.summary["time"]
     values = {"raw": None, "undone": None, "error": None, **across, **diffusion}
     values["too_far"] = TEXTS("too_far") if across["too_far"] else None
@@ -417,7 +417,7 @@ def _classes(view: FlipsView, title: str, rows: list[Mapping[str, Any]]) -> Tabl
 
 
 def _busiest(view: FlipsView) -> Browse | None:
-    """The pairs that flipped most often; None where none did."""
+    """Return the pairs with the largest number of flips; None if no pair flipped."""
     table, rules = view.table("busiest"), view.summary["rules"]
     if not len(table["i"]):
         return None
@@ -433,7 +433,7 @@ def _busiest(view: FlipsView) -> Browse | None:
 
 
 def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]:
-    """(title of its section, figure) of a rule; those that would be empty are left out."""
+    """Yield (title of its section, figure) for each figure of a rule that would not be empty."""
 
     def rows(table: str) -> dict[str, np.ndarray]:
         whole = view.table(table)
@@ -501,7 +501,7 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
 
 
 def _lasting(view: FlipsView, place: int) -> Table | None:
-    """The pairs of residues that were in contact most of the time; None where none ever was."""
+    """Return the pairs of residues with the longest total contact time; None if there was no contact."""
     table, frames = view.table("occupancy"), view.summary["frames"]
     rows = np.flatnonzero(table["rule"] == place)
     # those throughout are most often neighbors along a chain
@@ -517,7 +517,7 @@ def _lasting(view: FlipsView, place: int) -> Table | None:
 def _maps(
     view: FlipsView, pairs: Mapping[str, np.ndarray], moments: Mapping[str, np.ndarray], x: np.ndarray
 ) -> Iterator[tuple[str, tuple[str, ...], tuple[str, ...], Region]]:
-    """(name, words along x and y, map) of the contact matrix and of contacts over time."""
+    """Yield (name, labels along x and y, map) of the contact matrix and of contacts over time."""
     index, first = np.unique(moments["index"], return_index=True)
     if not len(index):
         return

@@ -1,4 +1,4 @@
-"""What one trajectory and two share: the summary of a file, and its numbers as people read them."""
+"""Functions shared by one and two trajectories: the summary of a file, and formatting of its numbers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TEXTS = Texts(Path(__file__).with_name("flips.py"))
 
 
 def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
-    """Indices of the atoms on either side."""
+    """Return the indices of the atoms of both selections."""
     from mdnum.trajectories.selection import select
 
     first, second = (None, None) if between is None else (select(trajectory, one) for one in between)
@@ -40,20 +40,20 @@ def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
 
 
 def stem(trajectory: Trajectory) -> str:
-    """What a folder is named after; a run's folder says more than the name that all trajectories have."""
+    """Return the stem of a folder's name; for a run's trajectory, the name of the run's folder."""
     name = trajectory.path.name.split(".")[0]
     return trajectory.path.resolve().parent.name if name == "trajectory" else name
 
 
 def name_of(trajectory: Trajectory) -> str:
-    """What a file is called on a page; a run's trajectory by its folder, because all have one name."""
+    """Return the name of a file for a page; for a run's trajectory, the name of the run's folder."""
     own = trajectory.path.name == "trajectory.traj"
     name = trajectory.path.resolve().parent.name if own else trajectory.path.name
     return f"{name}@{trajectory.slice_words}" if trajectory.slice_words else name
 
 
 def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None) -> dict[str, Any]:
-    """What summary.json says of a file."""
+    """Return the entries of summary.json on a file."""
     return {
         "world": "flips", "question": question, "system": name_of(trajectory), "file": str(trajectory.path),
         **{name: getattr(trajectory, name) for name in ("format", "reader", "atoms", "length", "time")},
@@ -63,7 +63,7 @@ def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None
 
 
 def in_python(text: str) -> str:
-    """A sentence that names options of the command, as a program writes them: cutoffs=R, array[:9]."""
+    """Replace options of the command in a sentence by their Python equivalents: cutoffs=R, array[:9]."""
 
     def named(option: re.Match[str]) -> str:
         name = {"cutoff": "cutoffs"}.get(option[1], option[1].replace("-", "_"))
@@ -76,7 +76,7 @@ def in_python(text: str) -> str:
 
 @contextmanager
 def as_python(in_memory: bool) -> Iterator[None]:
-    """Errors on arrays name arguments and no options."""
+    """In errors on arrays, replace command-line options by names of arguments."""
     try:
         yield
     except InputError as error:
@@ -86,7 +86,7 @@ def as_python(in_memory: bool) -> Iterator[None]:
 
 
 def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = False) -> dict[str, Any]:
-    """What summary.json says of how the reading ended."""
+    """Return the entries of summary.json on how reading ended."""
     told = None if stopped is None else str(stopped)
     return {
         "stopped": in_python(told) if told and in_memory else told,
@@ -96,7 +96,7 @@ def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = Fals
 
 
 class HeldRows:
-    """Rows of a folder's tables, appended for many frames together."""
+    """Buffer of rows of a folder's tables, which are written for many frames together."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         units = {"length": trajectory.length, "decision": trajectory.length, "time": trajectory.time}
@@ -107,19 +107,19 @@ class HeldRows:
         self._count = self.flips = 0
 
     def add(self, table: str, columns: dict[str, np.ndarray]) -> None:
-        """Adds rows, equally long columns."""
+        """Add rows as columns of equal length."""
         self.held.setdefault(table, []).append(columns)
         rows = len(next(iter(columns.values())))
         self._count += rows + _PART
         self.flips += rows * (table == "flips")
 
     def drain(self, folder: RunFolder, passes: Iterator[Any], found: Any, of: int, log: Progress) -> bool:
-        """Reads frames until there are no more, or control-C is pressed; returns whether it was.
+        """Read frames until the end, or until control-C is pressed; return True in the latter case.
 
         Args:
-            passes: one for each frame, which adds rows.
-            found: what it goes by, with `frames` read so far, and `stopped` where the rest cannot be read.
-            of: how many there are, 0 if not known.
+            passes: iterator with one item per frame, which adds rows.
+            found: the current results, with `frames` read so far, and `stopped` if the rest cannot be read.
+            of: number of frames, 0 if unknown.
         """
         with asked_to_stop() as stop:
             while True:
@@ -134,11 +134,11 @@ class HeldRows:
 
     @property
     def full(self) -> bool:
-        """Whether there are so many that they should be handed over."""
+        """True if the buffer has enough rows to be written."""
         return self._count > _ROWS_HELD
 
     def hand_over(self, folder: RunFolder) -> None:
-        """Appends the rows to their tables."""
+        """Append the rows to their tables."""
         folder.told = self._told
         for table, parts in self.held.items():
             folder.append(table, together(parts))
@@ -146,26 +146,26 @@ class HeldRows:
 
 
 class FlipsView(View):
-    """A folder of flips, with its numbers as people read them: frames as times, lengths with units."""
+    """View of a folder of flips, with formatted numbers: frames as times, lengths with units."""
 
     @property
     def timed(self) -> bool:
-        """Whether frames have times."""
+        """True if frames have times."""
         return bool(self.summary["timed"] and self.summary["interval"])
 
     @property
     def by_residue(self) -> bool:
-        """Whether pairs are of residues."""
+        """True if the pairs are pairs of residues."""
         return self.summary.get("by") == "residue"
 
     @property
     def one(self) -> str:
-        """Whose neighbors are counted, in words."""
+        """"a residue" or "an atom", depending on whose neighbors are counted."""
         return "a residue" if self.by_residue else "an atom"
 
     @property
     def unit(self) -> str:
-        """The unit of length."""
+        """Unit of length."""
         return self.summary["length"]
 
     @property
@@ -174,12 +174,12 @@ class FlipsView(View):
         return " and ".join(f"“{one}”" for one in self.summary["between"] or ()) or None
 
     def time(self, text: str) -> str:
-        """A number with the unit of time; steps are counted, units are not."""
+        """Append the unit of time to a number; only steps have a plural."""
         unit = self.summary["time"]
         return f"{text} {unit}{'s' if unit == 'step' and text not in ('1', '1.00', '1.0') else ''}"
 
     def duration(self, frames: float | None, digits: int = 3, beyond: str = "longer than seen") -> str:
-        """A number of frames as time where the file has times."""
+        """Format a number of frames, as a time if the file has times."""
         if frames is None:
             return beyond
         if self.timed:
@@ -187,10 +187,10 @@ class FlipsView(View):
         return f"{plain(frames, digits)} frame{'' if frames == 1 else 's'}"
 
     def life(self, one: Mapping[str, Any], name: str = "median", of: str = "lifetime") -> str:
-        """A lifetime of a rule: its value, of which side it is a bound, or why there is none.
+        """Format a lifetime of a rule: its value, any bound, or the reason why there is no value.
 
-        Where half of the contacts are over by the next frame, all lifetimes are upper bounds: pairs came and
-        went between the frames.
+        If half of the contacts have ended by the next frame, all lifetimes are upper bounds, because pairs
+        crossed the threshold several times between frames.
         """
         life = one[of]
         if not one["pairs_most"]:
@@ -204,7 +204,7 @@ class FlipsView(View):
         return bound * (life[name] is not None) + self.duration(life[name])
 
     def rate(self, per_frame: float | None) -> str:
-        """A rate per frame as one per time, where the file has times; a dash where there is none."""
+        """Format a rate per frame, as a rate per time if the file has times; a dash if there is no rate."""
         if per_frame is None:
             return "–"
         if self.timed:
@@ -212,16 +212,16 @@ class FlipsView(View):
         return f"{number(per_frame)} per frame"
 
     def length(self, value: float | None) -> str:
-        """A length with its unit."""
+        """Format a length with its unit."""
         return f"{number(value)} {self.unit}".rstrip()
 
     def rule(self, one: Mapping[str, Any]) -> str:
-        """A rule with its unit: r < 8.5 Å."""
+        """Format a rule with its unit: r < 8.5 Å."""
         name = one["rule"]
         return f"{name} {self.unit}" if self.unit and "<" in name and "most" not in name else name
 
     def box(self, box: Mapping[str, Any]) -> str:
-        """A box: lengths, angles where they are not right, and the axes along which it repeats."""
+        """Format a box: lengths, angles unless they are right angles, and periodic axes."""
         matrix, axes = np.array(box["matrix"]), repeating(box)
         if not axes:
             return "no box that repeats"
@@ -235,7 +235,7 @@ class FlipsView(View):
         return f"{text}, repeating along {listed(axes)}"
 
     def repeated(self, repeats: Mapping[str, Any] | None, file: str = "") -> Iterator[Finding]:
-        """The finding on frames that repeat earlier ones, if any do; of one of two files by its name."""
+        """Yield the finding on frames that repeat earlier ones, if any; `file` names one of two files."""
         again = repeats.get("again", ()) if repeats else ()
         if again and repeats and repeats["dropped"]:
             total = sum(one["frames"] for one in again)
@@ -256,30 +256,30 @@ class FlipsView(View):
         yield TEXTS.finding("REPEATED_FRAMES", *variants, ranges=listed(told), **values)
 
     def again(self, again: Sequence[Mapping[str, Any]]) -> list[str]:
-        """Which frames have the times of earlier ones, in words."""
+        """Return phrases on the frames that have the times of earlier frames."""
         kinds = ["one" if one["first"] == one["last"] else "many" for one in again[:_RANGES]]
         times = [{"time": plain(one["time"], 9), "to": self.time(plain(one["to"], 9))} for one in again]
         return [TEXTS(f"again_{kind}", **{**again[k], **times[k]}) for k, kind in enumerate(kinds)]
 
     def axis(self, rows: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray]:
-        """(label, values) of an axis along the trajectory."""
+        """Return (label, values) of an axis along the trajectory."""
         if self.timed:
             return f"time ({self.summary['time']})", rows["time"]
         return "frame", rows["frame"]
 
 
 def average(mean: float) -> str:
-    """A mean of whole numbers, with so many digits that rounding does not take it out of their range."""
+    """Format a mean of integers with enough digits that rounding keeps it within their range."""
     return count(round(mean)) if mean >= 1000 else number(mean, 4)
 
 
 def repeating(box: Mapping[str, Any]) -> list[str]:
-    """The axes along which a box repeats."""
+    """Return the axes along which a box is periodic."""
     return [name for name, yes in zip("abc", box["pbc"], strict=True) if yes]
 
 
 def resolution(kept: Mapping[str, Any], length: str) -> str:
-    """How finely a file gives positions, in words."""
+    """Return a phrase on the resolution of a file's positions."""
     code = kept["kind"]
     if not kept["told"]:
         code = "usual" if kept["step"] else "unknown"

@@ -1,7 +1,7 @@
-"""`mdnum fork`: where two runs that differ in one choice diverge, and what a flip had to do with it.
+"""`mdnum fork`: where two runs that differ in one choice diverge, and whether a flip caused it.
 
-One question of either world: a choice is varied (`fork`), all of them are (`fork_screen`), two finished runs
-are compared or followed again (`fork_folders`), or ensembles are (`fork_benign`).
+In both worlds, one choice (`fork`) or every choice (`fork_screen`) is varied, two finished runs are compared
+or replayed (`fork_folders`), or ensembles are compared (`fork_benign`).
 """
 
 from __future__ import annotations
@@ -53,37 +53,38 @@ def fork(
     pin: str | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system and its twin that differs in one choice, and say where and why they diverge.
+    """Run a system and its twin that differs in one choice, and find where and why they diverge.
 
     Example:
         >>> mdnum.fork("argon/crystal-108", "precision.force=float32", steps=500)
 
     Args:
         system: a simulation, a system, a shipped name or the path of a system file, of either world.
-        vary: the choice, such as "precision" or "contact=earlier"; "all" screens every choice. Default what
-            the [fork] table of the system file says, as for steps and split, and else "precision".
-        steps: last step; default the system's own.
-        split: separation that counts as split, length; default 0.01 of the longest cutoff, of a ball 0.01 of
-            the largest start height.
-        repeats: further pairs of runs with perturbed starts at most, to tell a delay from chance; default 15.
-            They are run until the verdict is clear, and again with starts displaced by a hundredth of that.
-        counterfactual: whether to run B's arithmetic under A's decisions, which the verdict rests on.
-        back: whether to run A's arithmetic under B's decisions too, for the table of two by two; default
-            with the counterfactual.
-        lyapunov: whether to carry a tangent along A, for the largest Lyapunov exponent (not of a ball).
-        minimal: whether to look for the fewest decisions that have to be overridden with A's to keep the runs
-            together; it takes up to 80 runs.
-        pin: a decision to override with A's in one more run of B: "fork", a pair "3-75", or a pair over a
-            window "3-75:600..700". minimal and pin are of molecular dynamics.
+        vary: the choice, such as "precision" or "contact=earlier"; "all" screens every choice. The default,
+            as for steps and split, is that of the [fork] table of the system file, or else "precision".
+        steps: last step; by default the system's own.
+        split: separation that counts as a split, length; default 0.01 of the longest cutoff, for a ball 0.01
+            of the largest start height.
+        repeats: maximum number of further pairs of runs with perturbed starts, which distinguish a delay from
+            chance; default 15. Pairs are run until the verdict is clear, and again with start displacements a
+            hundredth of that size.
+        counterfactual: whether to run B's arithmetic under A's decisions, which the verdict requires.
+        back: whether to run A's arithmetic under B's decisions too, for the two-by-two table; by default the
+            same as counterfactual.
+        lyapunov: whether to propagate a tangent along A, for the largest Lyapunov exponent (not for a ball).
+        minimal: whether to find the smallest set of decisions that, overridden with A's, keeps the runs
+            together; this takes up to 80 runs.
+        pin: a decision to override with A's in one additional run of B: "fork", a pair "3-75", or a pair over
+            a window "3-75:600..700". minimal and pin are for molecular dynamics only.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its result is a `mdnum.forks.Fork`, and where all choices were screened a list of
+        an outcome whose result is a `mdnum.forks.Fork`, or, if all choices were screened, a list of
         `mdnum.forks.pair.Screened`.
 
     Raises:
-        InputError: the system cannot be run, the choice is unknown or does not apply to it, or something was
-            asked for that would not be done.
+        InputError: the system cannot be run, the choice is unknown or does not apply to the system, or an
+            option would have no effect.
         FolderError: the folder cannot be used.
     """
     from mdnum.forks.choices import parse, twin_of, world_of
@@ -120,7 +121,7 @@ def fork(
 
 
 def _asked_by_default(system: Any) -> Mapping[str, Any]:
-    """What the [fork] table of a system file asks: vary, steps and split."""
+    """Return the options in the [fork] table of a system file: vary, steps and split."""
     from mdnum.systems.load import world_of
 
     if world_of(system) == "md":
@@ -132,20 +133,20 @@ def _asked_by_default(system: Any) -> Mapping[str, Any]:
 def fork_screen(
     system: Simulation | System | BallSystem | str | Path, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Follow the free runs of every choice, and rank the choices by when they fork.
+    """Run the free runs of every choice, and rank the choices by when they fork.
 
-    Counterfactuals are left to the choices that turn out to matter.
+    Counterfactuals are left for the choices that prove to matter.
 
     Example:
         >>> mdnum.fork_screen("argon/crystal-108", steps=200)
 
     Args:
         system: as for `fork`.
-        steps: last step; default that of the [fork] table, or the system's own.
+        steps: last step; by default that of the [fork] table, or the system's own.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its result is a list of `mdnum.forks.pair.Screened`.
+        an outcome whose result is a list of `mdnum.forks.pair.Screened`.
     """
     from mdnum.forks.pair import screen
     from mdnum.systems import opened
@@ -172,27 +173,28 @@ def fork_screen(
 def fork_folders(
     a: str | Path, b: str | Path, *, replay: bool = False, objects: Sequence[Simulation] = (), **asked: Any
 ) -> Outcome:
-    """Compare two finished runs of one world: what was different, and where they diverge.
+    """Compare two finished runs of one world: find their differences, and where they diverge.
 
     Example:
         >>> mdnum.fork_folders("runs/liquid-864", "runs/liquid-864-2")
 
     Args:
-        a, b: run folders; or two of `mdnum.Recorder` or `mdnum flips`, whose steps are frames.
-        replay: follow both again (molecular dynamics), and judge the flip at their fork as `fork` does. The
-            summary then says whether the replay diverges where the stored tables do: it has their bits where
-            versions and processor are the same. Else nothing is run: dates are those of the stored tables.
-        objects: the simulations that ran there, where they were made of objects; which one is which, and
-            whether they are those, is told by what the folders say of them.
-        asked: out, report and progress; of a replay also steps, split, repeats, counterfactual, back,
-            lyapunov, minimal and pin of `fork`, and no more steps than both runs have.
+        a, b: run folders; or two folders of `mdnum.Recorder` or `mdnum flips`, whose steps are frames.
+        replay: run both again (molecular dynamics), and judge the flip at their fork as `fork` does. The
+            summary then states whether the replay diverges where the stored tables do; the replay has the
+            same bits if versions and processor are the same. Otherwise nothing is run, and all dates are
+            those of the stored tables.
+        objects: the simulations of these runs, if they were made from objects; they are matched with the
+            folders, and checked, by the data in the folders.
+        asked: out, report and progress; for a replay also steps, split, repeats, counterfactual, back,
+            lyapunov, minimal and pin of `fork`, with at most as many steps as both runs have.
 
     Returns:
-        its result is a `mdnum.forks.folders.FolderFork`, of a replay a `mdnum.forks.Fork`.
+        an outcome whose result is a `mdnum.forks.folders.FolderFork`, or for a replay a `mdnum.forks.Fork`.
 
     Raises:
-        InputError: the folders hold runs of other systems, or no runs.
-        FolderError: a folder holds no run, or the new one cannot be used.
+        InputError: the folders contain runs of different systems, or no runs.
+        FolderError: a folder contains no run, or the new folder cannot be used.
     """
     from mdnum.forks.folders import compare_folders, simulation_in, twin_of
 
@@ -236,19 +238,19 @@ def fork_folders(
 def fork_benign(
     system: Simulation | System | str | Path, vary: str, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Whether a choice changes anything that would be measured: an ensemble-consistency test.
+    """Test whether a choice changes any measurable quantity: an ensemble-consistency test.
 
     Example:
         >>> mdnum.fork_benign("argon/liquid-864", "order")
 
     Args:
-        system: of molecular dynamics, as for `fork`.
+        system: a system of molecular dynamics, as for `fork`.
         vary: the choice.
-        steps: at which the ensembles are compared; default calibrated.
+        steps: step at which the ensembles are compared; by default calibrated.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its result is a `mdnum.forks.benign.Benign`.
+        an outcome whose result is a `mdnum.forks.benign.Benign`.
     """
     from mdnum.forks.benign import benign
     from mdnum.forks.choices import parse, twin_of
@@ -263,7 +265,7 @@ def fork_benign(
 
 
 def listed() -> Reply:
-    """`mdnum fork choices`: what can be varied."""
+    """Execute `mdnum fork choices`: list the choices that can be varied."""
     from mdnum.forks.choices import shipped
 
     document, tables = {}, []
@@ -289,7 +291,7 @@ def _page(view: View, what: str, about: str, keys: Mapping[str, Any], sections: 
 
 
 def page_screen(view: View, verdict: Verdict) -> Page:
-    """The page of all choices side by side."""
+    """Return the page that compares all choices."""
     s, rows, left = view.summary, view.summary["ranking"], view.summary["not_applicable"]
     same = [row["first_bit"] is None for row in rows]
     held = [whole for whole, row in zip(same, rows, strict=True) if row["must_hold"]]
@@ -316,7 +318,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """A line per choice: where the first bit and the first decision differ, and where the runs split."""
+    """Draw one line per choice with the steps of the first different bit, the fork and the split."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (
@@ -340,7 +342,7 @@ def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
 
 
 def page_compare(view: View, verdict: Verdict) -> Page:
-    """The page of two finished runs."""
+    """Return the page of two finished runs."""
     s = view.summary
     same = [TEXTS("folders_0_causes")] * (s["world"] != "flips")
     different = [differences(s["differences"])] if s["differences"] else same
@@ -358,7 +360,7 @@ of_pair,
 
 
 def page_benign(view: View, verdict: Verdict) -> Page:
-    """The page of an ensemble-consistency test."""
+    """Return the page of an ensemble-consistency test."""
     s = view.summary
     failing = Table(("feature", "standard deviations"), list(s["failing"].items()))
     names = tuple(f"component {k + 1}" for k in range(s["components"]))

@@ -1,4 +1,4 @@
-"""`mdnum fork certify` and `processes`: runs against exact arithmetic, and programs against each other."""
+"""`mdnum fork certify` and `processes`: runs versus exact arithmetic, and programs versus each other."""
 
 from __future__ import annotations
 
@@ -42,21 +42,21 @@ def fork_certify(
     policies: Mapping[str, Any] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """When runs in each precision leave the history in exact arithmetic.
+    """Find, for each precision, the step at which a run departs from the history in exact arithmetic.
 
     Example:
         >>> mdnum.fork_certify("argon/crystal-108", steps=100)
 
     Args:
         system: a simulation, a system, a shipped name or the path of a system file: one pair potential, NVE,
-            at most 108 atoms; or a ball whose steps are sums and products.
-        steps: last step; default the system's own.
+            at most 108 atoms; or a ball whose steps consist of sums and products.
+        steps: last step; by default the system's own.
         policies: precisions to rank, by name: dtypes by role, such as {"state": "float32"}; default
             `MD_POLICIES` or `BALL_POLICIES` of `mdnum.forks.exact.certify`.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its result is a `mdnum.forks.exact.certify.Certificate`.
+        an outcome whose result is a `mdnum.forks.exact.certify.Certificate`.
 
     Raises:
         InputError: the system cannot be certified.
@@ -89,7 +89,7 @@ def fork_certify(
 
 
 def _ranking(answer: Answer) -> list[dict[str, Any]]:
-    """Precisions for the summary; the same into a table, with their separations from the exact run."""
+    """Return the precisions for the summary; write their table and separations from the exact run."""
     ranking, rows, table = answer.result.ranking, [], []
     for row in ranking:
         decision, growth, separation = row.decision, row.growth, row.separation
@@ -111,7 +111,7 @@ def _ranking(answer: Answer) -> list[dict[str, Any]]:
 
 
 def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[str, Any]:
-    """Separations by step one below the other, each with its name in a column."""
+    """Return the columns of separations of several lines, stacked, with each line's name in a column."""
     return {
         name: np.concatenate([np.full(len(line), key) for key, line in lines.items()]),
         "step": np.concatenate([first + np.arange(len(line)) for line in lines.values()]),
@@ -120,7 +120,7 @@ def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[s
 
 
 def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
-    """Each policy's decisions against their rounding bounds; the ambiguous ones in exact arithmetic too."""
+    """Compare each policy's decisions with their rounding bounds; evaluate ambiguous ones exactly too."""
     from mdnum.forks.certified import certified_horizon
     from mdnum.numerics import PrecisionPolicy
 
@@ -135,7 +135,7 @@ def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
 
 
 def judge_certify(view: View) -> Verdict:
-    """Which precisions keep the exact history, and which leave it when."""
+    """Return the verdict on which precisions keep the exact history, and when the others depart from it."""
     s = view.summary
     rows = [row for row in s["policies"] if row["reason_unavailable"] is None]
     left = [row for row in rows if row["horizon"] is not None]
@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """What promoting single roles is worth against single precision throughout, or lowering them costs."""
+    """Yield the gain from raising single roles to double precision, or the loss from lowering them."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip
@@ -187,7 +187,7 @@ def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
 
 
 def page_certify(view: View, verdict: Verdict) -> Page:
-    """The page of a ranking of precisions."""
+    """Return the page of a ranking of precisions."""
     s, ball, unit = view.summary, "balls" in view.summary, view.units.length
     rows, ambiguous, steps = s["policies"], s.get("ambiguous") or {}, s["steps"]
     roles = [role for role in ("state", "force", "arithmetic", "decision", "accumulate") if role in rows[0]]
@@ -229,7 +229,7 @@ def page_certify(view: View, verdict: Verdict) -> Page:
 
 
 def _drawn(table: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> tuple[Series, ...]:
-    """A line for each of some names of a table of `_lines`."""
+    """Return one line for each selected name of a table of `_lines`."""
     names = next(iter(table.values()))
     steps = np.unique(table["step"])
     lines = {label: np.full(len(steps), np.nan) for label in labels.values()}
@@ -240,7 +240,7 @@ def _drawn(table: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> tuple[
 
 
 def _bars(s: Mapping[str, Any], figure: Canvas) -> None:
-    """A bar per precision, as long as it keeps to the exact history."""
+    """Draw one bar per precision, whose length is the number of steps with the exact history."""
     axes, rows, last = figure.subplots(), s["policies"], s["steps"]
     place = np.arange(len(rows))[::-1]
     ends = [last if row["horizon"] is None else row["horizon"] for row in rows]
@@ -266,24 +266,24 @@ def fork_processes(
     which: Sequence[Variant] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system jitted, eagerly, in a batch, in a gradient and under flags of XLA, and find which agree.
+    """Run a system jitted, eagerly, in a batch, in a gradient and under XLA flags, and find which runs agree.
 
     Example:
         >>> mdnum.fork_processes("argon/crystal-108", steps=100)
 
     Args:
         system: a simulation, a system, a shipped name or the path of a system file; pair potentials only.
-        steps: of each program; default 200, or the system's own where they are fewer.
+        steps: number of steps of each program; default 200, or the system's own if smaller.
         which: the variants; default `mdnum.forks.processes.VARIANTS`.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its result is a `mdnum.forks.processes.Variants`.
+        an outcome whose result is a `mdnum.forks.processes.Variants`.
 
     Raises:
         InputError: the system cannot be run, or its potential is a many-body one.
         FolderError: the folder cannot be used.
-        MdnumError: not one of the variants ran.
+        MdnumError: none of the variants ran.
     """
     from mdnum.forks.processes import VARIANTS, in_a_file, variants
 
@@ -327,7 +327,7 @@ def _cause(code: str, names: Sequence[str] = (), program: str = "", **values: An
 
 
 def judge_processes(view: View) -> Verdict:
-    """How many different trajectories the programs of one system compute."""
+    """Return the verdict on how many different trajectories the programs of one system compute."""
     s = view.summary
     seeds = [row["first_bit"] for row in s["variants"] if row["first_bit"] is not None]
     ran, clusters = len(s["variants"]) - len(s["failed_variants"]), len(s["clusters"])
@@ -343,7 +343,7 @@ def judge_processes(view: View) -> Verdict:
 
 
 def page_processes(view: View, verdict: Verdict) -> Page:
-    """The page of a comparison of programs."""
+    """Return the page of a comparison of programs."""
     s, length = view.summary, view.units.length
     ran = [row for row in s["variants"] if not row["failed"]]
     seeds = [row["first_bit"] for row in ran if row["first_bit"] is not None]

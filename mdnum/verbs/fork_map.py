@@ -1,4 +1,4 @@
-"""`mdnum fork map` and `forecast`: where decisions change along a number, and what would flip them first."""
+"""`mdnum fork map` and `forecast`: where decisions change along a parameter, and which would flip first."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ _ROOM = 0.03
 
 
 def command(system: str, along: str, **given: Any) -> Outcome:
-    """`mdnum fork map SYSTEM KEY=LOW:HIGH`.
+    """Execute `mdnum fork map SYSTEM KEY=LOW:HIGH`.
 
     Raises:
-        InputError: the interval is not of that form.
+        InputError: the interval is not of the form KEY=LOW:HIGH.
     """
     return fork_map(system, *interval(along), **given)
 
 
 def interval(text: str) -> tuple[str, float, float]:
-    """The words of KEY=LOW:HIGH.
+    """Split KEY=LOW:HIGH into the key and two numbers.
 
     Raises:
-        InputError: not of that form.
+        InputError: the text is not of this form.
     """
     with suppress(ValueError):
         for key, low, high in _INTERVAL.findall(text):
@@ -73,29 +73,30 @@ def fork_map(
     confirm: bool = True,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Where the history of a run's decisions changes along a number, to adjacent floats.
+    """Find where the history of a run's decisions changes along a parameter, to adjacent floats.
 
     Example:
         >>> mdnum.fork_map("argon/crystal-108", "cutoff.radius", 1.58, 1.59, steps=100)
 
     Args:
         system: a simulation, a system, a shipped name or the path of a system file, of either world.
-        key: the number, such as "potential.sigma", "timestep" or "position.17.x"; of a ball "k", "tol", "y0".
-        low, high: the interval, in the units of the system's file; both belong to it.
-        steps: last step of every run; default the system's own, but no more than 500 of molecular dynamics.
-        cells: of the grid that is searched first.
-        most: stop after this number of boundaries; default 24, and of a ball 64.
-        loss: of the final state, called with the simulation, unwrapped positions and velocities; default the
-            mean squared displacement from the start. That of a ball is the file's.
-        confirm: whether to run both sides of every boundary again in a fresh process; not of a simulation
-            made of objects, which only this process has.
+        key: the parameter, such as "potential.sigma", "timestep" or "position.17.x"; for a ball "k", "tol",
+            "y0".
+        low, high: the closed interval, in the units of the system's file.
+        steps: last step of every run; by default the system's own, but at most 500 for molecular dynamics.
+        cells: number of cells of the grid that is searched first.
+        most: stop after this number of boundaries; default 24, and 64 for a ball.
+        loss: loss of the final state, called with the simulation, unwrapped positions and velocities; by
+            default the mean squared displacement from the start. The loss of a ball is that of its file.
+        confirm: whether to run both sides of every boundary again in a new process; not for a simulation made
+            from objects, which exists only in this process.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its result is a `mdnum.forks.boundaries.BoundaryMap`.
+        an outcome whose result is a `mdnum.forks.boundaries.BoundaryMap`.
 
     Raises:
-        InputError: the system cannot be run, no such number, or an interval that makes no sense.
+        InputError: the system cannot be run, there is no such parameter, or the interval is invalid.
         FolderError: the folder cannot be used.
     """
     from mdnum.forks.boundaries import boundaries, checked
@@ -151,7 +152,7 @@ def fork_map(
 
 
 def _row(edge: Boundary) -> dict[str, Any]:
-    """A boundary in plain values."""
+    """Return a boundary as plain values."""
     below, above = edge.below, edge.above
     first, second = [*edge.subject, -1, -1][:2]
     side = "above" if above.decided else "below"
@@ -175,7 +176,7 @@ def _row(edge: Boundary) -> dict[str, Any]:
 
 
 def judge_map(view: View) -> Verdict:
-    """What changes along a number, how much, and how sure that is."""
+    """Return the verdict on what changes along a parameter, by how much, and with what certainty."""
     s = view.summary
     edges, left, failed = s["boundaries"], s["unresolved"], s["failed_runs"]
     all_failed = bool(failed) and failed == s["evaluations"]
@@ -221,7 +222,7 @@ def _map_evidence(s: Mapping[str, Any], values: Mapping[str, Any]) -> Iterator[s
 
 
 def page_map(view: View, verdict: Verdict) -> Page:
-    """The page of a map."""
+    """Return the page of a map."""
     s, unit, length = view.summary, view.summary["key_unit"], view.units.length
     edges, left = s["boundaries"], s["unresolved"]
     keys = TEXTS.keys("keys_map", **{**s, "n": len(edges), "left": len(left) or None, "length": length})
@@ -260,7 +261,7 @@ def page_map(view: View, verdict: Verdict) -> Page:
 
 
 def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
-    """The loss piece by piece; less its trend, where jumps are too small to be seen; how large they are."""
+    """Yield figures of the loss by piece, of the loss minus its trend if jumps are small, and of jumps."""
     s, points = view.summary, view.table("points")
     at, loss = points["at"], points["loss"]
     finite = np.isfinite(loss)
@@ -323,22 +324,23 @@ def _with_unit(text: str, unit: str) -> str:
 def fork_forecast(
     system: Simulation | System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Which decisions a random displacement of the start would flip first, from one tangent run.
+    """Predict which decisions a random displacement of the start would flip first, from one tangent run.
 
     Example:
         >>> mdnum.fork_forecast("argon/liquid-864", 1e-9)
 
     Args:
         system: a simulation, a system, a shipped name or the path of a system file; pair potentials only.
-        size: of the displacement: how far the furthest atom is moved, length.
-        steps: last step; default the system's own.
+        size: displacement of the atom that is moved furthest, length.
+        steps: last step; by default the system's own.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its result is a `mdnum.forks.linearized.Forecast`.
+        an outcome whose result is a `mdnum.forks.linearized.Forecast`.
 
     Raises:
-        InputError: the system cannot be run, its potential is a many-body one, or size is no length.
+        InputError: the system cannot be run, its potential is a many-body one, or size is not a positive
+            length.
         FolderError: the folder cannot be used.
     """
     from mdnum.forks.linearized import LINEAR, forecast
@@ -370,7 +372,7 @@ def fork_forecast(
 
 
 def judge_forecast(view: View) -> Verdict:
-    """What a displacement is expected to flip first, and how far that is good."""
+    """Return the verdict on the first flips expected from a displacement, and the forecast's validity."""
     s, unit = view.summary, view.units.length
     first, nearest, until, ends = s["first"], s["nearest"], s["until"], s["ends"]
     values = {**s, "unit": unit, "after": until + 1}
@@ -389,7 +391,7 @@ def judge_forecast(view: View) -> Verdict:
 
 
 def page_forecast(view: View, verdict: Verdict) -> Page:
-    """The page of a forecast."""
+    """Return the page of a forecast."""
     s, length, until = view.summary, view.units.length, view.summary["until"]
     first, near = (next(iter(s[name]), None) for name in ("first", "nearest"))
     values = {"first": first, "near": near, "needed": near and abs(near["amplitude"]), "length": length}

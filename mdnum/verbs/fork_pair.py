@@ -1,4 +1,4 @@
-"""A pair of runs of either world, followed into a fork folder: its summary, its tables."""
+"""Runs of a pair, of either world, and the summary and tables of their fork folder."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _MD_ALONE = ("energy_back", "nearest_a", "nearest_b", "ambiguous_a", "ambiguous_
 
 @dataclass(frozen=True)
 class PairQuestion:
-    """What is to be found out about a pair of runs; the arguments of `fork`."""
+    """Options for a pair of runs; the arguments of `fork`."""
 
     steps: int | None = None
     split: float | None = None
@@ -55,10 +55,10 @@ class PairQuestion:
 
 
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
-    """The last step: the one given, else the system's own, but no more than `most`.
+    """Return the last step: the given one, or else the system's own, but at most `most`.
 
     Raises:
-        InputError: steps below 1.
+        InputError: steps is below 1.
     """
     from mdnum.systems.load import world_of
 
@@ -71,14 +71,15 @@ def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
 def of_md(
     system: Any, overrides: Mapping[str, Any] | None, question: str, pairwise: bool = False
 ) -> Simulation:
-    """A simulation, the only ones that a question is asked of.
+    """Return a simulation of molecular dynamics, or raise an error for a system that is not supported.
 
     Args:
-        question: whose sentence "ball_<question>" says what a ball offers in its place.
-        pairwise: whether it is asked of pair potentials alone; "many_body_<question>" then says so.
+        question: name in the text keys "ball_<question>", the alternative for a ball, and
+            "many_body_<question>".
+        pairwise: whether only pair potentials are supported.
 
     Raises:
-        InputError: it is a ball, has a many-body potential, or is no system.
+        InputError: the system is a ball, has an unsupported many-body potential, or is no system.
     """
     from mdnum.systems import BallSystem, opened
 
@@ -92,7 +93,7 @@ def of_md(
 
 
 def basics(system: Simulation | System | BallSystem, steps: int | None) -> dict[str, Any]:
-    """What every summary says of the system; steps default to its own."""
+    """Return the entries on the system that every summary has; steps default to the system's own."""
     from mdnum.systems import BallSystem, System
 
     head: dict[str, Any] = {"system": system.name}
@@ -115,7 +116,7 @@ def basics(system: Simulation | System | BallSystem, steps: int | None) -> dict[
 
 
 def check(asked: PairQuestion) -> None:
-    """Refuses what cannot be, before a folder is made."""
+    """Raise an error for impossible options, before a folder is made."""
     from mdnum.forks.pair import repeats_asked
 
     expect_at_least(1, steps=1 if asked.steps is None else asked.steps)
@@ -135,11 +136,11 @@ def followed(
     further: Callable[[Fork], dict[str, Any]] = lambda made: {},
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Follow a twin and leave a fork folder.
+    """Run a pair and write a fork folder.
 
     Args:
-        labels: entries of the summary on what is varied.
-        further: gives those that need the pair.
+        labels: entries of the summary on the varied choice.
+        further: function that returns the entries that need the finished pair.
     """
     from mdnum.forks import fork as follow
     from mdnum.forks.pair import counterfactuals
@@ -161,7 +162,7 @@ def followed(
 
 
 def _numbers(made: Fork) -> dict[str, Any]:
-    """What the summary of any pair says: dates, verdict, growth, the table of two by two."""
+    """Return the summary's numbers for any pair: dates, verdict, growth, the two-by-two table."""
     step, verdict, growth = made.twin.a.timestep, made.verdict, made.growth["B"]
     dates = {"first_bit": made.dates.first_bit, "fork": made.dates.fork, "split": made.dates.split}
     free, imposed, overridden = (
@@ -207,7 +208,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
 
 
 def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
-    """Strain between the boxes at the end, at most, and beside the separation at each date."""
+    """Return the strain between the boxes: at the end, the largest, and with the separation at each date."""
     if "strain" not in made.series:
         return {}
     strain, free = made.series["strain"], made.series["B"]
@@ -220,7 +221,7 @@ def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
-    """A fit as a line: separation = exp(intercept + rate * step) between first and last."""
+    """Return a fit as a line: separation = exp(intercept + rate * step) between first and last."""
     if not np.isfinite(fit.rate):
         return dict.fromkeys(("rate", "r_squared", "first", "last", "intercept"))
     step = np.arange(fit.first, fit.last + 1)
@@ -229,7 +230,7 @@ def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
 
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """The step at which runs that have not split are expected to: by their own growth, or the exponent."""
+    """Predict the split step of runs that have not split, from their own growth or the Lyapunov exponent."""
     from mdnum.numerics.verdicts import expected
 
     exponent = summary.get("lyapunov")
@@ -254,7 +255,7 @@ def _separation(made: Fork) -> dict[str, Any]:
 
 
 def _decision(made: Fork) -> dict[str, Any] | None:
-    """The decision at the fork, in plain values."""
+    """Return the decision at the fork as plain values."""
     decision = made.decision
     if decision is None:
         return None
@@ -291,7 +292,7 @@ def _decision(made: Fork) -> dict[str, Any] | None:
 
 
 def _of_md(made: Fork, asked: PairQuestion, answer: Answer) -> dict[str, Any]:
-    """Entries and tables of a pair of molecular dynamics."""
+    """Return entries, and add tables, for a pair of molecular-dynamics runs."""
     from mdnum.forks.certified import certified
     from mdnum.forks.replays import neighborhood
 
@@ -341,7 +342,7 @@ def _of_md(made: Fork, asked: PairQuestion, answer: Answer) -> dict[str, Any]:
 
 
 def _of_ball(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
-    """Entries and tables of a pair of a ball: decisions that differ, the deciding ball around the fork."""
+    """Return entries, and add tables, for a pair of ball runs: differing decisions, the ball at the fork."""
     names = ("step", "channel", "ball", "a", "b", "margin_a", "margin_b", "bound_a", "bound_b", "run")
     flips = [{name: getattr(flip, name) for name in names} for flip in made.flips]
     tables["cross_flips"] = [
@@ -363,7 +364,7 @@ def _of_ball(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
 
 
 def _exponent(made: Fork) -> dict[str, Any]:
-    """The largest Lyapunov exponent of run A beside the growth that was seen, or why there is none."""
+    """Return the largest Lyapunov exponent of run A and the observed growth, or why there is none."""
     from mdnum.forks.linearized import lyapunov
 
     def why(name: str, **values: Any) -> dict[str, Any]:
@@ -397,7 +398,7 @@ def _exponent(made: Fork) -> dict[str, Any]:
 
 
 def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
-    """B run again with some decisions overridden with A's; a reason where it cannot be."""
+    """Return the result of running B with some of A's decisions imposed, or why this is impossible."""
     from mdnum.forks.replays import parse_pin, pinned
 
     try:
@@ -414,7 +415,7 @@ def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
 
 
 def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
-    """The fewest decisions that have to be overridden; a reason where none can be."""
+    """Return the smallest set of decisions that must be overridden, or a reason why there is none."""
     from mdnum.forks.replays import disagreements, minimal_cause
 
     try:

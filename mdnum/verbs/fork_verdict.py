@@ -1,4 +1,4 @@
-"""What is found about two runs of either world, and the answer in a sentence; from the folder alone."""
+"""Findings on two runs of either world, and the verdict in one sentence, from the folder alone."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RANKING = "Ranking"
 
 
 def subject(s: Mapping[str, Any]) -> str:
-    """What differs at the fork: the flip of a pair, the contact of a ball, the stop of a solver."""
+    """Name what differs at the fork: the flip of a pair, the contact of a ball, the stop of a solver."""
     d = s.get("decision")
     if d is None:
         return ""
@@ -36,13 +36,13 @@ def subject(s: Mapping[str, Any]) -> str:
 
 
 def of_pair(flip: Mapping[str, Any]) -> str:
-    """Whose decision a stored flip is: a pair's, of a term where there are several, or a ball's."""
+    """Name the pair (and the term, if there are several) or the ball of a stored flip."""
     i, *j = flip["subject"]
     return pair_name({"i": i, "j": j[0], "terms": flip["terms"]}) if j else str(i)
 
 
 def judge(view: View) -> Verdict:
-    """The verdict on a pair of runs."""
+    """Return the verdict on a pair of runs."""
     found = [*_findings(view), *view.kept(TEXTS.entries)]
     name, values = _headline(view)
     best = "info" if view.summary.get("fork") is not None else "good"
@@ -50,7 +50,7 @@ def judge(view: View) -> Verdict:
 
 
 def _headline(view: View) -> tuple[str, dict[str, Any]]:
-    """The sentence that answers, by name, and its values."""
+    """Return the name of the headline sentence and its values."""
     s = view.summary
     failed, word, fork, split = (s.get(name) for name in ("failed", "effect", "fork", "split"))
     values = {name: s.get(name) for name in ("steps", "first_bit", "fork", "split", "predicted_split")}
@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """How many of the pair and its repeats split later without the flips, at either displacement."""
+    """State how many of the pair and its repeats split later without the flips, at each displacement."""
     said = ""
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -108,13 +108,13 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def decided(decision: Mapping[str, Any]) -> str:
-    """The name of the sentence on a decision that differs."""
+    """Return the name of the sentence on a decision that differs."""
     name = "at_start" if decision["run"] == "start" else decision["channel"]
     return f"decided_{name}{'_term' * bool(decision.get('terms'))}"
 
 
 def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
-    """Which run decided yes and which no, and what each of them decided."""
+    """Return which run decided yes and which no, and the decision of each."""
     yes = "A" if decision["decided"]["A"] > decision["decided"]["B"] else "B"
     return {"yes": yes, "no": "B" if yes == "A" else "A", "a": decision["decided"]["A"],
             "b": decision["decided"]["B"]}  # fmt: skip
@@ -158,13 +158,13 @@ def _findings(view: View) -> Iterator[Finding]:
 
 
 def must_hold(row: Mapping[str, Any]) -> Finding:
-    """A choice that cannot change a bit by design, and did."""
+    """Return the finding that a choice that by design cannot change a bit did change one."""
     values: dict[str, Any] = {name: row.get(name) for name in ("choice", "difference", "first_bit", "fork")}
     return TEXTS.finding("MUST_HOLD_FORKED", *["fork"] * (row.get("fork") is not None), **values)
 
 
 def judge_screen(view: View) -> Verdict:
-    """The verdict on all choices: which forks first, and whether what must hold did."""
+    """Return the verdict on all choices: which forks first, and whether the choices that must hold did."""
     rows, found = view.summary["ranking"], []
     broken = [row for row in rows if row["must_hold"] and row["first_bit"] is not None]
     forked = [row for row in rows if row["fork"] is not None]
@@ -181,7 +181,7 @@ def judge_screen(view: View) -> Verdict:
 
 
 def judge_compare(view: View) -> Verdict:
-    """What two folders say about where their runs diverge, and what it may be put down to."""
+    """Return the verdict on where the runs of two folders diverge, and on possible causes."""
     summary = view.summary
     causes = summary["causes"]
     values = {name: summary[name] for name in ("steps", "first_bit", "fork")}
@@ -210,7 +210,7 @@ def judge_compare(view: View) -> Verdict:
 
 
 def judge_benign(view: View) -> Verdict:
-    """Whether B's runs belong to A's ensemble."""
+    """Return the verdict on whether B's runs belong to A's ensemble."""
     summary = view.summary
     values = {"difference": summary["difference"], "step": summary["window"]}
     if summary["passed"]:

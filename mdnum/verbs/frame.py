@@ -1,13 +1,13 @@
-"""The one frame of every verb: a folder is opened, filled, judged, shown; written once.
+"""The common frame of all verbs: a folder is created, filled, judged and shown.
 
-A verb is a file that reads top to bottom: its function (options → a filled folder), `judge` (view → findings
-and a headline) and `page` (view → sections), with its sentences in a text file beside it. It says so once:
+A verb is a file that reads from top to bottom: its function (options → a filled folder), `judge` (view →
+findings and a headline) and `page` (view → sections), with its sentences in a text file of the same name. It
+is declared once:
 
     KINDS = {"flips": Verb(judge, page)}
 
-by the kind of its folders, which its text file declares under [kinds.flips] (see `mdnum.verbs`). What is
-computed goes into the folder first: judge and page read the folder alone, so a page can be written again
-from disk.
+by the kind of its folders, which its text file declares under [kinds.flips] (see `mdnum.verbs`). All results
+are written to the folder first: judge and page read only the folder, so a page can be rewritten from disk.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ STEPWISE = 50
 
 @dataclass(frozen=True)
 class View:
-    """A folder as the findings and sections of its verb read it."""
+    """Read access to a folder for the findings and sections of its verb."""
 
     folder: RunFolder  # on disk
     summary: dict[str, Any]  # as written, without what was judged
@@ -69,37 +69,39 @@ class View:
 
     @property
     def name(self) -> str:
-        """The system's name, or what else was asked about."""
+        """Name of the system, or of whatever else was examined."""
         return str(self.summary.get("system") or self.summary.get("name") or self.folder.path.name)
 
     @cached_property
     def system(self) -> Mapping[str, Any]:
-        """The tables of the system that was run, empty where there is none."""
+        """Tables of the system that was run, empty if there is none."""
         return self.folder.system
 
     @cached_property
     def units(self) -> Units:
-        """The unit system of all numbers in the folder."""
+        """Unit system of all numbers in the folder."""
         return units.get(str(self.summary.get("units") or self.system.get("units") or "lj"))
 
     @property
     def took(self) -> tuple[str, str]:
-        """A row on the time that it took."""
+        """Table row with the duration of the verb."""
         return "Took", f"{number(self.summary['seconds'], 2)} s"
 
     def table(self, name: str) -> Mapping[str, np.ndarray]:
-        """A table of the folder: arrays by column name."""
+        """Return a table of the folder: arrays by column name."""
         if name not in self._tables:
             self._tables[name] = self.folder.read(name)
         return self._tables[name]
 
     def kept(self, codes: Mapping[str, Any]) -> list[Finding]:
-        """Findings of summary.json that the verb does not decide again: those whose code it has not."""
+        """Return findings of summary.json that the verb does not derive again because it lacks their
+        codes.
+        """
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
 
     def page(self, title: str, about: str, keys: Iterable[Key], sections: Iterable[Section]) -> Page:
-        """A page of this folder, with its system and provenance; sections without content are left out."""
+        """Return a page of this folder, with system and provenance; sections without content are omitted."""
         kept = [section for section in sections if section.parts]
         file = self.folder.system_file
         what = ("", "") if file is None else (file.name, read_text(file))
@@ -108,7 +110,7 @@ class View:
 
 @dataclass(frozen=True)
 class Verb:
-    """How a kind of folder is judged and shown."""
+    """Functions that judge and show a kind of folder."""
 
     judge: Callable[[Any], Verdict]  # findings and headline, from the folder alone
     page: Callable[[Any, Verdict], Page]  # everything else that is shown
@@ -117,7 +119,7 @@ class Verb:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Somebody pressed control-C where there was an answer (`outcome`) already, which is in its folder."""
+    """Raised if control-C is pressed when an answer (`outcome`) already exists, which is in its folder."""
 
     def __init__(self, outcome: Outcome):
         super().__init__(outcome)
@@ -126,9 +128,9 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Control-C as a wish: whether it was pressed since; pressed again, it interrupts as it always does.
+    """Yield a function that returns whether control-C was pressed; a second press interrupts as usual.
 
-    Outside of the main thread, where Python hands no signals over, nobody ever asks.
+    Outside the main thread, to which Python does not deliver signals, the function always returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -148,14 +150,14 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
 
 
 def end_on_sigterm(stack: ExitStack) -> None:
-    """SIGTERM as control-C until a stack is closed, in the main thread: what there is can be kept."""
+    """Treat SIGTERM as control-C until a stack is closed, in the main thread, so that results can be kept."""
     if threading.current_thread() is threading.main_thread():
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)
         stack.callback(signal.signal, signal.SIGTERM, before)
 
 
 class Keep(TypedDict, total=False):
-    """Keyword arguments of every question that is asked of a system."""
+    """Keyword arguments that all verbs on a system have in common."""
 
     # the new folder; default runs/<verb>-<name>-<n>; "{content}" in it becomes a digest of what is asked, and
     # a folder of that name which is finished is read
@@ -170,21 +172,21 @@ class Keep(TypedDict, total=False):
 
 
 class UnknownKeyword(InputError, TypeError):
-    """A verb has no such keyword; also the TypeError that Python raises for one."""
+    """Raised for a keyword that a verb does not have; also a TypeError, as Python would raise."""
 
 
 def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
-    """A public verb that rejects a keyword it does not have before it reads or writes anything.
+    """Wrap a public verb so that an unknown keyword is rejected before anything is read or written.
 
-    What a verb passes on as `**keep` would otherwise be examined only when its folder is made, after options
-    that the misspelled one was to replace have been used.
+    Otherwise, keywords passed on as `**keep` would be checked only when the folder is made, after the
+    defaults of misspelled options have been used.
 
     Args:
-        more: names of keywords that it passes on besides those of `Keep`.
-        name: its public name, where that is another than its own.
+        more: names of keywords that the verb passes on in addition to those of `Keep`.
+        name: public name of the verb, if it differs from the function's name.
 
     Raises:
-        UnknownKeyword: with the nearest name that it has, and all of them.
+        UnknownKeyword: with the closest known keyword, and a list of all.
     """
     parameters = inspect.signature(verb).parameters.values()
     known = [one.name for one in parameters if one.kind is not one.VAR_KEYWORD]
@@ -215,13 +217,13 @@ def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
 
 
 def content(verb: str, asked: Mapping[str, Any]) -> str:
-    """Sixteen hexadecimal digits for what a verb is asked: in every process the same for the same question.
+    """Return sixteen hexadecimal digits that identify the arguments of a verb, the same in every process.
 
-    A system counts by its program and structure, whatever its file is called; a file by its bytes; a run
-    folder by its manifest; everything else by its value; and the version of mdnum.
+    A system is identified by its program and structure, independent of its file name; a file by its bytes; a
+    run folder by its manifest; everything else by its value. The version of mdnum is included.
 
     Raises:
-        InputError: something has no value, such as a function.
+        InputError: an argument has no plain value, such as a function.
     """
     from mdnum.provenance import hashes
     from mdnum.systems import opened
@@ -252,7 +254,7 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
 
 @dataclass
 class Answer:
-    """What a question puts into its folder while it is answered."""
+    """Content of a verb's folder while it is being filled."""
 
     folder: RunFolder  # that is filled
     log: Progress  # passes progress on and writes it to log.txt
@@ -274,15 +276,15 @@ def answering(
     progress: Progress | None = None,
     allow_code: bool = False,
 ) -> Iterator[Answer]:
-    """A new folder that is filled, then stored with the seconds that it took, judged and shown.
+    """Context manager of a new folder, which is afterwards stored with its duration, judged and shown.
 
     Args:
         kind, name, system: as for `new_folder`.
-        overrides, allow_code: have had their effect on the system already.
-        out, report, progress: see `Keep`; named one by one, so that what is misspelled is refused.
+        overrides, allow_code: already applied to the system.
+        out, report, progress: see `Keep`; explicit arguments, so that misspelled names raise an error.
 
     Raises:
-        InputError: overrides of no system. FolderError: the folder cannot be used.
+        InputError: overrides without a system. FolderError: the folder cannot be used.
     """
     if overrides and system is None:
         raise InputError("overrides apply to a system file, but none was given", remedy="Omit the overrides")
@@ -295,10 +297,10 @@ def answering(
 
 
 def layout(kind: str) -> Layout:
-    """What the folders of a kind hold, as the verb declares it that makes them.
+    """Return the content of a kind of folder, as declared by the verb that makes it.
 
     Raises:
-        InputError: no verb of this installation does.
+        InputError: no installed verb declares the kind.
     """
     name = home(kind)
     # a column of another package means what that package says, whatever mdnum calls so
@@ -310,12 +312,12 @@ def layout(kind: str) -> Layout:
 def new_folder(
     kind: str, name: str, out: str | Path | None = None, *, system: Any = None
 ) -> Iterator[RunFolder]:
-    """An empty folder to be filled, with the system and its provenance; closed if filling it fails.
+    """Context manager of an empty folder with the system and its provenance; it is closed if filling fails.
 
     Args:
-        kind: of the folder, which a verb declares.
-        name: runs/<name>-<n> is the folder where out is None.
-        system: what is simulated, with `write(path)`; None for a verb without a system.
+        kind: kind of the folder, which a verb declares.
+        name: the folder is runs/<name>-<n> if out is None.
+        system: the simulated system, with `write(path)`; None for a verb without a system.
 
     Raises:
         FolderError: the folder cannot be used.
@@ -343,15 +345,15 @@ def finish(
     view: View | None = None,
     write: bool = True,
 ) -> Outcome:
-    """Judges a folder, writes findings and verdict into its summary.json, and its page if it is wanted.
+    """Judge a folder, write findings and verdict to its summary.json and, on request, its page.
 
     Args:
-        result: what the verb computed, for who called it from Python.
-        view: of the folder, where it has been read already.
-        write: False leaves the folder as it is.
+        result: result of the verb's computation, for a caller in Python.
+        view: view of the folder, if the folder has already been read.
+        write: False leaves the folder unchanged.
 
     Raises:
-        FolderError: it holds no answer, is damaged or cannot be written.
+        FolderError: the folder holds no result, is damaged or cannot be written.
     """
     folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
     folder.read_as(layout(folder.kind))
@@ -386,30 +388,30 @@ def finish(
 
 
 def read(folder: str | Path) -> Outcome:
-    """The outcome of a folder that a verb wrote, whatever its kind; it is judged again, and not changed.
+    """Return the outcome of a folder of any verb; the folder is judged again, and not changed.
 
     Example:
         >>> mdnum.read("runs/argon-crystal-108-1").table("flips")
 
     Raises:
-        FolderError: it holds no answer, or is damaged.
+        FolderError: the folder holds no result, or is damaged.
     """
     return finish(folder, report=False, write=False)
 
 
 def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **counts: Any) -> None:
-    """Reports a phase, if anybody listens."""
+    """Report a phase, if there is a progress function."""
     if progress is not None:
         progress(step, steps, {"phase": phase, **counts})
 
 
 def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, Any]) -> None:
-    """Ends the filling of a folder: its tables, then its summary.
+    """Finish filling a folder: write its tables, then its summary.
 
     Args:
-        summary: anything with plain values, dataclasses and arrays included.
-        tables: by table, equally long arrays by column name, or rows; those of the kind without rows may be
-            left out.
+        summary: a mapping of plain values, dataclasses and arrays included.
+        tables: for each table, arrays of equal length by column name, or rows; tables of the kind without
+            rows may be omitted.
     """
     for name, columns in tables.items():
         if not isinstance(columns, Mapping):
@@ -421,20 +423,20 @@ def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, An
 
 
 def words(texts: Sequence[str] | str) -> tuple[str, ...]:
-    """Words that were given one by one, or with commas between them."""
+    """Split words that were given one by one, or separated by commas."""
     texts = (texts,) if isinstance(texts, str) else texts
     return tuple(dict.fromkeys(word.strip() for text in texts for word in text.split(",") if word.strip()))
 
 
 def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
-    """Refuses options that would change nothing.
+    """Raise an error for options that would have no effect.
 
     Args:
-        given: by option, whether it was given.
-        whose: they are instead: "of one comparison, and all choices were asked for".
+        given: for each option, whether it was given.
+        whose: use of these options: "of one comparison, and all choices were asked for".
 
     Raises:
-        InputError: one was given.
+        InputError: an option was given.
     """
     names = [name for name, present in given.items() if present]
     if names:
@@ -443,10 +445,10 @@ def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
 
 
 def logged(folder: RunFolder, progress: Progress | None, lines: int = 10) -> Progress:
-    """Passes progress on, and writes a line of log.txt at each new phase and now and then.
+    """Wrap a progress function so that log.txt gets a line at each new phase and at intervals.
 
     Args:
-        lines: of a phase that counts its steps, about.
+        lines: approximate number of lines for a phase that counts its steps.
     """
     last = ("", -1)
 

@@ -1,4 +1,4 @@
-"""`mdnum grad`: differentiate a loss through a rollout of either world in several ways."""
+"""`mdnum grad`: derivatives of a loss through a rollout of either world by several methods."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def grad(
     half_step: bool = True,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Differentiate a loss of a rollout by parameters of its system, in several ways, and compare them.
+    """Differentiate a rollout's loss with respect to parameters by several methods, and compare these.
 
     Example:
         >>> mdnum.grad("argon/crystal-108", "mean-potential", ["sigma", "cutoff.radius"], steps=200)
@@ -62,25 +62,26 @@ def grad(
     Args:
         system: a simulation, a system, a shipped name or the path of a system file; of molecular dynamics or
             a ball.
-        of: the loss, a name of `gradients.losses.LOSSES` with options behind a colon
-            ("potential:every=10"); of a ball a kind of its [loss] table, default what its file has.
-        wrt: parameters, full or short names, one by one or with commas; of a ball default what the
-            [gradient] table of its file has.
-        steps: last step; default the system's own, but no more than 500 of molecular dynamics.
-        methods: names of `gradients.METHODS`, of a ball of `gradients.ball.BALL_METHODS`, or "all"; default
-            those that answer within about a minute, of a ball all. What is left out is in the summary.
-        replicas: starts for the standard error of the gradient, at least 2; 0 leaves it out. Each is a run
-            and a pass of tangents.
+        of: the loss, a name of `gradients.losses.LOSSES` with options after a colon ("potential:every=10");
+            for a ball a kind of its [loss] table, by default that of its file.
+        wrt: parameters, full or short names, as a sequence or separated by commas; for a ball the default is
+            the [gradient] table of its file.
+        steps: last step; by default the system's own, but at most 500 for molecular dynamics.
+        methods: names of `gradients.METHODS`, for a ball of `gradients.ball.BALL_METHODS`, or "all"; by
+            default those that finish within about a minute, for a ball all. Omitted methods are listed in the
+            summary.
+        replicas: number of starts for the standard error of the gradient, at least 2; 0 for none. Each
+            requires a run and a tangent pass.
         also: further parts of the diagnosis, of `ALSO`, or "all".
-        half_step: make the run and its gradient at half the time step too, about as much work again as all
-            else; without it nothing is called trusted, and digits are not known. A ball has none of it.
+        half_step: repeat the run and its gradient at half the time step, which about doubles the work;
+            otherwise no gradient is called trusted, and its number of digits is unknown. Not for a ball.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        folder, summary and page; its result is a `GradientDiagnosis`, of a ball `BallGradients`.
+        folder, summary and page; its result is a `GradientDiagnosis`, for a ball `BallGradients`.
 
     Raises:
-        InputError: no such loss, parameter or method, or none of the methods applies.
+        InputError: no such loss, parameter or method, or none of the methods is applicable.
         NumericalError: the run blew up.
         FolderError: the folder cannot be used.
     """
@@ -128,7 +129,7 @@ def grad(
 def _problem(
     simulation: Simulation, of: str | None, names: Sequence[str], steps: int | None
 ) -> tuple[Problem, tuple[str, ...]]:
-    """The problem and full names of the parameters: what is not possible is refused here."""
+    """Return the problem and the full names of the parameters; raise an error if they are not supported."""
     from mdnum.gradients import Problem, parameters
     from mdnum.gradients.losses import LOSSES, NOT_REAL, parse
 
@@ -150,11 +151,12 @@ def _problem(
 def plan(
     problem: Problem, names: Sequence[str], asked: Sequence[str] | None, replicas: int = 0
 ) -> tuple[list[Method], list[dict[str, str]]]:
-    """The methods to run, and what was not asked for and is not run: what, why, and how to ask.
+    """Return the methods to run, and those omitted by default: what, why, and the option that adds them.
 
     Args:
-        asked: names of methods; None for those that answer soon.
-        replicas: starts of averages; 0 for their own number, and for no average where nothing was asked.
+        asked: names of methods; None for the fast ones.
+        replicas: number of starts for averages; 0 for each method's own number, and for no averages if asked
+            is None.
 
     Raises:
         InputError: no such method.
@@ -182,7 +184,7 @@ def plan(
 
 
 def _too_long(method: Method, problem: Problem, names: int) -> str:
-    """Why a quick method is not run where nothing was said about methods; "" where it is."""
+    """Return why a fast method is not run by default; "" if it is run."""
     runs = getattr(method, "runs", 0) * names + 1
     if runs * problem.simulation.atoms * problem.steps <= AFFORDABLE or runs == 1:
         return ""
@@ -190,7 +192,7 @@ def _too_long(method: Method, problem: Problem, names: int) -> str:
 
 
 def _over(method: Any, replicas: int, horizons: bool = True) -> Method:
-    """A method that averages over starts, over this many of them; other methods as they are."""
+    """Set the number of starts of a method that averages over starts; return other methods unchanged."""
     if not replicas or not hasattr(method, "replicas"):
         return method
     changed = replace(method, replicas=replace(method.replicas, count=replicas))
@@ -236,7 +238,7 @@ def _diagnosed(
 
 
 def _brief(part: Any) -> Any:
-    """A part of a diagnosis without its rows, and without pairs that did not nearly flip."""
+    """Return a part of a diagnosis without its rows, and without pairs that did not nearly flip."""
     return part and plain({name: value for name, value in vars(part).items() if name not in _ROWS})
 
 
@@ -289,7 +291,7 @@ def _not_run(
     asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
     further: Sequence[str], half_step: bool,
 ) -> list[dict[str, str]]:  # fmt: skip
-    """What was left out: what, why, and how to have it."""
+    """Return what was omitted, why, and the option that adds it."""
     from mdnum.gradients.diagnose.trust import no_half_step
 
     own, rows = problem.simulation.steps, []
@@ -305,7 +307,7 @@ def _not_run(
 
 
 def _entries(simulation: Simulation, name: str) -> list[str] | None:
-    """Which pair each entry of a parameter belongs to; None where it has one entry, or one for each atom."""
+    """Return the pair type of each entry of a parameter; None unless it has one entry per pair type."""
     from mdnum.gradients import parameters
     from mdnum.systems.schema import pair_names
 
@@ -314,7 +316,7 @@ def _entries(simulation: Simulation, name: str) -> list[str] | None:
 
 
 def _keep_arrays(answer: Answer) -> None:
-    """Puts large derivatives into a folder."""
+    """Write large derivatives to the folder."""
     agreement = answer.result.agreement
     large: dict[str, Any] = {
         f"{one.method}/{name}": np.asarray(value)
@@ -331,7 +333,7 @@ def _keep_arrays(answer: Answer) -> None:
 
 
 def _method(found: Gradient) -> dict[str, Any]:
-    """What one method found, in plain values."""
+    """Return the result of one method as plain values."""
     details = plain(found.details)
     error = details.pop("error", details.get("standard_error", {}))
     # by what is used, zero is a number like any other
@@ -348,7 +350,7 @@ def _method(found: Gradient) -> dict[str, Any]:
 
 
 def brief(value: Any) -> Any:
-    """A number, a few, or the size of many."""
+    """Return a number, a short list of numbers, or the norm and largest entry of a large array."""
     array = np.asarray(value, np.float64)
     if array.ndim == 0:
         return float(array)
@@ -376,7 +378,7 @@ def _ball_methods(asked: Sequence[str] | None) -> list[str]:
 def _ball_system(
     system: Any, of: str | None, names: Sequence[str], steps: int | None, overrides: Mapping[str, Any] | None
 ) -> BallSystem:
-    """The ball with the loss and the parameters that were requested in its own tables."""
+    """Return the ball system with the requested loss and parameters in its tables."""
     from mdnum.systems import BallSystem, ball, load
 
     kinds = get_args(ball.LossTable.model_fields["kind"].annotation)
@@ -440,7 +442,7 @@ def _differentiated(system: BallSystem, methods: list[str], answer: Answer) -> N
 
 
 def relative(value: float, right: float) -> float:
-    """The difference over what is right; infinite where only that is 0."""
+    """Difference relative to the correct value; infinite if only the correct value is 0."""
     if value == right:
         return 0.0
     return abs(value - right) / abs(right) if right else float("inf")

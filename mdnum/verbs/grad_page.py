@@ -1,4 +1,4 @@
-"""What `mdnum grad` shows: derivatives by method with the digits that hold, sections and figures."""
+"""Report page of `mdnum grad`: derivatives by method with their valid digits, sections and figures."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _GROWN = {"forward bounded, gradient not": "growing", "forward not bounded": "un
 
 
 def by(summary: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
-    """What a method found; the closed form counts as one."""
+    """Return the result of a method; the closed form counts as a method."""
     if summary.get("exact") and method == summary["reference"]:
         exact = {"gradient": summary["exact"], "details": {}, "error": {}}
         return {"method": method, "description": TEXTS("exact"), **exact}
@@ -39,7 +39,7 @@ def by(summary: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
 
 
 def magnitude(value: Any, missing: float | None = None) -> float:
-    """A derivative as one number: itself, or the norm of several."""
+    """Return a derivative as one number: its value, or the norm of several values."""
     if isinstance(value, Mapping):
         value = value["norm"]
     if isinstance(value, list):
@@ -48,12 +48,12 @@ def magnitude(value: Any, missing: float | None = None) -> float:
 
 
 def digits_of(summary: Mapping[str, Any], name: str) -> int | None:
-    """Digits of a derivative that half the time step leaves; None where that was not examined."""
+    """Number of digits of a derivative that are unchanged at half the time step; None if not examined."""
     return ((summary.get("trust") or {}).get("digits") or {}).get(name)
 
 
 def digits_note(summary: Mapping[str, Any], name: str) -> str:
-    """What must be known beside the digits of a derivative; "" where they hold, or nobody asked."""
+    """Return a note on a derivative's digits; "" if the digits are valid or trust was not examined."""
     known = digits_of(summary, name)
     if summary.get("trust") and known is None:
         return TEXTS("digits_unknown")
@@ -61,9 +61,9 @@ def digits_note(summary: Mapping[str, Any], name: str) -> str:
 
 
 def resolved(summary: Mapping[str, Any], name: str, value: float | None, most: int) -> str:
-    """One number of a derivative by a parameter, with the digits that hold and no more than `most`.
+    """Format one entry of a derivative with its valid digits, but at most `most`.
 
-    In powers of ten where zeros would look like more digits.
+    The number is written as a power of ten if zeros could be mistaken for digits.
     """
     known = digits_of(summary, name)
     if known is None:
@@ -72,7 +72,7 @@ def resolved(summary: Mapping[str, Any], name: str, value: float | None, most: i
 
 
 def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str, most: int = 6) -> str:
-    """A derivative as text, with the digits that hold."""
+    """Format a derivative with its valid digits."""
     if found is None or name not in found["gradient"]:
         return "–"
     value = found["gradient"][name]
@@ -86,7 +86,7 @@ def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str
 
 
 def slope_unit(summary: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
-    """The unit of a derivative."""
+    """Return the unit of a derivative."""
     above, below = summary["loss"]["unit"], parameter["unit"]
     if above == below:
         return ""
@@ -98,7 +98,7 @@ def slope_unit(summary: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
 
 
 def closeness(row: Mapping[str, Any]) -> str:
-    """A relative difference as people put it."""
+    """Format a relative difference as a phrase."""
     relative = row["relative"]
     if relative is None:
         return "not finite" if row["size"] else "where the other is 0"
@@ -111,7 +111,7 @@ def closeness(row: Mapping[str, Any]) -> str:
 
 
 def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
-    """What was seen of one limit of trust."""
+    """Return the sentence on one limit of trust."""
     code = f"{limit['what']}_{limit['code']}".replace(" ", "_")
     values = {"horizon": limit["horizon"], **limit["values"]}
     first = values.get("first")
@@ -120,7 +120,7 @@ def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
 
 
 def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, Any]]:
-    """Judgments on trust by the parameters that share them; by no name where all share one."""
+    """Group the judgments on trust by the parameters that share them; the key is empty if all share one."""
     trust = summary.get("trust")
     if not trust:
         return {}
@@ -135,7 +135,7 @@ def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, 
 
 
 def trust_sentence(summary: Mapping[str, Any], names: tuple[str, ...], one: Mapping[str, Any]) -> str:
-    """A verdict on trust."""
+    """Return the sentence on a verdict on trust."""
     free = [limit["what"] for limit in one["limits"] if limit["horizon"] is not None and not limit["reached"]]
     values = {"steps": summary["steps"], "horizon": one["horizon"], "limit": one["limited_by"]}
     text = TEXTS(f"trust_{one['verdict']}", free=", ".join(free) or "nothing", **values)
@@ -143,7 +143,7 @@ def trust_sentence(summary: Mapping[str, Any], names: tuple[str, ...], one: Mapp
 
 
 def trust_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
-    """The verdicts on trust, and what they are limited by."""
+    """Yield the verdicts on trust, and their limits."""
     for names, one in judgments(summary).items():
         yield trust_sentence(summary, names, one)
         yield from (limit_sentence(summary, limit) for limit in one["limits"] if limit["reached"])
@@ -152,7 +152,7 @@ def trust_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def growth_sentences(view: View) -> list[str]:
-    """How the gradient by the state grew."""
+    """Return sentences on the growth of the gradient with respect to the state."""
     growth = view.summary.get("growth")
     if not growth:
         return []
@@ -166,7 +166,7 @@ def growth_sentences(view: View) -> list[str]:
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Everything that is known about a gradient."""
+    """Return the page of a gradient."""
     summary, loss = view.summary, view.summary["loss"]
     size = many(summary["atoms"], "atom") if "atoms" in summary else many(summary["balls"], "ball")
     about = TEXTS(
@@ -200,7 +200,7 @@ def _keys(view: View) -> Iterator[Key]:
 
 
 def _methods(view: View) -> Iterator[Any]:
-    """Derivatives by method, the reference first, each with how far it is from the reference."""
+    """Yield derivatives by method, the reference first, with their differences from the reference."""
     summary, reference = view.summary, view.summary["reference"]
     rows = sorted(summary["methods"], key=lambda one: one["method"] != reference)
     exact = by(summary, reference)
@@ -269,7 +269,7 @@ def _horizons(view: View) -> Iterator[Any]:
 
 
 def _limits(view: View) -> Iterator[tuple[float, str]]:
-    """Where trust in the gradient ends."""
+    """Yield the horizons at which trust in the gradient ends."""
     for names, one in judgments(view.summary).items():
         if one["limited_by"]:
             yield one["horizon"], ", ".join([f"limit: {one['limited_by']}", *names])
@@ -346,7 +346,7 @@ def _flips(view: View) -> Iterator[Any]:
 
 
 def _browse(table: Mapping[str, np.ndarray]) -> Browse:
-    """The heaviest flips."""
+    """Return a table of the flips with the largest contributions."""
     with np.errstate(divide="ignore", invalid="ignore"):
         rows = {**table, "ratio": np.abs(table["margin"]) / table["bound"]}
     rows["rank"] = np.arange(1, len(rows["ratio"]) + 1)

@@ -1,4 +1,4 @@
-"""What is wrong with a gradient, or should be known about it: the judge of `mdnum grad`."""
+"""Verdict of `mdnum grad`: errors, warnings and notes on a gradient."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CLOSE = 0.01
 
 
 def judge(view: View) -> Verdict:
-    """Findings, evidence and headline of a gradient."""
+    """Return findings, evidence and headline of a gradient."""
     trust = view.summary.get("trust") or {}
     found = [*_of_methods(view), *_of_trust(view), *_of_flips(view), *_of_the_motion(view)]
     found += function_findings(view.summary.get("function"), view.units)
@@ -72,7 +72,7 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def _of_methods(view: View) -> Iterator[Finding]:
-    """What the methods gave, did not give, or should not be taken for."""
+    """Yield findings on the results of methods, missing results, and their possible misinterpretation."""
     summary, methods, section = view.summary, view.summary["methods"], "By method"
     where = summary.get("detective") or {}
     variants = []
@@ -126,7 +126,7 @@ def _of_methods(view: View) -> Iterator[Finding]:
 
 
 def _of_trust(view: View) -> Iterator[Finding]:
-    """Derivatives that are not trusted as far as they were requested."""
+    """Yield findings on derivatives that cannot be trusted for all requested steps."""
     for names, one in grad_page.judgments(view.summary).items():
         whose = TEXTS("whose", names=listed(names)) if names else ""
         values: dict[str, Any] = {"names": list(names), "whose": whose, "section": "How far it is trusted"}
@@ -144,7 +144,7 @@ def _of_trust(view: View) -> Iterator[Finding]:
 
 
 def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
-    """What to do about each thing that was not examined, as variants of the finding."""
+    """Yield a remedy for each limit that was not examined, as variants of the finding."""
     unseen = {one["what"] for one in trust["limits"] if one["horizon"] is None}
     aware = by(view.summary, "event-aware") is not None
     if any(one["what"] == "half the time step" for one in view.summary["left_out"]):
@@ -162,12 +162,12 @@ def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _averaged(view: View) -> bool:
-    """Whether the gradient was averaged over starts."""
+    """True if the gradient was averaged over starts."""
     return any(name.startswith("error.") for name in view.table("trust"))
 
 
 def _of_flips(view: View) -> Iterator[Finding]:
-    """Derivatives that hang on a flip or two, and flips that the guard left out."""
+    """Yield findings on derivatives dominated by one or two flips, and on flips that the guard excluded."""
     section, totals = "Flips on the way", (view.summary.get("flips") or {}).get("total") or {}
     table = view.table("flip_contributions") if totals else {}
     for name, total in totals.items():
@@ -198,7 +198,7 @@ def _of_flips(view: View) -> Iterator[Finding]:
 
 
 def _of_the_motion(view: View) -> Iterator[Finding]:
-    """Methods that do not give the derivative of the exact motion, where that is known."""
+    """Yield findings on methods whose result differs from the derivative of the exact motion, if known."""
     rows = view.summary["comparisons"] if view.summary.get("exact") else ()
     off = [row for row in rows if row["relative"] is None or row["relative"] > _CLOSE]
     methods: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""What every verb returns: plain data, and tables, figures and a page read from its folder on demand."""
+"""Return value of every verb: plain data, and tables, figures and a page read from its folder on demand."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Outcome:
-    """What every verb returns: plain data, and ways to read the rest from its folder.
+    """Return value of every verb: plain data, and methods that read the rest from its folder.
 
-    It can be pickled, and returned by the workers of a pool. Tables, figures and the page are read from the
-    folder when they are used, so the folder must still be where it was written.
+    An outcome can be pickled, and returned by the workers of a pool. Tables, figures and the page are read
+    from the folder when they are used, so the folder must still be where it was written.
 
     Example:
         >>> outcome = mdnum.run("argon/crystal-108", steps=200)
@@ -52,26 +52,26 @@ class Outcome:
 
     @property
     def folder(self) -> Path:
-        """The same as `path`."""
+        """Path of the folder, the same as `path`."""
         return self.path
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What a person should know about the result, errors first."""
+        """Findings on the result that a person should know, errors first."""
         return self.verdict.findings
 
     @property
     def page(self) -> Page:
-        """What report.html and the terminal show; a FolderError where the folder is gone, or damaged."""
+        """Content of report.html and of the terminal output; FolderError if the folder is gone or damaged."""
         if self._page is None:
             object.__setattr__(self, "_page", self._read(self._place).page)
         return cast(Page, self._page)
 
     def table(self, name: str) -> pa.Table:
-        """A table of the folder; `.to_pandas()` makes a data frame of it (docs/folders.md: nulls).
+        """Return a table of the folder; `.to_pandas()` converts it to a data frame (docs/folders.md: nulls).
 
         Raises:
-            FolderError: there is no such table (the message lists those that there are), or it is damaged.
+            FolderError: there is no such table (the message lists the existing ones), or it is damaged.
         """
         from mdnum.store import RunFolder
 
@@ -86,13 +86,13 @@ class Outcome:
             return folder.table(name)
 
     def plot(self, name: str) -> Axes:
-        """A figure of the page, by the name of its file in figures/, as a new figure of pyplot.
+        """Draw a figure of the page, named as its file in figures/, as a new figure of pyplot.
 
         Returns:
-            its axes, of several the first: `.figure.axes` are all.
+            the axes, or the first of several; `.figure.axes` are all of them.
 
         Raises:
-            InputError: there is no such figure; the message lists those that there are.
+            InputError: there is no such figure; the message lists the existing ones.
         """
         from matplotlib import pyplot
 

@@ -1,4 +1,4 @@
-"""Progress of a verb: a bar in a terminal and in a notebook, a line now and then elsewhere."""
+"""Progress of a verb: a bar in a terminal and in a notebook, occasional lines elsewhere."""
 
 from __future__ import annotations
 
@@ -26,8 +26,10 @@ _OUTERMOST = threading.Lock()
 
 @contextmanager
 def reported(progress: Wanted) -> Iterator[Progress | None]:
-    """What a verb reports to: the function that it is given; None gives a bar, except in a verb that another
-    one calls and in the workers of a pool; True gives a bar in any case, False nothing.
+    """Yield the function to which a verb reports its progress, or None.
+
+    A function is used as given. None gives a bar, except in a verb called by another verb and in the workers
+    of a pool; True gives a bar in any case, False none.
     """
     from multiprocessing import parent_process
 
@@ -43,17 +45,17 @@ def reported(progress: Wanted) -> Iterator[Progress | None]:
 
 
 class ProgressBar:
-    """Called by a rollout as progress(step, steps, info); shows steps/s, flips, rebuilds and ETA.
+    """Progress bar of a rollout, called as progress(step, steps, info); shows steps/s, flips, rebuilds, ETA.
 
-    What counts something else than steps says so: info["unit"] names it.
-
-    A thread draws it: the first thing a run does is compile, for seconds, without calling.
+    If something other than steps is counted, info["unit"] names it. The bar is drawn by a thread, because a
+    run begins with seconds of compilation without calls.
 
     Args:
-        stream: where to draw a bar, or to print lines where it is no terminal; default stderr, or the output
-            of a notebook's cell.
+        stream: where to draw a bar, or to print lines if the stream is no terminal; default stderr, or the
+            output of a notebook's cell.
         delay: seconds of run before the bar appears.
-        pause: seconds to the first line where it is no terminal, doubled after each up to a minute.
+        pause: seconds until the first line if the stream is no terminal, doubled after each line up to a
+            minute.
     """
 
     def __init__(self, stream: TextIO | None = None, delay: float = 2.0, pause: float = 10.0):
@@ -80,12 +82,12 @@ class ProgressBar:
             self._bar.stop()
 
     def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
-        """What a rollout reports: the step reached, of how many, and counts so far."""
+        """Receive a rollout's report: the current step, the number of steps, and counts so far."""
         self._last = (step, steps, dict(info))
         self.folder = info.get("folder", self.folder)
 
     def _watch(self) -> None:
-        """Draws the bar, or prints a line, whenever it is time to."""
+        """Draw the bar, or print a line, at intervals."""
         while not self._over.wait(self._pause):
             step, steps, info = self._last
             phase = str(info.get("phase", "run"))
@@ -105,7 +107,7 @@ class ProgressBar:
 
 
 def _drawn(stream: TextIO) -> Any:
-    """A bar that is there until it is stopped."""
+    """Return a bar that is shown until it is stopped."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
@@ -120,7 +122,7 @@ def _drawn(stream: TextIO) -> Any:
 
 
 class _Cell:
-    """A bar below a notebook's cell, until it is stopped."""
+    """A progress bar below a notebook's cell, shown until it is stopped."""
 
     def __init__(self, stream: TextIO):
         from IPython.display import display  # pyright: ignore[reportMissingImports]
@@ -138,7 +140,7 @@ class _Cell:
 
 
 def describe(step: int, steps: int, info: dict[str, Any]) -> str:
-    """The numbers beside the bar, in one line."""
+    """Return the numbers next to the bar, in one line."""
     unit = info.get("unit", "steps")
     parts = [f"{step:,} of {steps:,} {unit}"]
     parts += [f"{info[name]:,} {name}" for name in ("flips", "rebuilds") if name in info]

@@ -1,4 +1,4 @@
-"""`mdnum.Recorder`: frames of anybody's loop into the folder that `mdnum flips` makes of a file."""
+"""`mdnum.Recorder`: frames of any simulation loop, recorded in a folder like that of `mdnum flips`."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ _NONE = {name: np.zeros(0, np.int64) for name in ("rule", "i", "j", "rank", "ent
 
 
 class Recorder:
-    """Flips, and pairs that the neighbor list in use lacks, of a loop that somebody else runs.
+    """Recorder of flips, and of pairs that the neighbor list in use lacks, for any simulation loop.
 
-    The loop stays as it is; what `see` is given ends up in the folder, findings and page that `mdnum.flips`
-    makes of a file with the same frames. Decisions are those that follow from the positions in float64, with
-    a bound for what positions in float32 leave undecided.
+    The loop need not be changed; the data given to `see` lead to the same folder, findings and page as
+    `mdnum.flips` for a file with the same frames. Decisions are derived from the positions in float64, with a
+    bound on what positions in float32 leave undecided.
 
     Example:
         >>> with mdnum.Recorder(8.5, box=box, fractional=True, out="runs/mine") as rec:
@@ -47,24 +47,24 @@ class Recorder:
         >>> dyn.attach(mdnum.Recorder(5.0, atoms=atoms), interval=1)
 
     Args:
-        r_cut: the cutoff or several, length; pairs by species, nearest neighbors and `most` as of `flips`.
-        compare: "r2 <", "r2 <=", "r <" or "r <=", by which a pair exactly at the cutoff is outside or inside.
-            How r is rounded is within the bound of a margin, and decides nothing here.
-        atoms: ASE's, for calls without arguments (`dyn.attach`); positions, box, species and, where the
-            calculator has it, the total energy are read from them.
-        pair_energy: u(r), the energy of a pair at a distance up to the cutoff, as it is truncated there
-            (shifts included): each flip then says what it adds to the energy.
-        between, window, out, report: as of `flips`.
-        name: what the loop is called on the page.
-        arrays: `species`, a word or number for each atom; `cell` or `box` where frames are given without: one
+        r_cut: one or more cutoffs, length; pairs by species, nearest neighbors and `most` as for `flips`.
+        compare: "r2 <", "r2 <=", "r <" or "r <=", which decides whether a pair exactly at the cutoff is
+            inside. The rounding of r is within the bound of a margin, and does not affect decisions here.
+        atoms: ASE `Atoms`, for calls without arguments (`dyn.attach`); positions, box, species and, if the
+            calculator provides it, the total energy are read from them.
+        pair_energy: u(r), the energy of a pair at a distance up to the cutoff, as truncated there (with
+            shifts): each flip is then recorded with its energy jump.
+        between, window, out, report: as for `flips`.
+        name: name of the loop on the page.
+        arrays: `species`, a word or number for each atom; `cell` or `box` if frames are given without: one
             length, three, or a matrix with lattice vectors as rows (`cell`: ASE, torch, OpenMM) or as columns
-            (`box`: jax-md); `pbc`, the directions that repeat, default all that have a vector; `fractional`,
-            whether positions are fractions of the box, default lengths, which is checked; `timestep`, which
-            makes times of steps and is needed for velocities; `length` and `time`, units in words.
+            (`box`: jax-md); `pbc`, the periodic directions, by default all that have a vector; `fractional`,
+            whether positions are fractions of the box (by default lengths), which is checked; `timestep`,
+            which converts steps to times and is needed for velocities; `length` and `time`, names of units.
 
     Raises:
-        InputError: an option cannot be used; by `see`, arrays or a frame cannot be, such as one that holds
-            no finite positions: what came before is kept.
+        InputError: an option cannot be used; in `see`, an array or a frame cannot be used, such as a frame
+            without finite positions: earlier frames are kept.
         FolderError: the folder cannot be used.
     """
 
@@ -112,15 +112,15 @@ class Recorder:
         self, step: int, positions: Any, cell: Any = None, *, box: Any = None, pbc: Any = None,
         neighbors: Any = None, velocities: Any = None, energy: Any = None,
     ) -> None:  # fmt: skip
-        """Records a frame; arrays may be of numpy, jax or torch, and are copied.
+        """Record a frame; arrays may be from numpy, jax or torch, and are copied.
 
         Args:
-            step: of the loop.
+            step: step of the loop.
             positions: (atoms, 3), length; or fractions of the box.
-            cell, box, pbc: of this frame, where they are not those of all.
-            neighbors: the list in use: jax-md's `NeighborList`, (i, j) or (i, j, S) as ASE, matscipy and
-                vesin have them, or indices (2, pairs) or (atoms, neighbors); left out, the one before.
-            velocities: (atoms, 3), length per time, of lengths also where positions are fractions.
+            cell, box, pbc: of this frame, if they differ from those of all frames.
+            neighbors: the list in use: jax-md's `NeighborList`, (i, j) or (i, j, S) as in ASE, matscipy and
+                vesin, or indices (2, pairs) or (atoms, neighbors); if omitted, the previous list.
+            velocities: (atoms, 3), length per time, also if positions are fractions.
             energy: the energy that the integrator conserves.
         """
         began = perf_counter()
@@ -145,12 +145,12 @@ class Recorder:
     def see_many(
         self, positions: Any, cell: Any = None, *, first: int = 0, every: int = 1, **given: Any
     ) -> None:
-        """Records frames that a scan returned, (frames, atoms, 3), or a list of frames or of ASE's Atoms.
+        """Record frames that a scan returned, (frames, atoms, 3), or a list of frames or of ASE `Atoms`.
 
         Args:
-            first, every: the step of the first, and steps from one to the next.
-            cell, given: as of `see`, for all frames; energies and velocities in rows, boxes that do not have
-                the shape of a single one, and lists have an entry for each.
+            first, every: step of the first frame, and number of steps between frames.
+            cell, given: as for `see`, for all frames; energies and velocities as rows; boxes (unless a single
+                one is given) and neighbor lists with one entry per frame.
         """
         for k, (frame, here) in enumerate(one_by_one(positions, {"cell": cell, **given})):
             if hasattr(frame, "get_positions"):
@@ -159,7 +159,7 @@ class Recorder:
                 self.see(first + every * k, frame, **here)
 
     def see_atoms(self, atoms: Any, step: int | None = None) -> None:
-        """Records ASE's Atoms, or those of a dynamics of ASE's, whose steps are then counted."""
+        """Record ASE `Atoms`, or those of an ASE dynamics object, whose step number is then used."""
         step = int(getattr(atoms, "nsteps", self._given if step is None else step))
         atoms = getattr(atoms, "atoms", atoms)
         if self._source.named is None:
@@ -169,7 +169,7 @@ class Recorder:
         self.see(step, atoms.positions, atoms.cell.array, pbc=atoms.pbc, velocities=speeds, energy=energy)
 
     def __call__(self, *args: Any, **given: Any) -> None:
-        """`see`, or `see_atoms`: ASE's dynamics call what is attached without arguments."""
+        """Call `see` or `see_atoms`: ASE dynamics call attached functions without arguments."""
         if len(args) > 1 or given:
             self.see(*args, **given)
         elif args or self._atoms is not None:
@@ -180,7 +180,7 @@ class Recorder:
             )
 
     def hook(self, step: Any, positions: Any, **given: Any) -> None:
-        """`see` inside of jax.jit, fori_loop and scan: the host is called at every step, in order."""
+        """Call `see` inside jax.jit, fori_loop and scan: the host is called at every step, in order."""
         from jax.experimental import io_callback
 
         def seen(step: Any, positions: Any, given: Mapping[str, Any]) -> None:
@@ -191,7 +191,7 @@ class Recorder:
 
     @property
     def outcome(self) -> Outcome:
-        """What `mdnum.flips` returns; closes the recorder."""
+        """Close the recorder and return the outcome, as `mdnum.flips` does."""
         return self.close()
 
     def __enter__(self) -> Recorder:
@@ -203,10 +203,10 @@ class Recorder:
             self.close(error)
 
     def close(self, error: BaseException | None = None) -> Outcome:
-        """Ends the recording, and judges what was seen.
+        """End the recording, and judge the recorded frames.
 
         Args:
-            error: what ended the loop before its end.
+            error: the exception that ended the loop early.
 
         Raises:
             InputError: no frame was given, or the first cannot be used.
@@ -235,13 +235,13 @@ class Recorder:
         return self._outcome
 
     def compare(self, other: Recorder) -> FolderFork:
-        """Where the decisions of two loops of one rule diverge; closes both."""
+        """Find where the decisions of two loops with the same rule diverge; close both recorders."""
         from mdnum.forks.folders import compare_folders
 
         return compare_folders(self.outcome.path, other.outcome.path)
 
     def _advance(self) -> None:
-        """Examines the frames that wait."""
+        """Examine the frames that are waiting."""
         try:
             if self._one is None:
                 self._one = self._stack.enter_context(examining(self._source, self._rules, **self._how))
@@ -275,7 +275,7 @@ class Recorder:
             self._cost = self._written - now
 
     def _after(self, one: FrameExamination, new: Sequence[dict[str, Any]]) -> None:
-        """What the program itself said of a frame that was examined, beside its flips."""
+        """Record the program's own data on an examined frame, in addition to its flips."""
         energy, listed, overflow = self._told.popleft()
         flips, frame = next((rows for rows in new if rows["rule"][0] == 0), _NONE), self._source.now
         if new and not np.isnan(self._jump):

@@ -1,4 +1,4 @@
-"""`mdnum report`: the page of a folder once more."""
+"""`mdnum report`: rewriting of a folder's page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mdnum.verbs.frame import finish
 
 
 def report(folder: Path) -> Reply:
-    """Judges a folder and writes its page, as the verb that made it does."""
+    """Judge a folder and write its page, as the verb that made the folder does."""
     outcome = finish(folder)
     written = outcome.folder / "report.html"
     kept = {name: outcome.summary[name] for name in HEAD} | {"of": outcome.kind}

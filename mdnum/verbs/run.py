@@ -1,4 +1,4 @@
-"""`mdnum run`: roll a system out into a folder, compare it with the reference, judge it."""
+"""`mdnum run`: a rollout of a system into a folder, with comparison to the reference and a verdict."""
 
 from __future__ import annotations
 
@@ -74,23 +74,23 @@ def run(
         >>> mdnum.run("argon/liquid-864", steps=500).folder
 
     Args:
-        system: a loaded system, a shipped name or the path of a system file; None when resuming.
+        system: a simulation, a system, a shipped name or the path of a system file; None when resuming.
         out: the new run folder; default runs/<name>-<n>.
-        steps: last step; default the system's.
-        save_every: a trajectory frame every so many steps; default the system's.
+        steps: last step; by default the system's.
+        save_every: number of steps between trajectory frames; by default the system's.
         overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
         resume: continue the run in this folder, bit for bit.
-        check: compare with ASE (or with plain numpy where ASE has no such potential).
+        check: compare with ASE (or with plain numpy if ASE has no such potential).
         report: write report.html.
         progress: see `mdnum.verbs.frame.Keep`.
-        allow_code: execute the Python that a system file names.
+        allow_code: execute the Python code that a system file names.
 
     Returns:
         folder, summary and page; its result is a `mdnum.rollout.run.RunResult`.
 
     Raises:
         InputError: the system cannot be run. FolderError: the folder cannot be used.
-        NumericalError: the run blew up; what came before is in the folder, with its report.
+        NumericalError: the run blew up; the results before this step are in the folder, with a report.
     """
     _compile_beside()
     from mdnum.md.kernel import left_out
@@ -148,10 +148,10 @@ def run(
 
 
 def _compile_beside() -> None:
-    """Starts another process that compiles what the loop calls, where nothing is kept of earlier commands.
+    """Start another process that compiles the loop's functions, if the compilation cache is empty.
 
-    That is the first one after an installation, which compiles for most of its time; one process at a time
-    compiles for one processor.
+    This is the case for the first command after an installation, most of whose time is compilation; a single
+    process compiles on only one processor.
     """
     kept = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     with contextlib.suppress(OSError):
@@ -162,7 +162,7 @@ def _compile_beside() -> None:
 
 
 class _Beside(NamedTuple):
-    """What is worked out beside the loop."""
+    """Results that are computed in parallel with the loop."""
 
     compared: EnergyReport | None = None  # the first and the last frame with ASE
     period: float | None = None  # the fastest in them
@@ -175,7 +175,7 @@ def _beside_the_loop(
     check: bool,
     report: bool,
 ) -> _Beside:
-    """The comparison with ASE and what else takes Python's time, which the loop does not."""
+    """Compute, in parallel with the loop, the comparison with ASE and other work outside the loop."""
     if report:
         import mdnum.report.drawing  # noqa: F401 it takes as long
     if not check:
@@ -211,7 +211,7 @@ def _beside_the_loop(
 
 
 def _keep(run: RunView, compared: EnergyReport | None, period: float | None, function: Any) -> None:
-    """Puts what was worked out beside the loop into the summary."""
+    """Add the results computed in parallel with the loop to the summary."""
     from mdnum.verbs.check import energy_findings
 
     assert compared is not None
@@ -224,7 +224,7 @@ def _keep(run: RunView, compared: EnergyReport | None, period: float | None, fun
 
 
 def _beside_float64(run: RunView, result: RunResult) -> None:
-    """Puts how well a run in fixed-point numbers keeps its energy into the summary, and float64's."""
+    """Add to the summary the energy conservation of a run in fixed-point numbers, and that of float64."""
     from mdnum.rollout.engine import FAILURES, Engine
 
     simulation, summary = result.simulation, run.summary
@@ -247,7 +247,7 @@ def _beside_float64(run: RunView, result: RunResult) -> None:
 
 
 def judge(run: RunView) -> Verdict:
-    """Findings in the order in which they are read: the worst causes first."""
+    """Return the findings in reading order: the most serious causes first."""
     found = [
         *_status(run), *_time_step(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
         *_decisions(run), *_drift(run), *_cutoff(run),
@@ -439,7 +439,7 @@ def _loop(run: RunView) -> Iterator[Finding]:
 
 
 def function_findings(function: Mapping[str, Any] | None, units: Units) -> Iterator[Finding]:
-    """Where a person's pair function is no number, and where it breaks, by the derivative that jumps."""
+    """Yield findings on a user's pair function that is not finite, or has jumps in any derivative."""
     function = function or {}
     if function.get("single"):
         yield TEXTS.finding("SINGLE_INSIDE", "pair")
@@ -460,7 +460,7 @@ def function_findings(function: Mapping[str, Any] | None, units: Units) -> Itera
 
 
 def _potential(run: RunView) -> Iterator[Finding]:
-    """What the trial calls of an energy function found."""
+    """Yield the findings from trial calls of an energy function."""
     units: dict[str, Any] = {"energy_unit": run.units.energy, "length_unit": run.units.length}
     for code, values in ((run.system.get("potential") or {}).get("notes") or {}).items():
         # of a range that has an end

@@ -1,4 +1,4 @@
-"""What a run folder is read into, and the sections and figures that show it."""
+"""View of a run folder, and the sections and figures of its page."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _COLUMNS = ("step", "i", "j", "entered", "distance", "margin", "radial_speed", "
 
 
 class RunView(View):
-    """The folder of a run, finished or not."""
+    """View of the folder of a run, finished or not."""
 
     @cached_property
     def series(self) -> Mapping[str, np.ndarray]:
-        """A row for each step.
+        """Table with one row for each step.
 
         Raises:
-            FolderError: there is none.
+            FolderError: the folder has no steps.
         """
         series = self.table("series")
         if not len(series["step"]):
@@ -51,12 +51,12 @@ class RunView(View):
 
     @property
     def epochs(self) -> Mapping[str, np.ndarray]:
-        """A row for each neighbor list."""
+        """Table with one row for each neighbor list."""
         return self.table("epochs")
 
     @cached_property
     def flips(self) -> analysis.Scan:
-        """What the table of flips says, which may be larger than memory."""
+        """Statistics of the table of flips, which may be larger than memory."""
         flips = analysis.Scan(len(self.series["step"]), TABLE_ROWS)
         known = self.folder.table("flips", rows=1).column_names
         columns = [*_COLUMNS, *(name for name in ("terms",) if name in known)]
@@ -68,64 +68,65 @@ class RunView(View):
 
     @property
     def steps(self) -> int:
-        """Steps made."""
+        """Number of steps of the run."""
         return max(0, len(self.series["step"]) - 1)
 
     @property
     def cutoff(self) -> Mapping[str, Any]:
-        """Kind, radius, comparison, jumps; empty where there is none."""
+        """Kind, radius, comparison and jumps of the cutoff; empty if there is none."""
         return self.summary.get("cutoff") or {}
 
     @property
     def cutoff_key(self) -> str:
-        """The key of the system file that says where pairs end; empty where the potential does."""
+        """Key of the system file that sets the cutoff; empty if the potential sets it."""
         given = self.system.get("cutoff") or {}
         return next((f"cutoff.{key}" for key in ("radius", "in_sigma", "pairs") if key in given), "")
 
     @property
     def own_end(self) -> list[str]:
-        """The variant of a finding's remedy where no key of the system file moves the cutoff."""
+        """Variant of a finding's remedy for a cutoff that no key of the system file can change."""
         return [] if self.cutoff_key else ["own"]
 
     @cached_property
     def thermal(self) -> float:
-        """k_B T of the run's mean temperature, energy."""
+        """k_B T at the run's mean temperature, energy."""
         return self.units.k_B * float(np.mean(self.series["temperature"]))
 
     @property
     def jump(self) -> float:
-        """Energy of a pair at the cutoff, 0 where it ends at zero."""
+        """Energy of a pair at the cutoff, 0 if the potential ends at zero."""
         return float(self.cutoff.get("energy_jump") or 0.0)
 
     @property
     def ase(self) -> Mapping[str, Any]:
-        """The comparison with ASE; empty without one."""
+        """Comparison with ASE; empty if there is none."""
         return self.summary.get("ase") or {}
 
     @property
     def conservative(self) -> bool:
-        """Whether the total energy should stay what it was."""
+        """True if the total energy should be conserved."""
         return (self.system.get("dynamics") or {}).get("kind", "nve") == "nve"
 
     @cached_property
     def expected_ambiguous(self) -> float:
-        """Flips that one expects within their rounding bound."""
+        """Expected number of flips within their rounding bound."""
         return analysis.expected_ambiguous(self.flips.ratios)
 
     @cached_property
     def budget(self) -> dict[str, np.ndarray]:
-        """Energy against time: its change, the ledger's jumps summed, and what is left between the two."""
+        """Energy over time: its change, the cumulative jumps of the ledger, and the difference of the two."""
         conserved = self.series["conserved"]
         change, jumps = conserved - conserved[0], np.cumsum(self.series["energy_jump"])
         return {"change": change, "jumps": jumps, "residual": change - jumps}
 
     @cached_property
     def time_step(self) -> dict[str, float | None]:
-        """What the energies and the fastest vibration say of the time step; None for what is not known.
+        """Indicators of the time step's adequacy, from energies and the fastest vibration; None if unknown.
 
-        `per_period`: steps in the fastest vibration of the first and the last configuration; `fluctuation`:
-        of the energy that is conserved, the flips' jumps left out, over the kinetic energy's; `drift` of that
-        energy over the run and `drift_error`, its standard error, in k_B T per atom.
+        `per_period`: number of steps per period of the fastest vibration in the first and the last
+        configuration; `fluctuation`: ratio of the fluctuation of the conserved energy (without the flips'
+        jumps) to that of the kinetic energy; `drift` of the conserved energy over the run and its standard
+        error `drift_error`, in k_B T per atom.
         """
         period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
         atoms = self.summary.get("atoms") or 0
@@ -145,22 +146,22 @@ class RunView(View):
 
     @property
     def residual(self) -> Measured:
-        """How far the budget is from closing, as the run stated it or else |E(t) - E(0) - sum of jumps|."""
+        """Residual of the energy budget, as stated by the run or else max |E(t) - E(0) - sum of jumps|."""
         stated = self.summary.get("energy_budget_residual")
         left = float(np.max(np.abs(self.budget["residual"]))) if stated is None else abs(float(stated))
         return Measured(left, self.units.energy, self.summary.get("energy_budget_tolerance"))
 
     def total(self, key: str, column: str | None = None) -> int:
-        """A count from the summary, or from the epochs where a killed run has no summary."""
+        """Return a count from the summary, or from the epochs if a killed run has no summary."""
         return int(self.summary.get(key) or self.epochs[column or key].sum())
 
     def step(self, row: int | np.integer) -> int:
-        """The step of a row of the series."""
+        """Return the step of a row of the series."""
         return int(self.series["step"][row])
 
 
 def page(run: RunView, verdict: Verdict) -> Page:
-    """The page of a run."""
+    """Return the page of a run."""
     atoms, cutoff, units = run.summary.get("atoms"), run.cutoff, run.units
     about = [many(atoms, "atom")] if atoms else []
     about.append(many(run.steps, "step"))
@@ -188,7 +189,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
 
 
 def draw_first(run: RunView) -> None:
-    """Draws the figures that say nothing of single flips, while those are followed."""
+    """Draw the figures that do not show single flips, while the flips are still being computed."""
     from mdnum.report import drawing
 
     for part in (*_energy(run), next(_flips_per_step(run)), *_lists(run)):
@@ -197,7 +198,7 @@ def draw_first(run: RunView) -> None:
 
 
 def _numbers(run: RunView) -> dict[str, Any]:
-    """What stands above the page."""
+    """Return the key numbers at the top of the page."""
     summary, atoms, epochs = run.summary, run.summary.get("atoms"), run.epochs
     made = {name: int(run.series[name].sum(dtype=np.int64)) for name in ("entered", "left", "ambiguous")}
     known = ("energy_drift", "energy_budget_closes", "steps_per_second")
@@ -212,7 +213,7 @@ def _numbers(run: RunView) -> dict[str, Any]:
 
 
 def _what(run: RunView) -> list[tuple[str, str]]:
-    """What was run; what the system file leaves out is left out."""
+    """Return rows on the system that was run, without those absent from the system file."""
     units, system, time = run.units, run.system, run.series["time"]
     lengths: dict[str, str] = dict.fromkeys(("radius", "onset", "skin"), units.length)
 
@@ -243,7 +244,7 @@ def _what(run: RunView) -> list[tuple[str, str]]:
 
 
 def _freedom(run: RunView) -> dict[str, Any]:
-    """Degrees of freedom that a temperature is divided by, and why so many."""
+    """Return the number of degrees of freedom in the temperature, and its explanation."""
     freedom, atoms = run.summary.get("degrees_of_freedom"), run.summary.get("atoms") or 0
     if freedom is None:
         return dict.fromkeys(("freedom", "counted"))
@@ -309,7 +310,7 @@ def _energy(run: RunView) -> Iterator[Any]:
 
 
 def _pressure(run: RunView, parts: Mapping[str, Any]) -> Iterator[Any]:
-    """The pressure in parts, and what the cutoff leaves out of it."""
+    """Yield the components of the pressure, and the pressure that the cutoff neglects."""
     units = run.units
     rows = TEXTS.rows("pressure", **vars(units), **parts)
     terms = [
@@ -442,7 +443,7 @@ def _lists(run: RunView) -> Iterator[Any]:
 
 
 def _nearest(run: RunView) -> Iterator[Any]:
-    """The flips nearest to the threshold, in the order of steps."""
+    """Yield the flips nearest to the threshold, ordered by step."""
     flips, units = run.flips.nearest, run.units
     if not len(flips["step"]):
         yield TEXTS("no_flips")
@@ -453,7 +454,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
 
 
 def _ranges(run: RunView) -> Iterator[Any]:
-    """What the numbers ask of a format, and the steps at which narrower ones would not hold them."""
+    """Yield the range of magnitudes of each quantity, and the steps at which a narrower format would fail."""
     examined, series, units = run.table("ranges"), run.series, vars(run.units)
     sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
     sums["step"] = series["step"]

@@ -1,4 +1,4 @@
-"""`mdnum systems`: those that come with mdnum, and one's own, listed, shown, checked and copied."""
+"""`mdnum systems`: list, show, check and copy systems, shipped with mdnum or one's own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mdnum.verbs import Reply
 
 
 def listed() -> Reply:
-    """`mdnum systems list`."""
+    """Execute `mdnum systems list`."""
     loaded = [(name, systems.load(name)) for name in systems.names()]
     rows = [{"name": name, **_size(one), "about": one.spec.about} for name, one in loaded]
     lines = [(row["name"], _sized(row), row["about"].partition(". ")[0]) for row in rows]
@@ -22,13 +22,13 @@ def listed() -> Reply:
 
 
 def show(system: str, overrides: Mapping[str, str] | None = None) -> Reply:
-    """`mdnum systems show SYSTEM`."""
+    """Execute `mdnum systems show SYSTEM`."""
     text = systems.load(system, overrides).to_toml(beside=False)
     return Reply(headed("systems-show", tomllib.loads(text)), [text.rstrip()])
 
 
 def check(system: str, overrides: Mapping[str, str] | None = None) -> Reply:
-    """`mdnum systems check SYSTEM`."""
+    """Execute `mdnum systems check SYSTEM`."""
     loaded: Any = systems.load(system, overrides)
     from mdnum.verbs.check import structure_findings
 
@@ -41,13 +41,13 @@ def check(system: str, overrides: Mapping[str, str] | None = None) -> Reply:
 
 
 def copy(system: str, target: Path | None = None) -> Reply:
-    """`mdnum systems copy SYSTEM [DIR]`."""
+    """Execute `mdnum systems copy SYSTEM [DIR]`."""
     copied = systems.copy(system, target or Path())
     return Reply(headed("systems-copy", {"system": system, "path": copied}), [f"wrote {copied}"])
 
 
 def _size(system: Any) -> dict[str, int]:
-    """How many there are of what the system is made of."""
+    """Return the number of atoms or balls of a system."""
     atoms = getattr(system, "atoms", None)
     return {"balls": system.balls} if atoms is None else {"atoms": len(atoms)}
 
