@@ -1,23 +1,23 @@
 """mdnum: neighbor-set flips, forks and gradients of cutoff-based molecular dynamics.
 
-A simulation is made of objects, or of a system file:
+A simulation is made from objects, or from a system file:
 
     >>> argon = mdnum.LennardJones(sigma=3.405, epsilon=0.0103235)
     >>> sim = mdnum.simulation(atoms, argon, mdnum.Cut("switched", 8.5), timestep=0.002)
     >>> sim = mdnum.build("argon/liquid-864")
     >>> sim = mdnum.changed(sim, {"cutoff.radius": 8.0})
 
-Verbs take either, or the name or path of a system file, and leave a folder:
+Verbs take a simulation, or the name or path of a system file, and write a folder:
 
     run                 simulate, record every flip, compare with ASE
-    fork, fork_...      follow two runs that differ in one choice; maps, certificates, forecasts
+    fork, fork_...      compare two runs that differ in one choice; maps, certificates, forecasts
     grad                differentiate a loss of a run in several ways, and judge the derivatives
-    sweep               which choices move which results, and the cheapest setting that is enough
-    check               compare energies, pairs or a trajectory with other codes, on the spot
-    flips               contacts and flips of anybody's trajectory
-    audit_calculator    is an ASE calculator smooth, invariant and conservative?
-    conform             does a neighbor list find every pair?
-    bounce, demonstrate the same questions about a ball
+    sweep               which choices affect which results, and the cheapest sufficient setting
+    check               compare energies, pairs or a trajectory with other codes
+    flips               contacts and flips of any program's trajectory
+    audit_calculator    test whether an ASE calculator is smooth, invariant and conservative
+    conform             test whether a neighbor list finds every pair
+    bounce, demonstrate runs and demonstrations of a bouncing ball
 
 Nouns: `Simulation` and its `parameters` by path, pair potentials (`LennardJones`, `Morse`, `SoftSphere`,
 `PairFunction` for one of your own), `energy_function` for any energy over a neighbor list, `Cut`, `Term` for

@@ -1,4 +1,4 @@
-"""`python -m mdnum`: the same as `mdnum`."""
+"""The command line as `python -m mdnum`, the same as `mdnum`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ if __name__ == "__main__" and not sys.flags.safe_path and sys.path[:1] == [os.ge
 
 
 def main() -> None:
-    """Runs the command line and exits.
+    """Run the command line and exit.
 
-    Until there is something to be kept, and again at the end, control-C ends the process at once: a package
-    that is interrupted while it is imported fails in a way of its own.
+    Until there are results to be saved, and again at the end, control-C ends the process at once, because a
+    package whose import is interrupted fails in an unpredictable way.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:

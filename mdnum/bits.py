@@ -1,6 +1,6 @@
-"""What goes bit by bit: packed decisions, and orders of whole numbers.
+"""Operations on bits: packed decisions, and sorting of integers.
 
-Trajectories use it too, so it stands outside of `mdnum.numerics`, which imports jax.
+This module is outside `mdnum.numerics` because trajectories use it too, and `mdnum.numerics` imports jax.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mdnum.vectors import lowest_bit
 
 @njit
 def _scan(before, rows, columns, row, slot, column, values):
-    """Note the bits that change from row to row; returns their number, of which those that fit are noted."""
+    """Record the bits that change from row to row, as far as they fit; return the number of all changes."""
     at, room = 0, row.shape[0]
     for r in range(rows.shape[0]):
         # the eight slots that the scan is in, and the places of their bytes
@@ -43,14 +43,14 @@ def changes_in_time(
 ) -> tuple[
     Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]
 ]:
-    """The decisions that differ from the row before, for consecutive rows of one list.
+    """Return the decisions that differ from the previous row, for consecutive rows of one list.
 
     Args:
-        before: decisions ahead of the first row.
+        before: decisions before the first row.
         rows: decisions of each row.
 
     Returns:
-        row, slot, column and the decision now (1 yes, 0 no) of every change, by row, slot word, column, bit.
+        row, slot, column and the new decision (1 yes, 0 no) of every change, by row, slot word, column, bit.
     """
     count, words, columns = rows.shape
     size = words * columns
@@ -74,13 +74,13 @@ def changes_in_time(
 def set_bits(
     packed: UInt8[np.ndarray, "words columns"],
 ) -> tuple[Int[np.ndarray, "set"], Int[np.ndarray, "set"]]:
-    """Slot and column of every yes decision."""
+    """Return slot and column of every decision that is yes."""
     _, slots, columns, _ = changes_in_time(np.zeros_like(packed), packed[None])
     return slots, columns
 
 
 def count_set(packed: UInt8[np.ndarray, "..."]) -> int:
-    """How many decisions of packed bytes (any number of columns) are yes."""
+    """Count the decisions that are yes in packed bytes (any number of columns)."""
     flat = np.ascontiguousarray(packed).reshape(-1)
     whole = len(flat) // 8 * 8
     return int(np.bitwise_count(flat[:whole].view(np.uint64)).sum(dtype=np.int64)) + int(
@@ -90,9 +90,9 @@ def count_set(packed: UInt8[np.ndarray, "..."]) -> int:
 
 @njit
 def digit_order(room, count, most):
-    """A stable order of so many keys, whole numbers from 0 to below the most: digit by digit, the last first.
+    """Sort integer keys from 0 to below `most` stably, by radix sort from the last digit; return the order.
 
-    They are in the first row of the room, which is used up: int64, (4, count or more).
+    Keys are in the first row of `room`, whose content is overwritten: int64, (4, count or more).
     """
     keys, numbers, other_keys, other_numbers = room[0], room[1], room[2], room[3]
     bits = 1

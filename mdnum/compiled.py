@@ -1,4 +1,4 @@
-"""numba's decorators as mdnum uses them: what they compile is kept for later processes where it can be."""
+"""numba's decorators as mdnum uses them: compiled functions are cached on disk where possible."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ _missed: list[Any] = []  # what could not be kept
 
 
 def njit(function: Any = None, /, **options: Any) -> Any:
-    """`numba.njit` without the GIL; kept in a file, or compiled by each process where no folder takes one."""
+    """`numba.njit` without the GIL; cached in a file, or compiled by each process if no folder allows it."""
     if function is None:
         return lambda function: njit(function, **options)
     return _kept(lambda keep: numba.njit(cache=keep, nogil=True, **options)(function))
 
 
 def cfunc(signature: Any, function: Callable[..., Any]) -> Any:
-    """`numba.cfunc`, kept as by `njit`."""
+    """`numba.cfunc`, cached as by `njit`."""
     return _kept(lambda keep: numba.cfunc(signature, cache=keep)(function))
 
 
 def all_kept() -> bool:
-    """Whether everything that this process compiled so far is kept."""
+    """True if every function that this process has compiled so far is cached."""
     # a function that was not called has not been compiled
     return not any(getattr(one, "signatures", True) for one in _missed)
 
@@ -58,7 +58,7 @@ def _kept(compiled: Callable[[bool], Any]) -> Any:
 
 
 def _attempt(use: Callable[..., Any]) -> Callable[..., Any]:
-    """A use of a cache in whose folder files may be unreadable, or find no room: both are met only then."""
+    """Wrap a use of the cache so that errors from unreadable files or lack of disk space are recorded."""
 
     def attempt(*given: Any) -> Any:
         try:

@@ -1,4 +1,4 @@
-"""A limit on the time of a verb: what was not examined by then is said, not guessed."""
+"""Time limit of a verb: results that are missing at the deadline are reported as missing, not estimated."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ GRACE = 10.0
 
 
 class TimeUp(Exception):
-    """The deadline passed while something was in progress, which has no result."""
+    """The deadline passed during a calculation, which therefore has no result."""
 
     why = "the time was up"
 
 
 class Deadline:
-    """The moment at which no more work is begun.
+    """Time after which no more work is started.
 
-    How much evidence a verdict rests on is counted in calls, never in seconds; a deadline only cuts it short,
-    and a verb that was cut short says so.
+    The evidence for a verdict is measured in calls, never in seconds; a deadline only limits the number of
+    calls, and a verb states when this happened.
 
     Args:
-        minutes: from now; None for no limit.
+        minutes: time from now; None for no limit.
 
     Raises:
-        InputError: not a positive number.
+        InputError: minutes is not a positive number.
     """
 
     def __init__(self, minutes: float | None = None):
@@ -46,26 +46,26 @@ class Deadline:
 
     @property
     def left(self) -> float:
-        """Seconds that are left; infinite without a limit, never negative."""
+        """Remaining seconds; infinite without a limit, never negative."""
         return max(0.0, self._end - time.monotonic())
 
     def part(self, share: float) -> Deadline:
-        """The moment at which this share of the time that is left is used up."""
+        """Return the deadline after this fraction of the remaining time."""
         sooner = Deadline()
         sooner._end = time.monotonic() + share * self.left
         return sooner
 
     @property
     def passed(self) -> bool:
-        """Whether the time is up."""
+        """True if the deadline has passed."""
         return self.left == 0.0
 
 
 @contextmanager
 def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
-    """In the main thread, `TimeUp` where a call is in progress longer than `grace` s past a deadline.
+    """In the main thread, raise `TimeUp` if a call is still running `grace` s after the deadline.
 
-    It is interrupted again and again, since its code may catch that; compiled code is not interrupted.
+    The interruption is repeated, because the called code may catch it; compiled code is not interrupted.
     """
     if math.isinf(deadline.left) or threading.current_thread() is not threading.main_thread():
         yield
@@ -84,15 +84,15 @@ def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
 def fewest(
     items: Sequence[T], enough: Callable[[list[T]], bool], spent: Callable[[], bool] = lambda: False
 ) -> list[T]:
-    """A subset of items that is enough, from which none can be left out unless the search was cut short.
+    """Return a sufficient subset of items, minimal unless the search was cut short.
 
     Args:
-        items: enough together.
-        enough: decides a subset, in the order of items.
-        spent: whether no more may be asked.
+        items: items that are sufficient together.
+        enough: returns whether a subset, in the order of items, is sufficient.
+        spent: returns whether the search must stop.
 
     Source: Zeller and Hildebrandt, Simplifying and Isolating Failure-Inducing Input, IEEE TSE 28, 183 (2002);
-        complements alone.
+        complements only.
     """
     kept = list(items)
     size = max(1, len(kept) // 2)

@@ -1,11 +1,11 @@
-"""`mdnum doctor`: can the numbers that this installation computes be trusted?
+"""`mdnum doctor`: tests of whether the numbers that this installation computes can be trusted.
 
-Everything is found out by computing on the machine at hand. A version known to be bad is named too,
-but a version is not evidence of the contrary.
+All results come from computations on the current machine. A version known to be faulty is also reported, but
+a version is no evidence of correctness.
 
-Bounds and margins rest on +, -, *, / and sqrt being correctly rounded, one by one, and on no sum being
-reordered. XLA keeps that on CPUs but also contracts a*b+c and rewrites divisions by constants: each
-changes last bits legitimately, so two builds may decide a margin within its bound differently.
+Bounds and margins require that +, -, *, / and sqrt are correctly rounded, one by one, and that no sum is
+reordered. XLA satisfies this on CPUs, but also contracts a*b+c and rewrites divisions by constants: these
+legitimately change last bits, so two builds may make different decisions if a margin is within its bound.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _ENERGY_TOLERANCE, _FORCE_TOLERANCE = 1e-12, 1e-10  # the promise of `mdnum chec
 
 @dataclass(frozen=True)
 class DoctorRow:
-    """One test of the installation."""
+    """Result of one test of the installation."""
 
     name: str  # what was tested
     # "info": changes bits without making them wrong; "unsafe": numbers, or claims about them, may be wrong
@@ -58,14 +58,14 @@ class DoctorRow:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All tests of one installation."""
+    """Results of all tests of one installation."""
 
     rows: tuple[DoctorRow, ...]  # in the order they are worth reading
     seconds: float  # that they took
 
     @property
     def ok(self) -> bool:
-        """Whether no row is unsafe."""
+        """True if no test found the installation unsafe."""
         return all(row.status != "unsafe" for row in self.rows)
 
 
@@ -77,11 +77,11 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
         True
 
     Args:
-        budget: seconds after which the tests in other processes are given up; those in this process
-            take about six.
+        budget: seconds after which tests in other processes are abandoned; the tests in this process take
+            about six seconds.
 
     Returns:
-        A row per test. `Diagnosis.ok` is false when one is unsafe.
+        one row per test; `Diagnosis.ok` is False if any test is unsafe.
     """
     start = time.perf_counter()
     other, imported = Child(DIGEST_CODE), Child(IMPORTS_CODE)
@@ -95,7 +95,7 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
 
 
 def _row(test: str, status: Status | bool, **values: Any) -> DoctorRow:
-    """A row in the words of a test, their fields filled in; True is "ok", False "unsafe"."""
+    """Return a test's row with the fields of its text filled in; status True is "ok", False "unsafe"."""
     if not isinstance(status, str):
         status = "ok" if status else "unsafe"
     words = _WORDS[test]
@@ -107,7 +107,7 @@ def _row(test: str, status: Status | bool, **values: Any) -> DoctorRow:
 
 
 def jax_version() -> DoctorRow:
-    """jax and jaxlib against the releases known to be wrong."""
+    """Compare the versions of jax and jaxlib with releases known to be faulty."""
     from jaxlib.version import __version__ as library
 
     # what is imported counts, when metadata and modules differ
@@ -121,7 +121,7 @@ def jax_version() -> DoctorRow:
 
 
 def flags() -> DoctorRow:
-    """Settings in the environment that change what XLA computes."""
+    """Report environment settings that change XLA's results."""
     settings = {
         name: value
         for name, value in sorted(os.environ.items())
@@ -135,13 +135,13 @@ def flags() -> DoctorRow:
 
 
 def devices() -> DoctorRow:
-    """The devices that jax computes on."""
+    """Report the devices that jax computes on."""
     names = ", ".join(f"{device.platform} ({device.device_kind})" for device in jax.devices())
     return _row("devices", "info", names=names, cores=os.cpu_count())
 
 
 def packages() -> DoctorRow:
-    """Every package that mdnum needs, and the optional peers that are there."""
+    """Report every package that mdnum needs, and the installed optional packages."""
     found = {package: version(package) for package in (*PACKAGES, *PEERS)}
     missing = [package for package in PACKAGES if found[package] is None]
     installed = ", ".join(f"{package} {at}" for package, at in found.items() if at)
@@ -149,7 +149,7 @@ def packages() -> DoctorRow:
 
 
 def numba_works() -> DoctorRow:
-    """numba compiles, keeps float64 and does not reorder a sum."""
+    """Test that numba compiles, keeps float64 and does not reorder a sum."""
     start = time.perf_counter()
     try:
         import numba
@@ -184,7 +184,7 @@ def _differing(a: Any, b: Any) -> int:
 
 
 def float64() -> DoctorRow:
-    """Double precision is on, and a double survives the way to the device, through jit and back."""
+    """Test that double precision is on, and that doubles are unchanged by transfer to the device and jit."""
     values = np.array([np.float64(1) / 3, np.pi, 1 + 2**-52, 8.5125, 1e300, -(2.0**-1000)])
     after = np.asarray(jax.jit(lambda x: x)(jnp.asarray(values)))
     kept = after.dtype == np.float64 and after.tobytes() == values.tobytes()
@@ -196,10 +196,10 @@ def float64() -> DoctorRow:
 
 
 def elementwise() -> DoctorRow:
-    """Basic operations under jit and eagerly against numpy, bit for bit, in both precisions.
+    """Compare basic operations, jitted and eager, with numpy, bit for bit, in both precisions.
 
-    On an accelerator quotients and square roots in float32 may be approximate. No decision rests on them
-    (`numerics.exact.root`).
+    On an accelerator, quotients and square roots in float32 may be approximate; decisions do not depend on
+    them (`numerics.exact.root`).
     """
     # by name, which numpy and jax share, with the number of arguments
     operations = {
@@ -220,7 +220,7 @@ def elementwise() -> DoctorRow:
 
 
 def functions() -> DoctorRow:
-    """exp, log, cos and power against numpy, in units in the last place."""
+    """Compare exp, log, cos and power with numpy, in units in the last place."""
     a, b = _numbers(3), _numbers(4) / 10
     ulps = {}
     for name, given in {"exp": [-a], "log": [a], "cos": [a], "power": [a, b]}.items():
@@ -234,7 +234,7 @@ def functions() -> DoctorRow:
 
 
 def reassociation() -> DoctorRow:
-    """Sums keep their order: (x + c) - c is not folded and an error-free transformation is exact."""
+    """Test that sums keep their order: (x + c) - c is not folded, an error-free transformation is exact."""
     x, c = _numbers(5) * 1e-3, np.full(_COUNT, 1e3)
 
     def two_sum(a: Any, b: Any) -> tuple[Any, Any]:
@@ -253,14 +253,14 @@ def reassociation() -> DoctorRow:
 
 
 def contraction() -> DoctorRow:
-    """Whether a*b + c is contracted to one rounding under jit."""
+    """Test whether a*b + c is contracted to one rounding under jit."""
     a, b, c = _numbers(6), _numbers(7), -_numbers(8)
     count = _differing(jax.jit(lambda a, b, c: a * b + c)(*map(jnp.asarray, (a, b, c))), a * b + c)
     return _row("contraction", "info" if count else "ok", count=count, of=_COUNT)
 
 
 def constant_division() -> DoctorRow:
-    """Whether x / constant becomes x * (1 / constant), and (x*c)*d becomes x*(c*d)."""
+    """Test whether x / constant becomes x * (1 / constant), and (x*c)*d becomes x*(c*d)."""
     x = _numbers(9)
     divided = _differing(jax.jit(lambda x: x / 3.0)(jnp.asarray(x)), x / 3.0)
     folded = _differing(jax.jit(lambda x: (x * 0.1) * 0.7)(jnp.asarray(x)), (x * 0.1) * 0.7)
@@ -269,11 +269,11 @@ def constant_division() -> DoctorRow:
 
 
 def subnormals() -> DoctorRow:
-    """Whether numpy and jax keep numbers below 2.2e-308, or flush them to zero.
+    """Test whether numpy and jax keep numbers below 2.2e-308, or flush them to zero.
 
-    XLA flushes them on CPUs, and a library that is loaded can have the processor do so for everything. Asked
-    by computing with them, in the size at which XLA's own threads work too; compared as integers, because a
-    processor that takes them for zero calls them equal to it.
+    XLA flushes them on CPUs, and a loaded library can make the processor flush all of them. The test computes
+    with subnormals, also in arrays large enough for XLA's own threads, and compares integers, because a
+    processor that treats subnormals as zero considers them equal to zero.
     """
 
     def power(exponent: int, count: int) -> np.ndarray:
@@ -299,17 +299,17 @@ def subnormals() -> DoctorRow:
 
 
 def _fcc(cells: int) -> np.ndarray:
-    """Atoms of an fcc crystal in units of its lattice constant, (4 cells³, 3)."""
+    """Return the atoms of an fcc crystal in units of its lattice constant, (4 cells³, 3)."""
     return np.array([place for place in np.ndindex((2 * cells,) * 3) if sum(place) % 2 == 0]) / 2
 
 
 def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """500 argon atoms of an fcc crystal, rattled, in a tilted box, with a padded pair list.
+    """Return 500 argon atoms of an fcc crystal, perturbed, in a tilted box, with a padded pair list.
 
     Returns:
         cell: columns are box vectors (3, 3), Å.
         fractional: positions in units of the cell (500, 3).
-        slots: atom indices of the listed pairs (slots, 2), i < j; unused slots hold (500, 500).
+        slots: atom indices of the listed pairs (slots, 2), i < j; unused slots contain (500, 500).
     """
     fractional = (_fcc(5) / 5) % 1.0
     fractional = fractional + np.random.default_rng(39103).normal(scale=0.002, size=fractional.shape)
@@ -324,7 +324,7 @@ def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) -> jax.Array:
-    """r² of every slot as jax-md computes it, one matrix-vector product a pair; 0 in unused slots."""
+    """Compute r² of every slot as jax-md does, one matrix-vector product per pair; 0 in unused slots."""
     used = slots[:, 0] < fractional.shape[0]
     index = jnp.where(used[:, None], slots, 0)
     separation = fractional[index[:, 0]] - fractional[index[:, 1]]
@@ -334,7 +334,7 @@ def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) 
 
 
 def pair_energy(r2: jax.Array) -> jax.Array:
-    """The Lennard-Jones energy of the slots inside a hard cutoff, eV."""
+    """Return the Lennard-Jones energy of the slots inside a hard cutoff, eV."""
     inside = (r2 > 0) & (r2 < _R_CUT**2)
     inverse = (_SIGMA**2) / jnp.where(inside, r2, jnp.ones_like(r2))
     sixth = inverse * inverse * inverse
@@ -342,11 +342,12 @@ def pair_energy(r2: jax.Array) -> jax.Array:
 
 
 def crystal() -> DoctorRow:
-    """Squared distances and energy of the tilted crystal under jit and eagerly, against numpy and exact sums.
+    """Compare distances and energy of the tilted crystal, jitted and eager, with numpy and exact sums.
+    sums.
 
-    jax 0.10.2 computes a vmapped matrix-vector product followed by a reduction wrongly under jit on CPUs
-    (jax-ml/jax#39103), without a warning: one coordinate of every displacement in a tilted box. It needs more
-    than 16,384 rows, so small tests pass.
+    On CPUs, jax 0.10.2 jits a vmapped matrix-vector product followed by a reduction incorrectly
+    (jax-ml/jax#39103), without a warning: one coordinate of every displacement in a tilted box is wrong. The
+    bug requires more than 16,384 rows, so small tests pass.
     """
     cell, fractional, slots = tilted_crystal()
     used = slots[:, 0] < len(fractional)
@@ -372,10 +373,10 @@ def crystal() -> DoctorRow:
 
 
 def digest(steps: int = 50) -> str:
-    """SHA-256 of a short jitted rollout, to be compared between processes.
+    """Return the SHA-256 of a short jitted rollout, to be compared between processes.
 
     Args:
-        steps: velocity Verlet steps of 32 argon atoms.
+        steps: number of velocity Verlet steps of 32 argon atoms.
     """
     positions = _fcc(2) * 5.26
     positions += np.random.default_rng(7).normal(scale=0.05 * _SIGMA, size=positions.shape)
@@ -407,7 +408,7 @@ def digest(steps: int = 50) -> str:
 
 
 def own_forces() -> DoctorRow:
-    """mdnum's energy and forces of argon/tilted-500, neighbor search included, against plain numpy."""
+    """Compare mdnum's energy and forces of argon/tilted-500, including neighbor search, with plain numpy."""
     try:
         energy, force = worst_errors()
     except Exception as error:  # whatever keeps mdnum from computing forces here is what was asked for
@@ -417,7 +418,7 @@ def own_forces() -> DoctorRow:
 
 
 def worst_errors() -> tuple[float, float]:
-    """Relative energy difference, and the largest force difference over the largest force."""
+    """Return the relative energy difference, and the largest force difference over the largest force."""
     from mdnum.systems import build
 
     simulation = build("argon/tilted-500")
@@ -433,7 +434,7 @@ def worst_errors() -> tuple[float, float]:
 def _lennard_jones(
     positions: np.ndarray, cell: np.ndarray, sigma: float, epsilon: float, r_cut: float
 ) -> tuple[float, np.ndarray]:
-    """Energy and forces by all pairs in all neighboring images, one image after another."""
+    """Compute energy and forces from all pairs in all neighboring images, one image after another."""
     terms: list[np.ndarray] = []
     forces = np.zeros_like(positions)
     fractional = positions @ np.linalg.inv(cell)
@@ -454,7 +455,7 @@ def _lennard_jones(
 
 
 class Child:
-    """A Python process that runs code and prints one line, started early so that it costs no waiting."""
+    """A Python process that runs code and prints one line, started early to avoid waiting."""
 
     def __init__(self, code: str):
         pipe: Any = subprocess.PIPE
@@ -463,7 +464,7 @@ class Child:
         )
 
     def answer(self, seconds: float) -> tuple[str | None, str]:
-        """(what it printed, "") or (None, why not), after waiting at most so many seconds."""
+        """Wait at most the given seconds; return (output, "") or (None, reason for the missing output)."""
         try:
             out, err = self.process.communicate(timeout=max(seconds, 0.1))
         except subprocess.TimeoutExpired:
@@ -479,14 +480,14 @@ _LATE = "no answer in time"
 
 
 def imports(child: Child, seconds: float) -> DoctorRow:
-    """jax_md can be imported, and how long that takes."""
+    """Test whether jax_md can be imported, and measure the time."""
     answer, why = child.answer(seconds)
     status = "info" if why == _LATE else answer is not None
     return _row("imports", status, seen=answer or why)
 
 
 def second_process(child: Child, here: str, seconds: float) -> DoctorRow:
-    """A jitted rollout has the same bits in another process: what resuming a run relies on."""
+    """Test that a jitted rollout has the same bits in another process, as required for resuming runs."""
     answer, why = child.answer(seconds)
     status = "info" if why == _LATE else answer == here
     return _row("second_process", status, here=here[:12], there=answer[:12] if answer else why)

@@ -1,4 +1,4 @@
-"""Exceptions that say what was seen, what was expected and what to do."""
+"""Exceptions whose messages contain the observation, the expectation and a remedy."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ _LONGEST = 800
 
 
 def python_escape(character: str) -> str:
-    """As Python writes a character that it does not print."""
+    """Return Python's escape sequence of a nonprintable character."""
     return character.encode("unicode_escape").decode()
 
 
 def json_escape(character: str) -> str:
-    """As JSON writes a character by its number."""
+    """Return JSON's escape sequence of a character."""
     return json.dumps(character)[1:-1]
 
 
 def printable(text: str, escape: Callable[[str], str] = python_escape) -> str:
-    """Text that came from a stranger's file, with nothing in it that a terminal would act on.
+    """Escape everything in untrusted text that a terminal would interpret.
 
-    Escape sequences, other control characters (but line ends and tabs) and characters that reorder or hide
-    text are written as Python writes them, such as ``\\x1b``.
+    Escape sequences, other control characters (except line ends and tabs) and characters that reorder or hide
+    text are written as in Python, such as ``\\x1b``.
     """
     return _CONTROL.sub(lambda found: escape(found[0]), text)
 
 
 def shortened(text: str) -> str:
-    """A sentence that quotes no more than can be read: long words and long texts lose their middle."""
+    """Shorten a message: long words and long texts lose their middle."""
     text = _LONG_WORD.sub(lambda found: _without_middle(found[0], 100), text)
     return _without_middle(text, _LONGEST)
 
@@ -51,9 +51,9 @@ def _without_middle(text: str, kept: int) -> str:
 
 
 class MdnumError(Exception):
-    """Base of every error that mdnum raises on purpose.
+    """Base class of every error that mdnum raises on purpose.
 
-    Control characters in what it quotes are escaped, and long quotes are shortened.
+    Control characters in quoted text are escaped, and long quotes are shortened.
 
     Example:
         >>> try:
@@ -62,8 +62,8 @@ class MdnumError(Exception):
         ...     print(error)
 
     Args:
-        message: what was seen and what was expected.
-        remedy: what to do about it, an imperative sentence.
+        message: the observation and the expectation.
+        remedy: an imperative sentence that tells the user what to do.
         where: the file, key or step at fault.
     """
 
@@ -90,22 +90,22 @@ def _restored(kind: type[MdnumError], args: tuple[Any, ...], held: dict[str, Any
 
 
 class InputError(MdnumError):
-    """What a person wrote cannot be run: a system file, an option, a structure."""
+    """Raised if user input cannot be used: a system file, an option, a structure."""
 
 
 class FolderError(InputError):
-    """A run folder cannot be written, read or resumed."""
+    """Raised if a run folder cannot be written, read or resumed."""
 
 
 class CapacityError(MdnumError):
-    """A neighbor list would need more room than it can have."""
+    """Raised if a neighbor list would exceed its maximum size."""
 
 
 class NumericalError(MdnumError):
-    """A number that must be finite is not.
+    """Raised if a number that must be finite is not.
 
     Args:
-        folder: the run folder that holds everything up to that number.
+        folder: the run folder, which contains all results before this number.
     """
 
     def __init__(self, message: str, *, folder: Path | None = None, **more: Any):
@@ -114,16 +114,16 @@ class NumericalError(MdnumError):
 
 
 def in_a_line(error: BaseException) -> str:
-    """An exception that is not mdnum's, in one line."""
+    """Return the type and message of another package's exception in one line."""
     words = " ".join(str(error).split())[:300]
     return f"{type(error).__name__}: {words}" if words else type(error).__name__
 
 
 def expect_at_least(least: int, **numbers: int) -> None:
-    """Rejects numbers below the least that makes sense, by their names.
+    """Raise an error if a number is below its minimum.
 
     Raises:
-        InputError: names the first.
+        InputError: with the name of the first such number.
     """
     for name, number in numbers.items():
         if number < least:
@@ -131,10 +131,10 @@ def expect_at_least(least: int, **numbers: int) -> None:
 
 
 def expect_path(given: object, remedy: str) -> None:
-    """Rejects an array or another object where a path is expected, without quoting what it holds.
+    """Raise an error if an array or another object is given instead of a path, without quoting its content.
 
     Raises:
-        InputError: names its type, and its shape where it has one.
+        InputError: with the object's type and, if it has one, its shape.
     """
     if not isinstance(given, str | os.PathLike):
         shape = getattr(given, "shape", None)

@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are first used (PEP 562)."""
+"""Import of a package's names on first use (PEP 562)."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from typing import Any
 def on_first_use(
     package: str, **others: str
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """`__getattr__`, `__dir__` and `__all__` of a package that imports nothing of its own.
+    """Return `__getattr__`, `__dir__` and `__all__` of a package that imports nothing itself.
 
-    Its names are those that its source imports under `if TYPE_CHECKING`, from modules by their full names:
-    they are said once, for type checkers and for Python.
+    The names of the package are those imported in its source under `if TYPE_CHECKING`, from modules by their
+    full names; they are thus written only once, for type checkers and for Python.
 
     Args:
-        package: its `__name__`.
-        others: "module:name" by name, of what a module calls otherwise.
+        package: `__name__` of the package.
+        others: "module:name" for each name that differs from the name in its module.
     """
     homes = {name: place.split(":") for name, place in others.items()}
     for node in ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")).body:

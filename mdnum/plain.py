@@ -1,4 +1,4 @@
-"""Plain values: what JSON, TOML and a terminal can hold of anything mdnum computes, and what texts hold."""
+"""Conversion of results to plain values for JSON, TOML and terminals, and access to text files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 @functools.cache
 def beside(module: str) -> dict[str, Any]:
-    """The tables of the TOML file beside a module, which is given by its `__file__`; nobody changes them."""
+    """Return the tables of the TOML file next to a module (given by `__file__`); do not change them."""
     return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
@@ -24,16 +24,16 @@ HEAD = ("status", "seconds", "headline", "verdict", "findings")
 
 
 def headed(kind: str, document: Mapping[str, Any]) -> dict[str, Any]:
-    """A document that says what it is: which of mdnum/schemas describes it, and its version."""
+    """Return a document with a header that names its schema in mdnum/schemas, its kind and its version."""
     head = {"schema": f"mdnum/{kind}/1", "kind": kind}
     return {**head, **document, **head}
 
 
 def plain(value: Any) -> Any:
-    """value as JSON can hold it: dataclasses to dictionaries, arrays to lists, non-finite numbers to None.
+    """Convert a value for JSON: dataclasses to dictionaries, arrays to lists, non-finite numbers to None.
 
     Raises:
-        TypeError: there is no plain form of it.
+        TypeError: the value has no plain form.
     """
     if value is None or isinstance(value, bool | str | int):
         return value
@@ -55,7 +55,7 @@ def plain(value: Any) -> Any:
 
 @dataclass_transform(frozen_default=True)
 def result(kind: type[T]) -> type[T]:
-    """A frozen dataclass whose repr has its numbers and short texts, and the types of everything else."""
+    """Make a frozen dataclass whose repr shows numbers and short texts, and the types of other fields."""
 
     def __repr__(self: Any) -> str:
         values = ((one.name, getattr(self, one.name)) for one in dataclasses.fields(self))

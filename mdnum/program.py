@@ -1,11 +1,11 @@
-"""The contract between a world and everything that runs its systems again, and what such runs leave.
+"""The interface between a world and the analyses that run its systems, and the results of such runs.
 
-A world (molecular dynamics, the bouncing ball, a stranger's) implements `Program`: everything that decides
-the bits of a run, its start included. Forks, parameter maps, screening and certificates are written once
-against it and know neither atoms nor balls. Decide outside, act inside: a program acts on decisions that it
-is given, so a ledger holds what was used, and the decisions of one program can be imposed on another.
-
-Molecular dynamics: `mdnum.rollout.program.MdProgram`. The ball: `mdnum.ball.program.BallProgram`.
+A world (molecular dynamics, the bouncing ball, or another package's) implements `Program`: everything that
+determines the bits of a run, including its start. Forks, parameter maps, screening and certificates are
+written once for this interface, independent of atoms and balls. A program acts on decisions that it is given,
+so a ledger contains the decisions that were used, and the decisions of one program can be imposed on another.
+The implementation for molecular dynamics is `mdnum.rollout.program.MdProgram`, that for the ball
+`mdnum.ball.program.BallProgram`.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ class Program(Protocol):
 
     Attributes:
         size: number of atoms or balls.
-        steps: that the system's own run makes.
-        timestep: in the units of the system's file.
-        scale: the length that tolerances are shares of: the longest cutoff, the largest start height.
-        ulp: of the largest coordinate of its start, length: no smaller displacement can be written down.
-        streams: whether runs may go on beyond the steps that were asked for; one that is kept whole does not.
-        imposable: why decisions cannot be imposed on it; None where they can.
+        steps: number of steps of the system's own run.
+        timestep: time step in the units of the system's file.
+        scale: length relative to which tolerances are given: the longest cutoff, the largest start height.
+        ulp: unit in the last place of the largest start coordinate, length: no smaller displacement is
+            representable.
+        streams: whether runs may continue beyond the requested steps; False for runs that are stored whole.
+        imposable: why decisions cannot be imposed on the program; None if they can.
     """
 
     @property
@@ -50,66 +51,66 @@ class Program(Protocol):
     def imposable(self) -> str | None: ...
 
     def check(self, other: Any) -> None:
-        """Check that another program decides the same things of the same subjects.
+        """Check that another program makes the same kinds of decisions on the same subjects.
 
         Raises:
-            InputError: it does not.
+            InputError: the programs are not comparable.
         """
         ...
 
     def lockstep(
         self, other: Any, last: int, *, forward: bool, back: bool, guard: float | None
     ) -> Iterator[PairRows]:
-        """Run this program (A) and another (B) side by side.
+        """Run this program (A) and another (B) in lockstep.
 
         Args:
             forward: whether to run B under A's decisions too, "B|A".
             back: whether to run A under B's decisions too, "A|B".
-            guard: length; a run ends when an imposed decision is further than this from its threshold: it
-                would no longer be a decision that rounding could have changed.
+            guard: length; a run ends when an imposed decision is further than this from its threshold,
+                because rounding could no longer have changed that decision.
         """
         ...
 
     def repeats(
         self, others: Sequence[Any], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Separations from this program of each other one, free and under this one's decisions.
+        """Return separations of other programs from this one, free and under this one's decisions.
 
         Args:
-            others: the same program from perturbed starts.
-            last: last step; runs may end earlier where every one has split.
-            tolerance: of the split, length.
-            guard: as in `lockstep`.
+            others: the same program with perturbed starts.
+            last: last step; runs may end earlier if all of them have split.
+            tolerance: separation that counts as a split, length.
+            guard: as for `lockstep`.
         """
         ...
 
     def nudged(self, size: float, count: int, seed: int) -> list[Any]:
-        """The program from starts displaced at random, the furthest by about `size`, an ulp at least."""
+        """Programs with random displacements of the start, the largest about `size`, at least an ulp."""
         ...
 
     def decision(self, other: Any, flips: Sequence[Any], separation: float) -> Decision:
-        """The decision at a fork.
+        """Return the decision at a fork.
 
         Args:
-            flips: cross-run flips of that step, of a stretch.
-            separation: of the runs at the step before, length.
+            flips: cross-run flips of the segment of steps.
+            separation: separation of the runs at the step before, length.
         """
         ...
 
     def number(self, key: str) -> Number:
-        """A number of the system by its key, to be varied.
+        """Return a number of the system by its key, to be varied.
 
         Raises:
-            InputError: no such number, or several; names the known ones.
+            InputError: there is no such number, or several; the message lists the known ones.
         """
         ...
 
     def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
-        """What a run of so many steps decides, and where it ends."""
+        """Return the decisions of a run of the given number of steps, and its final state."""
         ...
 
     def differing(self, other: Any, steps: int, step: int, key: str) -> Differing:
-        """What this program and another, at an adjacent value of a number, decide differently at a step."""
+        """Return the decisions at a step that differ from those of a program with an adjacent value."""
         ...
 
 
@@ -127,7 +128,7 @@ class Twin:
 
 @dataclass(frozen=True)
 class PairRows:
-    """Some steps of two runs side by side."""
+    """Consecutive steps of two runs in lockstep."""
 
     first: int  # step of the first row
     # largest distance between the runs, length, of "B" and "B|A" from A, of "A|B" from B, and the other way
@@ -162,7 +163,7 @@ class PairRows:
         return len(self.cross)
 
     def until(self, last: int) -> PairRows:
-        """The rows up to a step, and what happened in them."""
+        """Return the rows up to a step, and the events in them."""
         rows = last - self.first + 1
         if rows >= self.rows:
             return self
@@ -194,7 +195,7 @@ class PairRows:
 
 @dataclass(frozen=True)
 class Decision:
-    """The decision at a fork."""
+    """Decision at a fork."""
 
     channel: str  # "pair", "contact" or "stop"
     step: int  # of the fork
@@ -215,22 +216,22 @@ class Decision:
 
     @property
     def margin(self) -> float:
-        """Of the run that made it; of A at the start."""
+        """Margin in the run that made the decision, or in A at the start."""
         return self.margins["A" if self.run == "start" else self.run]
 
     @property
     def bound(self) -> float:
-        """On the rounding error of that margin."""
+        """Bound on the rounding error of `margin`."""
         return self.bounds["A" if self.run == "start" else self.run]
 
     @property
     def ambiguous_in(self) -> list[str]:
-        """Runs in which rounding alone could have decided otherwise."""
+        """Runs in which rounding alone could have reversed the decision."""
         return [name for name, bound in self.bounds.items() if bound > 0 and abs(self.margins[name]) <= bound]
 
     @property
     def ambiguous(self) -> bool:
-        """Whether it could have in the run that made it."""
+        """True if rounding could have reversed the decision in the run that made it."""
         return abs(self.margin) <= self.bound
 
 
@@ -249,7 +250,7 @@ class Number:
 
 @dataclass(frozen=True)
 class DecisionHistory:
-    """What a run decided, step by step, and where it ended."""
+    """Decisions of a run, step by step, and its final state."""
 
     # of each step, a number that any other decisions of that step have different (up to collisions of 64
     # bits); shorter where the run failed, shape (rows,)
@@ -263,7 +264,7 @@ class DecisionHistory:
     first: int = 0  # step of the first row
 
     def first_difference(self, other: DecisionHistory) -> int | None:
-        """The first step at which two runs decide differently; None where they decide alike."""
+        """Return the first step at which the decisions of two runs differ; None if they never differ."""
         common = min(len(self.marks), len(other.marks))
         differ = np.flatnonzero(self.marks[:common] != other.marks[:common])
         if len(differ):
@@ -273,7 +274,7 @@ class DecisionHistory:
 
 @dataclass(frozen=True)
 class Differing:
-    """The decisions in which two programs with neighboring numbers differ at one step, the nearest first."""
+    """Decisions that differ at one step between programs with adjacent values of a number, nearest first."""
 
     # the one whose margin is closest to 0 on both sides; a, b, margins and bounds are those of the two
     # programs

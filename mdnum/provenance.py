@@ -1,8 +1,8 @@
-"""What was run, with what, on what: enough to explain why two runs of one input differ.
+"""Record of the program and machine of a run, sufficient to explain why two runs of one input differ.
 
-Two runs of the same system file on the same structure can be expected to agree bit for bit when their
-fingerprints agree. The fingerprint covers what XLA's code generation and mdnum's arithmetic depend on:
-the versions, the processor's instruction set, the devices, XLA's flags, jax's settings and the dtypes.
+Two runs of the same system file on the same structure should agree bit for bit if their fingerprints agree.
+The fingerprint includes everything that XLA's code generation and mdnum's arithmetic depend on: the versions,
+the processor's instruction set, the devices, XLA's flags, jax's settings and the dtypes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _RECORDED: dict[str, list[str]] = beside(__file__)  # names of what is recorded
 
 
 class _System(Protocol):
-    """What is asked of a system: a structural type, because systems stand above this file."""
+    """Required attributes of a system: a structural type, because systems are in a higher layer."""
 
     @property
     def name(self) -> str: ...
@@ -37,10 +37,10 @@ class _System(Protocol):
 
 
 def collect(system: _System) -> dict[str, Any]:
-    """Everything outside the system file that a run depends on, and hashes of what is inside.
+    """Return everything outside the system file that a run depends on, and hashes of the content.
 
     Returns:
-        A mapping of plain values, ready for JSON.
+        a mapping of plain values, ready for JSON.
     """
     import jax
 
@@ -79,7 +79,7 @@ def collect(system: _System) -> dict[str, Any]:
 
 
 def surroundings() -> dict[str, Any]:
-    """When, where and with what something was computed that ran no system and needs no jax."""
+    """Return time, place and versions of a computation that ran no system and needs no jax."""
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": shlex.join(sys.argv),
@@ -93,7 +93,7 @@ def surroundings() -> dict[str, Any]:
 
 
 def fingerprint(parts: Mapping[str, Any]) -> str:
-    """A short name of the arithmetic: equal parts, equal fingerprint.
+    """Return a short hash of the arithmetic; equal parts give equal hashes.
 
     Args:
         parts: plain values; the order of keys does not matter.
@@ -103,12 +103,12 @@ def fingerprint(parts: Mapping[str, Any]) -> str:
 
 
 def package_versions() -> dict[str, str | None]:
-    """The versions of the packages that a result can depend on, None where one is not installed."""
+    """Return the versions of packages that a result can depend on, None for packages not installed."""
     return {package: version(package) for package in _RECORDED["packages"]}
 
 
 def version(package: str) -> str | None:
-    """The installed version of a package, None when it is not there."""
+    """Return the installed version of a package, None if it is not installed."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -116,18 +116,18 @@ def version(package: str) -> str | None:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
-    """The processor's name, its cores, and those of its instruction sets that change bits.
+    """Return the processor's name, its cores, and the instruction sets that affect bits.
 
     Args:
-        cpuinfo: Linux's description of the processor; elsewhere the platform's own words are used.
+        cpuinfo: Linux's description of the processor; on other systems Python's `platform` is used.
 
     Returns:
-        model, cores, flags; flags is None where they cannot be told.
+        model, cores, flags; flags is None if unknown.
     """
     fields: dict[str, str] = {}
     if cpuinfo.exists():
@@ -144,12 +144,12 @@ def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
 
 
 def hashes(system: _System) -> dict[str, str | None]:
-    """SHA-256 of the system file as written, of the program it means, and of the structure as it was read.
+    """Return SHA-256 of the system file as written, of the program that it defines, and of the structure.
 
-    The program is every number and choice but the structure, defaults and overrides included: change one and
-    its hash changes; another name does not change it. The structure is hashed as numbers (species, masses,
-    positions, velocities, cell, periodicity), so that a file in another format with the same atoms has the
-    same hash.
+    The program includes all numbers and choices except the structure, with defaults and overrides: any change
+    of a value changes its hash, a change of the system's name does not. The structure is hashed as numbers
+    (species, masses, positions, velocities, cell, periodicity), so that a file in another format with the
+    same atoms has the same hash.
 
     Returns:
         file (None for a system that did not come from a file), program, and structure (None without atoms).
@@ -176,12 +176,12 @@ def hashes(system: _System) -> dict[str, str | None]:
 
 
 def commit(package: Path) -> str | None:
-    """The git commit that a package runs from, with "+" when its files were changed since.
+    """Return the git commit that a package runs from, with "+" if its files were changed since.
 
-    None of the programs that a repository can name (monitors, hooks, filters, transports) is run.
+    No program that a repository can configure (monitors, hooks, filters, transports) is run.
 
     Returns:
-        None for an installed wheel, without git, or when the folder belongs to another repository.
+        None for an installed wheel, without git, or if the folder belongs to another repository.
     """
 
     settings = ["core.fsmonitor=false", f"core.hooksPath={os.devnull}", "protocol.allow=never"]

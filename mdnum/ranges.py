@@ -1,4 +1,4 @@
-"""The range of numbers, and what narrower formats make of them; without jax."""
+"""Ranges of numbers, and the effect of narrower formats on them; without jax."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ DTYPES = {name: np.dtype(name) for name in ("float16", "bfloat16", "float32", "f
 
 
 def smallest(name: str) -> float:
-    """The smallest positive number that arithmetic keeps in a format."""
+    """Return the smallest positive number that arithmetic in a format preserves."""
     limits = ml_dtypes.finfo(DTYPES[name])
     # XLA on a CPU flushes subnormals to zero in every format but float16, whose arithmetic it does in float32
     return float(limits.smallest_subnormal if name == "float16" else limits.smallest_normal)
 
 
 def columns(quantities: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Columns of a table from quantities by name, each of shape (rows, values).
+    """Return table columns for the named quantities, each of shape (rows, values).
 
-    `largest_NAME` is the largest magnitude of a row, `smallest_NAME` the smallest but 0 (NaN for none).
+    `largest_NAME` is the largest magnitude of a row, `smallest_NAME` the smallest nonzero one (NaN for none).
     """
     made = {}
     for name, values in quantities.items():
@@ -33,11 +33,11 @@ def columns(quantities: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def first_outside(most: Any, least: Any, name: str) -> dict[str, tuple[int, float]]:
-    """The first rows whose numbers a format cannot hold, from the largest and the smallest of each row.
+    """Find the first rows whose numbers a format cannot represent, from the extreme magnitudes of each row.
 
     Returns:
-        row and number: the first that would be infinite ("overflows"), have fewer digits ("subnormal") or be
-        0 ("lost"); those that there are.
+        row and number that would first be infinite ("overflows"), lose digits ("subnormal") or be 0 ("lost");
+        only those that exist.
     """
     with np.errstate(over="ignore", under="ignore"):
         high, low = (np.asarray(one).astype(DTYPES[name]).astype(np.float64) for one in (most, least))

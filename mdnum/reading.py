@@ -1,7 +1,7 @@
-"""The one way through which files reach the readers of other packages.
+"""Common access to files for the readers of other packages.
 
-ASE's and MDAnalysis's readers raise what their parsing meets: any exception of Python's, messages of many
-lines, or none. `reading` turns each into one line with the file and the frame.
+The readers of ASE and MDAnalysis raise whatever exception occurs in parsing: any Python exception, with
+messages of many lines, or none. `reading` converts each to one line with the file and the frame.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _PATIENCE = 10_000
 
 
 class FrameError(InputError):
-    """A frame holds what cannot be right; it has this number in its file, from 0."""
+    """Raised if a frame contains impossible data; `frame` is its number in the file, from 0."""
 
     def __init__(self, message: str, *, frame: int, remedy: str | None, where: str | None = None):
         super().__init__(message, remedy=remedy, where=where)
@@ -82,11 +82,11 @@ class FrameError(InputError):
 
 
 class EarlierFramesError(FrameError):
-    """This frame shows that none of those before it can be right: there is nothing to keep."""
+    """Raised if a frame shows that all earlier frames are wrong, so that nothing can be kept."""
 
 
 class UnreadableFrame(FrameError):
-    """A frame in the middle of a file cannot be read; those before it were given out."""
+    """Raised if a frame in the middle of a file cannot be read; earlier frames were read."""
 
     def __init__(self, message: str, *, frame: int, where: str, remedy: str | None = None):
         before = f"The frames before it were read; to stop there add @:{frame} to the path"
@@ -97,18 +97,18 @@ class UnreadableFrame(FrameError):
 def reading(
     file: str | Path, frame: int | None = None, *, by: str = "MDAnalysis", remedy: str = CHECK
 ) -> Iterator[None]:
-    """Everything that a reader raises inside becomes one line; its warnings are dropped.
+    """Context manager that converts a reader's exceptions to one line, and suppresses its warnings.
 
     Args:
-        file: that is read.
-        frame: number in the file of the frame that is read; None while the file is opened.
-        by: the package whose reader it is.
-        remedy: what to do where the file cannot be opened.
+        file: the file that is read.
+        frame: number of the current frame in the file; None while the file is opened.
+        by: the package that provides the reader.
+        remedy: what to do if the file cannot be opened.
 
     Raises:
         UnreadableFrame: the frame cannot be read.
         InputError: the file cannot be opened, or needs a package that is not installed. mdnum's own errors
-            pass as they are.
+            are not changed.
     """
     hook = sys.unraisablehook
     # readers that could not open complain once more when they are thrown away
@@ -144,14 +144,14 @@ def reading(
 
 
 def check_claim(path: str | Path, atoms: int | None = None) -> None:
-    """Rejects a number of atoms that a file cannot hold, for which readers would allocate memory, or count.
+    """Reject an impossible number of atoms in a file, for which readers would allocate memory or loop.
 
     Args:
         path: the file.
-        atoms: what its head announces; None to look for that in formats whose readers believe it.
+        atoms: number of atoms in the file's header; None to search for it in formats whose readers trust it.
 
     Raises:
-        InputError: there would be a thousand atoms and more to a byte, which compression does not reach.
+        InputError: there would be at least a thousand atoms per byte, which no compression achieves.
     """
     size, found = Path(path).stat().st_size, None
     suffix = next((one for one in reversed(Path(path).suffixes) if one not in (".gz", ".bz2")), "").lower()
@@ -168,10 +168,10 @@ def check_claim(path: str | Path, atoms: int | None = None) -> None:
 
 
 def whole_text(file: str | Path | BinaryIO, where: str | Path) -> str:
-    """The text of a file that is held in memory whole, UTF-8.
+    """Return the text of a UTF-8 file that is read into memory as a whole.
 
     Raises:
-        InputError: it is too large for that. OSError, UnicodeDecodeError: as `open` and `read`.
+        InputError: the file is too large. OSError, UnicodeDecodeError: as from `open` and `read`.
     """
     if isinstance(file, str | Path):
         with open(file, "rb") as opened:
@@ -184,7 +184,7 @@ def whole_text(file: str | Path | BinaryIO, where: str | Path) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """The message of an error in a line."""
+    """Return the message of an error in one line."""
     cause: BaseException | None = error
     while cause is not None and not str(cause).strip():
         cause = cause.__context__
@@ -206,7 +206,7 @@ def first_line(error: BaseException) -> str:
 
 
 class _Lines(io.TextIOWrapper):
-    """A text file that stops a reader that keeps reading at its end because it trusts a count in the head."""
+    """A text file that stops a reader that, trusting a count in the header, reads beyond the end."""
 
     _at_end = 0
 
@@ -223,12 +223,13 @@ class _Lines(io.TextIOWrapper):
 def ase_images(
     path: str | Path, index: int | slice | str = slice(None), format: str | None = None
 ) -> Iterator[Atoms]:
-    """Structures that ASE reads from a file; to be used inside of `reading`.
+    """Yield structures that ASE reads from a file; to be used inside `reading`.
 
     Args:
-        path: taken as it is: a name that begins like a database's address, or has an @ in it, is a file's.
-        index: which of them, as a number, a slice or in ASE's words, which may be a choice in a database.
-        format: in ASE's word; None to find it.
+        path: always the path of a file, even if it contains an @ or begins like the address of a database.
+        index: selected structures, as a number, a slice or an ASE index string, or as a selection in a
+            database.
+        format: ASE's name of the format; None for automatic detection.
     """
     # its readers take half a second to import
     from ase.io.formats import filetype, get_ioformat, iread, open_with_compression, read
@@ -253,10 +254,10 @@ def ase_images(
 
 
 def with_elements(atoms: Any) -> Atoms:
-    """The atoms, each of which is of an element or of none (0).
+    """Return the atoms if each is of a known element or of none (0).
 
     Raises:
-        ValueError: one has another atomic number, which ASE gives no symbol or, below 0, a wrong one.
+        ValueError: an atom has another atomic number, for which ASE has no symbol or, below 0, a wrong one.
     """
     from ase.data import chemical_symbols
 
@@ -269,9 +270,9 @@ def with_elements(atoms: Any) -> Atoms:
 
 
 def ignored_velocities(arrays: Mapping[str, np.ndarray]) -> list[str]:
-    """Names of columns that look like velocities or momenta, which no reader takes for some.
+    """Return the names of columns that appear to be velocities or momenta, but that no reader uses as such.
 
-    Extended XYZ names momenta alone, in ASE's units: what others are in, a file does not say.
+    Extended XYZ defines only momenta, in ASE's units; a file does not state the units of other columns.
     """
     shapes = {name: array.shape[1:] for name, array in arrays.items() if _VELOCITY.fullmatch(name)}
     return sorted(name for name, shape in shapes.items() if shape in ((3,), ()) and name != "momenta")

@@ -1,12 +1,12 @@
-"""Things with names that people write: cutoffs, choices, methods, checks; and those that other packages add.
+"""Registries of named objects: cutoffs, choices, methods and checks, of mdnum and of other packages.
 
 A registry maps a name to a *value*: an object that is used as it is, or a class or function that makes one.
-A package outside mdnum adds its own by an entry point of the registry's group, such as
+Another package adds a value by an entry point of the registry's group, such as
 
     [project.entry-points."mdnum.cutoffs"]
     "smooth-cubic" = "my_package.cutoffs:SmoothCubic"
 
-Nothing of it is imported before its name is used or described.
+The package is imported only when the name is used or described.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _LONGEST_WORD = 100
 
 
 def meant(word: str, known: Iterable[str]) -> str:
-    """ "Did you mean ...? " with the known word most like this one; empty where none is."""
+    """Return "Did you mean ...? " with the most similar known word; empty if no word is similar."""
     folded = {option.lower(): option for option in known if len(word) <= _LONGEST_WORD}
     close = difflib.get_close_matches(word.lower(), folded, n=1)
     return f"Did you mean {folded[close[0]]}? " if close else ""
 
 
 def unknown(noun: str, word: str, known: Iterable[str], *, where: str | None = None) -> InputError:
-    """The error for a name that does not exist: what it may have meant, and what there is."""
+    """Return the error for an unknown name, with the most similar name and the list of known names."""
     known = list(known)
     remedy = f"{meant(word, known)}Known are {', '.join(known)}"
     return InputError(f"unknown {noun} {word!r}", remedy=remedy, where=where)
@@ -50,7 +50,7 @@ def _plugins(group: str, path: tuple[str, ...]) -> tuple[metadata.EntryPoint, ..
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Values by name, in the order in which they were added, then those of other packages."""
+    """Values by name, in the order in which they were added, followed by those of other packages."""
 
     noun: str  # what one of them is called, for messages
     group: str  # entry points by which other packages add theirs
@@ -63,10 +63,10 @@ class Registry(Generic[T]):
     _descriptions: dict[str, str] = field(default_factory=dict, repr=False)
 
     def add(self, name: str, value: Any = None, *, description: str | None = None) -> Any:
-        """Add a value of mdnum's own, or decorate the class or function that is one.
+        """Add one of mdnum's own values, or decorate a class or function to add it.
 
         Args:
-            name: what people write.
+            name: name that users write.
             value: the value, or "module:attribute", or a "module", to import on first use.
             description: one line; by default the value's `description` or the first line of its docstring.
         """
@@ -81,7 +81,7 @@ class Registry(Generic[T]):
 
     @property
     def shipped(self) -> tuple[str, ...]:
-        """Names of mdnum's own."""
+        """Names of mdnum's own values."""
         return tuple(self._own)
 
     def _added(self) -> dict[str, metadata.EntryPoint]:
@@ -107,10 +107,10 @@ class Registry(Generic[T]):
         return name in self._own or name in self._added()
 
     def place(self, name: str) -> str:
-        """The module of this name, of a registry of modules; nothing of it is imported.
+        """Return the module registered under a name, in a registry of modules, without importing it.
 
         Raises:
-            InputError: there is none.
+            InputError: there is no such name.
         """
         if name in self._own:
             return self._own[name]
@@ -119,10 +119,11 @@ class Registry(Generic[T]):
         return self._added()[name].value
 
     def __getitem__(self, name: str) -> Any:
-        """The value of this name.
+        """Return the value registered under a name.
 
         Raises:
-            InputError: there is none, or the package that adds it is broken; names what there is.
+            InputError: there is no such name, or the package that adds it is broken; the message lists the
+                known names.
         """
         if name in self._own:
             value = self._own[name]
@@ -154,13 +155,13 @@ class Registry(Generic[T]):
         return loaded
 
     def parse(self, text: str) -> T:
-        """What `text` names: a name alone, or "name=argument".
+        """Return the value that `text` refers to: a name, or "name=argument".
 
-        A class or function is called, with the argument's text where one is given (its `parse`, if it has
-        one). Anything else is returned as it is, and takes no argument.
+        A class or function is called, with the text of the argument if there is one (its `parse` method, if
+        it has one). Any other value is returned as it is, and takes no argument.
 
         Raises:
-            InputError: no such name, an argument for a name that takes none, or none for one that needs it.
+            InputError: no such name, an unexpected argument, or a missing one.
         """
         name, separator, argument = text.strip().partition(self.separator)
         value: Any = self[name]
@@ -177,7 +178,7 @@ class Registry(Generic[T]):
         return maker(*arguments)
 
     def description(self, name: str) -> str:
-        """One line on what the value of this name is."""
+        """Return a one-line description of the value registered under a name."""
         if name in self._descriptions:
             return self._descriptions[name]
         value = self[name]
@@ -187,7 +188,7 @@ class Registry(Generic[T]):
         return (inspect.getdoc(value) or "").partition("\n")[0].rstrip(".")
 
     def package(self, name: str) -> str:
-        """The package that the value of this name comes from."""
+        """Return the package that provides the value of this name."""
         return "mdnum" if name in self._own else _package(self._added()[name])
 
 

@@ -1,8 +1,8 @@
-"""Whose Python runs: that of the environment, never what lies in the folder in which one happens to stand.
+"""Protection against running Python code from the current folder instead of the environment's packages.
 
-Python puts the current folder first on its path for `-m` and `-c`: a `jax.py` or `numpy.py` in a stranger's
-folder would be run instead of the package. Every process that mdnum starts therefore begins with `-P`, which
-the processes of Python's multiprocessing inherit from it.
+For `-m` and `-c`, Python puts the current folder first on its path: a `jax.py` or `numpy.py` in an untrusted
+folder would be run instead of the package. Therefore every process that mdnum starts has the option `-P`,
+which processes of Python's multiprocessing inherit.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from types import ModuleType
 
 
 def python(*words: str) -> list[str]:
-    """The command of a Python process that imports nothing from the current folder.
+    """Return the command of a Python process that imports nothing from the current folder.
 
     Args:
-        words: what follows the interpreter: "-m", a module, and its arguments, or "-c" and a program.
+        words: arguments of the interpreter: "-m", a module, and its arguments, or "-c" and a program.
     """
     return [sys.executable, "-P", *words]
 
 
 def environment(**changes: str) -> dict[str, str]:
-    """The environment of a child, in which it finds mdnum where this process found it."""
+    """Return the environment of a child process, in which mdnum is found where this process found it."""
     home = Path(__file__).resolve().parents[1]
     if home.name in ("site-packages", "dist-packages"):
         return {**os.environ, **changes}
@@ -39,12 +39,13 @@ def environment(**changes: str) -> dict[str, str]:
 
 
 def guard(parent: int) -> None:
-    """Ends this process with the one that started it, however that ends; it may use half of the memory.
+    """End this process when its parent ends, for whatever reason, and limit it to half of the memory.
 
-    Where a foreign function loops and the system is not Linux, it ends when that function returns.
+    If a foreign function is in a loop and the system is not Linux, the process ends when that function
+    returns.
 
     Args:
-        parent: process number of the one that started it.
+        parent: process number of the parent.
     """
 
     def watch() -> None:
@@ -66,10 +67,10 @@ def guard(parent: int) -> None:
 
 
 def executed(file: Path, name: str) -> ModuleType:
-    """What a Python file holds once it was run, as a module that has this name unless another has it.
+    """Run a Python file and return it as a module with this name, unless another module has the name.
 
     Raises:
-        BaseException: whatever the file raises.
+        BaseException: any exception that the file raises.
     """
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None and spec.loader is not None  # of every file that ends in .py
@@ -85,11 +86,11 @@ def executed(file: Path, name: str) -> ModuleType:
 
 
 def search_last(folder: str | Path, module: str | None = None) -> None:
-    """Lets imports find what lies in a folder, as the last place: nothing there can hide a package.
+    """Append a folder to the import path as the last entry, so that nothing in it can hide a package.
 
     Args:
-        folder: of the Python that a person asked to be run.
-        module: what is wanted from there; where the environment has its package, nothing changes.
+        folder: folder of the Python code that the user asked to run.
+        module: module to be imported from the folder; if its package is installed, nothing changes.
     """
     place = str(Path(folder).resolve())
     if place not in sys.path and (module is None or not _is_installed(module.partition(".")[0])):

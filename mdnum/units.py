@@ -1,4 +1,4 @@
-"""Unit systems: what a person reads and writes, against the ASE-consistent numbers used inside."""
+"""Unit systems: conversion between the units of user input and the ASE-consistent internal units."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BOLTZMANN_EV_PER_K = 8.617330337217213e-05
 class Units:
     """Labels and factors of a unit system.
 
-    Inside mdnum lengths, energies and masses are those of the system file and time is
+    Internally, lengths, energies and masses are in the units of the system file and time is in units of
     length * sqrt(mass / energy), so that acceleration is force / mass without a factor.
 
     Attributes:
@@ -57,9 +57,9 @@ FORCE = f"{ENERGY}/{LENGTH}"
 
 
 def named(quantity: str, units: Mapping[str, Any]) -> str:
-    """A unit made of quantities in the names of a unit system; empty where it lacks one of them.
+    """Replace quantities in a unit by the names of a unit system; empty if one of them is missing.
 
-    A unit that is written out ("kcal/mol") is as it is.
+    An explicit unit ("kcal/mol") is unchanged.
 
     >>> named("energy/length", {"energy": "eV", "length": "Å"})
     'eV/Å'
@@ -70,7 +70,7 @@ def named(quantity: str, units: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Measured:
-    """A number with its unit, and what it is worth."""
+    """A number with its unit, its noise floor and a scale."""
 
     value: float
     unit: str = ""  # of names ("eV/Å") or, until it is written, of quantities ("energy/length")
@@ -79,18 +79,18 @@ class Measured:
 
     @property
     def found(self) -> bool:
-        """Whether it is more than noise or rounding explains; nan is."""
+        """True if the number is larger than noise or rounding can explain, or is nan."""
         return self.floor is None or not abs(self.value) <= self.floor
 
     @property
     def digits(self) -> str:
-        """The number, with as many digits as its floor leaves; all of them where it has none."""
+        """The number as text, with the digits that its floor justifies; all digits if there is no floor."""
         if self.floor is None or self.floor < 1e-12:
             return repr(float(self.value))
         return f"{self.value:.{min(max(math.ceil(-math.log10(self.floor)), 1), 15)}f}"
 
     def to(self, prefix: str, units: Mapping[str, Any] = MappingProxyType({})) -> Measured:
-        """The same in a unit with a prefix ("m": meV), and with quantities as the names of a unit system."""
+        """Convert to a unit with a prefix ("m": meV), with quantities replaced by names of a unit system."""
         unit = named(self.unit, units) or self.unit
         size = {"": 1.0, "m": 1e3}[prefix]
         scaled = {name: size * part for name, part in vars(self).items() if isinstance(part, float)}
@@ -98,7 +98,7 @@ class Measured:
 
 
 def revived(value: Any) -> Any:
-    """A `Measured` that was written as JSON; any other value as it is."""
+    """Restore a `Measured` that was written as JSON; return any other value unchanged."""
     names = {each.name for each in fields(Measured)}
     return Measured(**value) if isinstance(value, dict) and value.keys() == names else value
 
@@ -107,7 +107,7 @@ _ALL = {units.name: units for units in (METAL, LJ, BALL)}
 
 
 def get(name: str) -> Units:
-    """The unit system called name ("metal", "lj" or "ball").
+    """Return the unit system with this name ("metal", "lj" or "ball").
 
     Raises:
         InputError: no such unit system.

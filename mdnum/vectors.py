@@ -1,7 +1,7 @@
-"""Instructions on vectors and on bits of words that numba makes none of by itself, written out as LLVM's.
+"""LLVM instructions on vectors and on bits of words that numba does not generate itself.
 
-numba keeps a compiled function by the file that the function is in. After a change here remove what was kept
-before (`__pycache__`), or callers go on with the instructions that they were compiled with.
+numba caches a compiled function by the file that contains it. After a change here, delete the caches of
+callers (`__pycache__`), which otherwise keep the old instructions.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ intrinsic: Any = numba.extending.intrinsic
 
 @intrinsic
 def lowest_bit(typingctx: Any, word: Any) -> Any:
-    """Number of the lowest of 64 bits that is set, unsigned; there is one."""
+    """Return the position of the lowest set bit of 64, unsigned; at least one bit must be set."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -37,12 +37,12 @@ def lowest_bit(typingctx: Any, word: Any) -> Any:
 
 @intrinsic
 def bits_set(typingctx: Any, word: Any) -> Any:
-    """How many of 64 bits are set, unsigned."""
+    """Count the set bits of 64, unsigned."""
     return types.uint64(types.uint64), lambda context, builder, signature, args: builder.ctpop(args[0])
 
 
 class _Vectors:
-    """Writes instructions on vectors of one width, of numbers of one of numba's types."""
+    """Generator of instructions on vectors of fixed width, for one of numba's number types."""
 
     def __init__(self, context: Any, builder: Any, number: Any, width: int):
         self.context, self.builder, self.width = context, builder, width
@@ -50,40 +50,40 @@ class _Vectors:
         self.kind, self.size = ir.VectorType(self.number, width), context.get_abi_sizeof(self.number)
 
     def of(self, kind: Any, array: Any, place: Any) -> Any:
-        """The address of a number of an array."""
+        """Return the address of an element of an array."""
         return self.builder.gep(
             self.context.make_array(kind)(self.context, self.builder, array).data, [place]
         )
 
     def at(self, address: Any, place: int) -> Any:
-        """The address of a number, counted from an address that is an integer."""
+        """Return the address of a number at an offset from an address that is an integer."""
         moved = self.builder.add(address, ir.Constant(self.whole, self.size * place))
         return self.builder.inttoptr(moved, self.number.as_pointer())
 
     def load(self, address: Any) -> Any:
-        """The numbers from an address on."""
+        """Load the vector that begins at an address."""
         return self.builder.load(self.builder.bitcast(address, self.kind.as_pointer()), align=self.size)
 
     def store(self, value: Any, address: Any) -> None:
-        """Write a vector from an address on."""
+        """Store a vector at an address."""
         self.builder.store(value, self.builder.bitcast(address, self.kind.as_pointer()), align=self.size)
 
     def spread(self, value: Any) -> Any:
-        """One number in all places."""
+        """Copy one number to all elements of a vector."""
         one = self.builder.insert_element(ir.Constant(self.kind, ir.Undefined), value, ir.IntType(32)(0))
         first = ir.Constant(ir.VectorType(ir.IntType(32), self.width), None)
         return self.builder.shuffle_vector(one, one, first)
 
     def one(self, address: Any) -> Any:
-        """The number at an address in all places."""
+        """Copy the number at an address to all elements of a vector."""
         return self.spread(self.builder.load(address, align=self.size))
 
     def larger(self, a: Any, b: Any) -> Any:
-        """The larger of each two; b where one is not a number."""
+        """Return the elementwise maximum; b where either is not a number."""
         return self.builder.select(self.builder.fcmp_ordered(">", a, b), a, b)
 
     def squares(self, parts: list[Any]) -> Any:
-        """Sum of the squares."""
+        """Return the sum of squares."""
         name = f"llvm.fmuladd.v{self.width}f32"
         fused = self.builder.module.declare_intrinsic(name, (), ir.FunctionType(self.kind, [self.kind] * 3))
         total = self.builder.fmul(parts[0], parts[0])
@@ -92,7 +92,7 @@ class _Vectors:
         return total
 
     def bits(self, decisions: Any) -> Any:
-        """A bit for each decision, as a number."""
+        """Pack decisions into the bits of a number."""
         return self.builder.zext(self.builder.bitcast(decisions, ir.IntType(self.width)), self.whole)
 
 
@@ -101,7 +101,7 @@ class _Vectors:
 
 @intrinsic
 def moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any) -> Any:
-    """Copy eight numbers, and add one to each."""
+    """Copy eight numbers, and add a shift to each."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         to = _Vectors(context, builder, source.dtype, EIGHT)
@@ -115,7 +115,7 @@ def moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any
 
 @intrinsic
 def kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: Any, at: Any) -> Any:
-    """Of eight labels write those that a mask keeps; the place behind them."""
+    """Write those of eight labels that a mask selects; return the position after the last one."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits, to = (_Vectors(context, builder, one.dtype, EIGHT) for one in (mask, labels))
@@ -141,10 +141,10 @@ def kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: An
 
 @intrinsic
 def turned(typingctx: Any, rows: Any, place: Any, apart: Any, out: Any, at: Any, across: Any) -> Any:
-    """Write eight numbers each of eight rows as columns.
+    """Transpose eight rows of eight numbers.
 
     Args:
-        place, apart: of the first row, and from one to the next. at, across: of the first column, likewise.
+        place, apart: position of the first row, and distance between rows. at, across: the same for columns.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -172,7 +172,7 @@ def turned(typingctx: Any, rows: Any, place: Any, apart: Any, out: Any, at: Any,
 
 @intrinsic
 def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: Any) -> Any:
-    """Bits of the atoms of a cluster, less a shift, whose squared distance to a box is within reach.
+    """Return bits for the atoms of a shifted cluster whose squared distance to a box is within reach.
 
     The shifted coordinates are stored.
     """
@@ -193,7 +193,7 @@ def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: 
 
 @intrinsic
 def near_atom(typingctx: Any, atom: Any, atoms: Any, low: Any, high: Any) -> Any:
-    """Bits of the atoms of a cluster within two squared distances of an atom: those of the second above."""
+    """Return bits for the atoms of a cluster within two squared distances of an atom, the second above."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         atom, atoms, low, high = args

@@ -1,3 +1,3 @@
-"""The version of this package, for those below who write it into files."""
+"""Version of this package, for modules in lower layers that write it to files."""
 
 __version__ = "0.1.0"

@@ -1,9 +1,9 @@
-"""Sensitivity studies: which choices move which results, by how many errors, and which setting is enough.
+"""Sensitivity studies: which choices affect which results, how significantly, and which setting suffices.
 
 design      choices and their values, and the points that they make
-points      a folder for each point, named by what was asked: none lost, none computed twice
-engines     who computes points: processes here, or any executor
-measures    what is read from a point, with its statistical error
-statistics  means over seeds, differences in units of their error, and what could have been seen
-advice      the cheapest setting within a tolerance of the converged one
+points      storage of points, in one folder each, so that none is lost or computed twice
+engines     execution of points, by local processes or any executor
+measures    quantities that are derived from a point, with statistical errors
+statistics  means over seeds, differences in units of their error, and detection limits
+advice      the cheapest setting that agrees with the converged one within a tolerance
 """

@@ -1,4 +1,4 @@
-"""The cheapest setting whose results are those of the converged one, within a tolerance."""
+"""Search for the cheapest setting whose results agree with those of the converged one within a tolerance."""
 
 from __future__ import annotations
 
@@ -33,28 +33,28 @@ class Setting:
 
     @property
     def inside(self) -> bool | None:
-        """Whether all measures are within their tolerances; None: not decided."""
+        """True if all measures are within their tolerances; None if undecided."""
         each = [one.inside for one in self.by_measure.values()]
         return False if False in each else None if None in each else True
 
     @property
     def more(self) -> float:
-        """Times as many seeds that would decide it."""
+        """Factor by which the number of seeds must grow to decide."""
         return max((one.more for one in self.by_measure.values()), default=1.0)
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What to use along one axis.
+    """Recommended value of one axis.
 
     Attributes:
-        key: of the axis. end: the value that counts as converged; None where there is none.
-        settings: every value with its comparison, from the converged end on.
-        best: the cheapest that is within the tolerance with all that are nearer to the end; None where
-            nothing but the end is, or where that is not decided.
-        undecided: the first value that is not decided, beyond best.
-        converged: whether the value next to the end is within the tolerance of it: if not, the end itself may
-            be too near.
+        key: key of the axis. end: the value that counts as converged; None if there is none.
+        settings: every value with its comparison, starting at the converged end.
+        best: the cheapest value that, like all values nearer to the end, is within the tolerance; None if
+            there is only the end itself, or if undecided.
+        undecided: the first undecided value beyond best.
+        converged: whether the value next to the end agrees with it within the tolerance: if not, the end
+            itself may not be converged.
     """
 
     key: str
@@ -66,7 +66,7 @@ class Advice:
 
 
 def end_of(key: str, values: Sequence[Any], given: Mapping[str, str] = {}) -> Any:
-    """The value of an axis that counts as converged; None where none does."""
+    """Return the value of an axis that counts as converged; None if there is none."""
     word = given.get(key, _ENDS.get(key) or _ENDS.get(key.rpartition(".")[2], ""))
     if word == "largest":
         return max(values, key=_size)
@@ -86,11 +86,11 @@ def advise(
     tolerances: Mapping[str, float],
     given: Mapping[str, str] = {},
 ) -> Advice | None:
-    """What to use along an axis; None where no end of it is converged, or no measure has a tolerance.
+    """Return the recommended value of an axis; None if no end is converged, or no measure has a tolerance.
 
     Args:
-        values: of the axis. found: estimates by measure and by label of a value.
-        tolerances: by measure, in its unit.
+        values: values of the axis. found: estimates by measure and by label of a value.
+        tolerances: tolerances by measure, in its unit.
         given: ends by key, in place of the usual ones: "largest", "smallest" or a value.
     """
     end = end_of(key, values, given)

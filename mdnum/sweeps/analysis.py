@@ -1,4 +1,4 @@
-"""The answer of a sweep, from its points on disk: means, differences, failures and what to use."""
+"""Results of a sweep, from its points on disk: means, differences, failures and recommended values."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MOVES = {True: "yes", False: "no", None: "undecided"}
 
 @dataclass
 class _Results:
-    """What points have left, by what it is compared by."""
+    """Results of points, grouped as needed for comparisons."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)  # of the table of points
     # (value, error, independent samples) of each run, by measure and setting
@@ -32,7 +32,7 @@ class _Results:
 
 
 def analyzed(place: Workspace, plan: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Tables and summary of a sweep whose points were computed."""
+    """Return tables and summary of a sweep whose points have been computed."""
     results = _read(place, plan)
     means = {
         (name, setting): mean
@@ -126,7 +126,7 @@ def _finite(row: Mapping[str, Any]) -> dict[str, Any]:
 def _pairs(
     plan: Plan, means: Mapping[tuple[str, Setting], SeedMean]
 ) -> dict[tuple[str, ...], tuple[SeedMean, SeedMean]]:
-    """Means of each value of each axis, with those at the system's own."""
+    """Pair the means at each value of each axis with those at the system's own values."""
     return {
         (name, axis.key, label(value)): (means[name, setting], means[name, plan.origin])
         for name in plan.names
@@ -137,7 +137,7 @@ def _pairs(
 
 
 def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
-    """What each measure changes from end to end of each axis of a design that fills the space between."""
+    """Change of each measure from end to end of each axis, for a space-filling design."""
     choices, ends = {one.setting: one.point.choices for one in plan.points}, {}
 
     def share(axis: Axis, value: Any) -> float:
@@ -159,7 +159,7 @@ def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
 
 
 def _tolerances(plan: Plan, means: Mapping[tuple[str, Setting], SeedMean]) -> dict[str, float]:
-    """By measure in its unit."""
+    """Return tolerances by measure, in the measure's unit."""
     given = plan.question.tolerance
     if given is None:
         return {}
@@ -183,7 +183,7 @@ def _advice(
     compared: Mapping[tuple[str, ...], Difference],
     results: _Results,
 ) -> list[dict[str, Any]]:
-    """What to use along each axis, in plain values; of what changes no result the fastest."""
+    """Return the recommended value of each axis as plain values; the fastest if an axis affects nothing."""
     physical = {measure.name for measure in plan.measures if measure.physical}
     moving = {(key, value) for (name, key, value), one in compared.items() if one.moves and name in physical}
     rows = []
@@ -213,7 +213,7 @@ def _advice(
 
 
 def _fastest(plan: Plan, axis: Axis, moving: set[tuple[str, str]], results: _Results) -> dict[str, Any]:
-    """The fastest value of a choice that changes no result, among those that lost no pair."""
+    """Return the fastest value of a choice that affects no result, among those that lost no pair."""
     rows = []
     for value, setting in plan.along(axis):
         speeds, lost = np.array(results.speeds.get(setting, [(np.nan, 0)])).T

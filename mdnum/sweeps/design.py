@@ -1,7 +1,7 @@
-"""What is varied: choices with their values, and the points that are run.
+"""Design of a sweep: choices with their values, and the points that are run.
 
 A choice is a key of the system file, or a word for several keys that belong together (`precision`). Values
-are those that a system file would have.
+are written as in a system file.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ class Axis:
 
     @property
     def ordered(self) -> bool:
-        """Whether its values are numbers."""
+        """True if the values are numbers."""
         return all(isinstance(one, int | float) and not isinstance(one, bool) for one in self.values)
 
     def settings(self, value: Any, world: str = "md") -> dict[str, Any]:
-        """The keys of a system file, of molecular dynamics or of a ball, that a value stands for."""
+        """Return the keys of a system file, of molecular dynamics or of a ball, that a value sets."""
         if self.key == "precision" and isinstance(value, str):
             return {f"precision.{role}": value for role in _ROLES[world]}
         return {self.key: value}
@@ -57,10 +57,10 @@ class Point:
 
 
 def parse(text: str) -> Axis:
-    """The axis of KEY=LOW:HIGH:STEP, KEY=VALUE,VALUE,… or the word precision.
+    """Return the axis given as KEY=LOW:HIGH:STEP, KEY=VALUE,VALUE,… or the word precision.
 
     Raises:
-        InputError: not of that form, or values that repeat.
+        InputError: the text has another form, or repeated values.
     """
     key, equals, rest = (part.strip() for part in text.partition("="))
     if key == "precision" and not equals:
@@ -77,10 +77,10 @@ def parse(text: str) -> Axis:
 
 
 def checked(axis: Axis) -> Axis:
-    """The axis.
+    """Return the axis, if its values are valid.
 
     Raises:
-        InputError: no values, one that is not finite, or some that repeat.
+        InputError: there are no values, a value is not finite, or values are repeated.
     """
     seen = [json.dumps(one) for one in axis.values]
     if not seen or "" in axis.values:
@@ -111,7 +111,7 @@ def _range(text: str, low: Any, high: Any, step: Any) -> tuple[Any, ...]:
 
 
 def with_base(axis: Axis, base: Any) -> Axis:
-    """The axis with the base among its values, in order where they are numbers."""
+    """Return the axis with the base value added, in ascending order if the values are numbers."""
     same = [one for one in axis.values if one == base and type(one) is not bool]
     values = axis.values if same else (base, *axis.values)
     made = Axis(axis.key, values)
@@ -125,11 +125,11 @@ def points(
     design: Design = "one-at-a-time",
     samples: int = 0,
 ) -> list[Point]:
-    """All points, seed after seed, so that a sweep that is stopped early has seen every setting.
+    """Return all points, seed by seed, so that a sweep that is stopped early includes every setting.
 
     Args:
-        base: the value of each axis around which one at a time is varied.
-        samples: points of a space-filling design, a power of two.
+        base: the value of each axis that is kept while another axis is varied.
+        samples: number of points of a space-filling design, a power of two.
 
     Raises:
         InputError: too many points, or a space-filling design over values without an order.
@@ -156,7 +156,7 @@ def points(
 
 
 def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
-    """A scrambled Sobol sequence between the ends of each axis; of words, each in turn."""
+    """Return a scrambled Sobol sequence between the ends of each axis; values that are words take turns."""
     from scipy.stats import qmc
 
     if samples < 2 or samples & (samples - 1):
@@ -178,5 +178,5 @@ def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
 
 
 def label(value: Any) -> str:
-    """A value as a table has it."""
+    """Format a value for tables."""
     return f"{value:.6g}" if isinstance(value, float) else str(value)

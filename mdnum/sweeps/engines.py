@@ -1,7 +1,7 @@
-"""Who computes: any `concurrent.futures.Executor`; here processes that are started anew, one for each core.
+"""Execution of a sweep's tasks by any `concurrent.futures.Executor`; by default new processes on all cores.
 
-An engine is only a way to start processes. What it says of a task is not believed: whether a point was
-computed is asked of its folder, so that a worker that dies takes nothing with it but its own point.
+An engine only starts processes. Its report on a task is not trusted: whether a point was computed is
+determined from the point's folder, so that a worker that dies loses only its own point.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ _AHEAD = 3
 
 @cache
 def _pinned(width: int) -> None:
-    """Gives this process cores of its own: XLA takes all that it sees, and heeds no OMP_NUM_THREADS.
+    """Restrict this process to reserved cores, because XLA uses all visible ones despite OMP_NUM_THREADS.
+    OMP_NUM_THREADS.
 
-    A core is taken by a lock that ends with its process, so that sweeps of one machine share the cores; where
-    none is left, one is used twice.
+    A core is reserved by a lock that ends with the process, so that sweeps on one machine share the cores; if
+    no core is free, one is used twice.
     """
     with suppress(ImportError, AttributeError, OSError):
         import fcntl
@@ -60,7 +61,7 @@ def _pinned(width: int) -> None:
 def _answered(
     work: Callable[[Any], Any], task: Any, caller: tuple[str, int], width: int
 ) -> tuple[Any, Exception | None]:
-    """The answer to a task, or the exception it ended with: what a future raises is then its engine's."""
+    """Return a task's result, or its exception; an exception of the future is then the engine's."""
     if (socket.gethostname(), os.getpid()) != caller:
         _pinned(width)
     try:
@@ -73,7 +74,7 @@ def _answered(
 
 
 class _Engine:
-    """Where tasks are sent: an executor, made again after it has broken unless it is the caller's."""
+    """Executor of tasks, recreated after it has broken unless it belongs to the caller."""
 
     def __init__(
         self, make: Callable[[], Executor], width: int, threads: int,
@@ -85,7 +86,7 @@ class _Engine:
         self.executor = make()
 
     def again(self) -> None:
-        """Makes a new executor where it can; every task of the old one is then forgotten."""
+        """Make a new executor if possible; all tasks of the old one are then forgotten."""
         self.close()
         with suppress(Exception):
             self.executor = self.make()
@@ -97,7 +98,7 @@ class _Engine:
 
 
 def _local(workers: int | None) -> _Engine:
-    """Processes of this machine, which import no main program: scripts need no guard, notebooks nothing."""
+    """Start processes on this machine that do not import the main program, so that scripts need no guard."""
     from loky import get_reusable_executor  # noqa: F401 (its pool starts processes by fork and exec)
     from loky.backend.context import get_context
     from loky.process_executor import ProcessPoolExecutor
@@ -136,7 +137,7 @@ def _dask(address: str, workers: int | None) -> _Engine:
 
 @contextmanager
 def opened(on: str | Executor | None, workers: int | None) -> Iterator[_Engine]:
-    """An engine: None, tcp://host:port of a dask scheduler, or an executor of one's own.
+    """Context manager of an engine: None, tcp://host:port of a dask scheduler, or the user's executor.
 
     Raises:
         InputError: no such engine, or its package is missing.
@@ -164,18 +165,19 @@ def computed(
     workers: int | None = None,
     lost: Callable[[Any, str], bool] = lambda task, why: True,
 ) -> Iterator[tuple[Any, Any]]:
-    """Tasks with what came of each, as they end.
+    """Yield tasks with their results, as they finish.
 
     Args:
-        work: of a task, in another process.
-        lost: called with a task whose process ended without an answer, and why: whether it was at work on it.
-            A task that was three times, the last time alone, is given up; one that was not is begun again.
+        work: function that processes a task, in another process.
+        lost: called with a task whose process ended without a result, and the reason; returns whether the
+            process was working on the task. A task that fails three times in this way, the last time alone,
+            is abandoned; other tasks are restarted.
 
     Yields:
-        (task, answer), the answer an exception where there is none.
+        (task, result), where the result is an exception if there is none.
 
     Raises:
-        InputError: no such engine, or one that fails again and again.
+        InputError: no such engine, or an engine that fails repeatedly.
     """
     waiting, alone, tries, idle = deque(range(len(tasks))), deque[int](), [0] * len(tasks), 0
     caller = socket.gethostname(), os.getpid()
@@ -229,7 +231,7 @@ def computed(
 
 
 def _error(future: Future[Any]) -> BaseException | None:
-    """What a future that is done ended with, in place of an answer."""
+    """Return the exception of a finished future, or None."""
     try:
         return future.exception()
     except CancelledError as cancelled:

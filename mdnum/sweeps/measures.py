@@ -1,4 +1,4 @@
-"""What is read from a run: a number with its unit and its statistical error, by name."""
+"""Measures by name: numbers that are derived from a run, with unit and statistical error."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BINS, _REACH = 200, 0.98
 
 
 class Value(NamedTuple):
-    """A measure of one run."""
+    """Value of a measure for one run."""
 
     value: float
     error: float = float("nan")  # standard error; nan where one run does not tell
@@ -32,14 +32,14 @@ class Value(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """A run as measures see it.
+    """Data of a run from which measures are computed.
 
     Attributes:
-        series: numbers of each step, as in series.parquet.
-        summary: of the run.
-        atoms: how many.
+        series: values at each step, as in series.parquet.
+        summary: summary of the run.
+        atoms: number of atoms.
         k_B: Boltzmann's constant in the units of the run.
-        folder: of the run, with its frames where a measure needs them.
+        folder: folder of the run, with its frames if a measure needs them.
     """
 
     series: Mapping[str, np.ndarray]
@@ -62,22 +62,22 @@ class Sample:
 
     @property
     def volumes(self) -> np.ndarray:
-        """Of each step, length³."""
+        """Volume at each step, length³."""
         return self.series.get("volume", np.full(len(self.series["step"]), self.volume))
 
 
 @dataclass(frozen=True)
 class Measure:
-    """Something that is read from a run.
+    """A quantity that is derived from a run.
 
     Attributes:
-        name: by which it is asked for.
-        unit: of quantities, such as "energy" or "length²/time".
-        title: in words.
-        of: its value.
+        name: name that users write.
+        unit: unit in terms of quantities, such as "energy" or "length²/time".
+        title: description.
+        of: function that returns its value.
         needs: "series", or "frames" of positions along the run.
-        physical: whether it is a result, and no property of the machine or of the lists.
-        world: "md" or "ball", whose runs have it.
+        physical: whether it is a physical result, not a property of the machine or of neighbor lists.
+        world: "md" or "ball", the world of runs that have it.
     """
 
     name: str
@@ -108,7 +108,7 @@ def _measure(
 
 
 def _blocked(of: Callable[[slice], float], rows: int, blocks: int = _BLOCKS) -> Value:
-    """A number of the whole, with the scatter of blocks as its error."""
+    """Return a number computed from all rows, with its error from the scatter between blocks."""
     edges = np.linspace(0, rows, blocks + 1).astype(int)
     parts = np.array([of(slice(a, b)) for a, b in pairwise(edges) if b > a])
     error = parts.std(ddof=1) / len(parts) ** 0.5 if len(parts) > 1 else np.nan
@@ -144,7 +144,7 @@ def flips(run: Sample) -> Value:
 
 @_measure("energy/time", "drift of the conserved energy per atom")
 def drift(run: Sample) -> Value:
-    """The slope of a line through the second half, with the error that the scatter of blocks leaves."""
+    """Slope of a line through the second half of the run, with its error from the scatter of blocks."""
     rows = slice(len(run.series["time"]) // 2, None)
     time, kept = run.series["time"][rows], run.series["conserved"][rows] / run.atoms
     if len(time) < 2 * _BLOCKS:
@@ -170,8 +170,11 @@ def fluctuation(run: Sample) -> Value:
 
 @_measure("", "heat capacity per atom, in k_B")
 def heat_capacity(run: Sample) -> Value:
-    """From the fluctuations of the kinetic energy at constant energy (Lebowitz, Percus, Verlet 1967), of the
-    whole energy where a thermostat holds the temperature."""
+    """Heat capacity from fluctuations, by the formula for the ensemble of the run.
+
+    At constant energy, fluctuations of the kinetic energy are used (Lebowitz, Percus, Verlet 1967), with a
+    thermostat those of the total energy.
+    """
     half = slice(len(run.series["time"]) // 2, None)
     kinetic, total = run.series["kinetic"][half], run.series["total"][half]
     held = run.summary.get("dynamics") not in ("nve", None)
@@ -206,7 +209,7 @@ def rdf(run: Sample) -> Value:
 
 
 def radial_distribution(run: Sample) -> tuple[Float[np.ndarray, "frames bins"], Float[np.ndarray, "bins"]]:
-    """g(r) of each frame and the middle of its bins, by MDAnalysis's search of pairs."""
+    """Return g(r) of each frame and the centers of its bins, from MDAnalysis's pair search."""
     from MDAnalysis.lib.distances import capped_distance
     from MDAnalysis.lib.mdamath import triclinic_box
 
@@ -297,10 +300,10 @@ USUAL: Mapping[str, tuple[str, ...]] = {
 
 
 def chosen(words: Sequence[str], world: str) -> list[Measure]:
-    """Measures by name.
+    """Return the measures with the given names.
 
     Raises:
-        InputError: no such measure of this world, or one twice.
+        InputError: no such measure in this world, or a measure is repeated.
     """
     if twice := [word for word in words if list(words).count(word) > 1]:
         raise InputError(f"--measure has {twice[0]} twice", remedy="Give each once")
@@ -312,7 +315,7 @@ def chosen(words: Sequence[str], world: str) -> list[Measure]:
 
 
 def measured(measures: Sequence[Measure], run: Sample) -> dict[str, dict[str, Any]]:
-    """Values of measures by name; where one has none, why."""
+    """Return the values of measures by name, or the reason if there is no value."""
     found: dict[str, dict[str, Any]] = {}
     for one in measures:
         try:

@@ -1,4 +1,4 @@
-"""What a sweep will compute: its settings, their points, and the address of each, before anything is run."""
+"""Plan of a sweep: its settings, their points, and the address of each, before any run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Setting = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Question:
-    """What a sweep is asked, as `mdnum.sweep` has it."""
+    """Arguments of a sweep, as for `mdnum.sweep`."""
 
     seeds: int | Sequence[int] = 4
     measure: Sequence[str] | str = USUAL["md"]
@@ -37,7 +37,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Planned:
-    """A point with where it is stored."""
+    """A point and its place on disk."""
 
     point: Point
     setting: Setting
@@ -49,13 +49,13 @@ class Planned:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that is decided before anything is computed.
+    """Everything that is determined before any run.
 
     Attributes:
-        loaded: the system or simulation at its own values. system, overrides: what it is made of.
-        base: the value of each axis around which others are varied.
-        points: in the order in which they are run.
-        steps: of a run at the system's own time step.
+        loaded: the system or simulation with its own values. system, overrides: what it is made from.
+        base: the value of each axis that is kept while another axis is varied.
+        points: points in the order in which they are run.
+        steps: number of steps of a run at the system's own time step.
     """
 
     loaded: Any
@@ -73,29 +73,29 @@ class Plan:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of its measures."""
+        """Names of the measures."""
         return tuple(measure.name for measure in self.measures)
 
     @property
     def origin(self) -> Setting:
-        """The setting of the system's own values."""
+        """Setting with the system's own values."""
         return self.setting(self.base)
 
     def setting(self, choices: Mapping[str, Any]) -> Setting:
-        """The labels of a value of each axis."""
+        """Return the labels of a value of each axis."""
         return tuple(label(choices[axis.key]) for axis in self.axes)
 
     def along(self, axis: Axis) -> Iterator[tuple[Any, Setting]]:
-        """Each value of an axis with its setting, all other choices at their base."""
+        """Yield each value of an axis with its setting; all other choices have their base values."""
         for value in axis.values:
             yield value, self.setting({**self.base, axis.key: value})
 
 
 def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, Any] | None) -> Plan:
-    """The plan of a sweep.
+    """Return the plan of a sweep.
 
     Raises:
-        InputError: a choice or a measure that does not exist, or a system that cannot be swept.
+        InputError: a choice or a measure does not exist, or the system cannot be swept.
     """
     from mdnum.systems import BallSystem, System, load
     from mdnum.systems.build import build
@@ -159,9 +159,9 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
 
 
 def resolved(simulation: Any, settings: Mapping[str, Any]) -> Any:
-    """A simulation made of objects, or a loaded ball, with other values.
+    """Return a simulation made from objects, or a loaded ball, with other values.
 
-    Velocities of atoms are drawn by the seed, as those of a file.
+    Velocities of atoms are drawn with the seed, as for a system file.
     """
     from mdnum.systems import BallSystem
     from mdnum.systems.load import vary
@@ -190,7 +190,7 @@ def _axes(over: Any) -> list[Axis]:
 
 
 def _own_value(axis: Axis, own: Mapping[str, Any], loaded: Any, system: Any, overrides: Any) -> Any:
-    """The value of an axis that a system has."""
+    """Return the value of an axis in the system itself."""
     from mdnum.systems import BallSystem, load
     from mdnum.systems.parameters import names, number, resolve
 

@@ -1,17 +1,17 @@
-"""A folder for each point, named by what was asked: none lost, none computed twice, whoever computes.
+"""Storage of points, in one folder each, named by content, so that none is lost or computed twice.
 
     sweep/
       .signac/config                  a signac workspace
       workspace/ADDRESS/
-        signac_statepoint.json        every number and choice that the point is made of
-        point.json                    its results, or why there are none
-        series.parquet                numbers of each step
-      workspace/.ADDRESS.claim.N      who computes it now
+        signac_statepoint.json        every number and choice that defines the point
+        point.json                    its results, or the reason why there are none
+        series.parquet                values at each step
+      workspace/.ADDRESS.claim.N      the process that is computing it
 
-The address is signac's: the MD5 of the state point as JSON. A point is computed in a folder of its own and
-appears under its address by one rename; what is killed before leaves nothing there. Who claims a point
-creates its claim, which one process alone can (O_EXCL); the claim of a process that is gone is followed by
-another with the next number. Nothing of this depends on what starts the processes.
+The address is that of signac: the MD5 of the state point as JSON. A point is computed in a separate folder,
+which one rename moves to its address; a process that is killed before leaves nothing there. A process claims
+a point by creating a claim file, which only one process can (O_EXCL); if this process ends, another creates a
+claim with the next number. This does not depend on how processes are started.
 """
 
 from __future__ import annotations

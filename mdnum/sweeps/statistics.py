@@ -1,8 +1,9 @@
 """Means over seeds and differences between choices, each with its error.
 
-A run gives a mean and, from its own correlation, the error of that mean; several seeds give their scatter.
-Both estimate one variance, the first with many degrees of freedom but too small where modes are slower than a
-run. So the runs' own errors are scaled by what all seeds of all settings say of them together.
+A run gives a mean and, from its autocorrelation, the error of this mean; several seeds give a scatter. Both
+estimate the same variance, the first with many degrees of freedom but too small if modes are slower than a
+run. Therefore the errors of the runs are scaled by a factor that all seeds of all settings determine
+together.
 """
 
 from __future__ import annotations
@@ -36,19 +37,20 @@ class SeedMean:
 
     @property
     def known(self) -> bool:
-        """Whether it has a value and an error."""
+        """True if the mean has a value and an error."""
         return bool(np.isfinite(self.value) and np.isfinite(self.error))
 
 
 def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K, SeedMean]:
-    """Means of one measure at each setting, over runs that differ by their seed alone.
+    """Return means of one measure at each setting, over runs that differ only in their seed.
 
-    The error of a mean is that of its runs, times how much more (or less) seeds scatter than runs know, which
-    is one number for all settings of a measure: it is known the better the more settings there are. Where the
-    runs' own errors are worth less than the scatter of the seeds of one setting, that scatter alone counts.
+    The error of a mean is that of its runs, multiplied by the ratio of the scatter between seeds to the runs'
+    own errors. This ratio is one number for all settings of a measure, and is more precise the more settings
+    there are. If the runs' own errors have less weight than the scatter of the seeds of one setting, only
+    that scatter is used.
 
     Args:
-        found: (value, standard error, independent samples) of each run; nan where a run does not tell them.
+        found: (value, standard error, independent samples) of each run; nan if unknown.
     """
     arrays = {key: np.asarray(rows, float).reshape(-1, 3) for key, rows in found.items()}
     means = {key: _Runs.of(rows) for key, rows in arrays.items()}
@@ -72,7 +74,7 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
 
 
 class _Runs(NamedTuple):
-    """The variance of a mean over runs, as they know it and as they scatter; nan where not known."""
+    """Variance of a mean over runs, from the runs' own errors and from their scatter; nan if unknown."""
 
     runs: int
     within: float
@@ -99,7 +101,7 @@ class _Runs(NamedTuple):
 
 @dataclass(frozen=True)
 class Difference:
-    """What a choice changes, against the base."""
+    """Change of a measure due to a choice, relative to the base."""
 
     value: float
     error: float  # of the difference
@@ -109,23 +111,23 @@ class Difference:
 
     @property
     def moves(self) -> bool | None:
-        """Whether the choice moves the result; None where that is not decided for lack of an error."""
+        """True if the choice changes the result significantly; None if undecided for lack of an error."""
         return None if np.isnan(self.chance) else bool(self.chance < ALPHA)
 
     @property
     def sigmas(self) -> float:
-        """In units of its error."""
+        """Difference in units of its error."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return float(np.float64(self.value) / self.error)
 
 
 def differences(pairs: Mapping[Name, tuple[SeedMean, SeedMean]]) -> dict[Name, Difference]:
-    """Differences of each choice and its base, with Welch's degrees of freedom, corrected (`corrected`)."""
+    """Differences between choices and their bases, with Welch's degrees of freedom, after `corrected`."""
     return corrected({name: difference(one, base) for name, (one, base) in pairs.items()})
 
 
 def difference(one: SeedMean, base: SeedMean) -> tuple[float, float, float]:
-    """Value, error and degrees of freedom; the last is nan where an error is not known."""
+    """Return value, error and degrees of freedom; the last is nan if an error is unknown."""
     variances = np.array([one.error**2, base.error**2])
     value, error = one.value - base.value, float(np.sqrt(variances.sum()))
     if not (one.known and base.known):
@@ -135,9 +137,10 @@ def difference(one: SeedMean, base: SeedMean) -> tuple[float, float, float]:
 
 
 def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Difference]:
-    """Values, errors and degrees of freedom with chances that hold for all of them together (Holm 1979).
+    """Add p-values, corrected for all comparisons together (Holm 1979), to values with known errors.
+    freedom.
 
-    What has no degrees of freedom (nan) is told nothing about, and does not count as a comparison.
+    An entry without degrees of freedom (nan) gets no p-value, and does not count as a comparison.
     """
     from scipy.stats import t
 
@@ -161,14 +164,14 @@ def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Diff
 
 
 def effects(places: Float[np.ndarray, "points axes"], values: Float[np.ndarray, "points"]) -> list[Any]:
-    """What a measure changes from one end of each axis to the other, of a plane through all points.
+    """Change of a measure from one end of each axis to the other, from a plane fitted to all points.
 
     Args:
-        places: of each point along each axis, from 0 to 1.
+        places: position of each point along each axis, from 0 to 1.
 
     Returns:
-        (value, error, degrees of freedom) of each axis, as `corrected` takes them; the error counts what the
-        plane does not describe.
+        (value, error, degrees of freedom) for each axis, as for `corrected`; the error includes deviations
+        from the plane.
     """
     rows, count = places.shape
     freedom = rows - count - 1
@@ -185,7 +188,7 @@ def effects(places: Float[np.ndarray, "points axes"], values: Float[np.ndarray, 
 
 @dataclass(frozen=True)
 class Within:
-    """Whether a difference is within a tolerance."""
+    """Result of a comparison of a difference with a tolerance."""
 
     inside: bool | None  # None: not decided
     # times as many seeds that would decide it, if the difference stays what it is; 1 where it is decided
@@ -193,10 +196,10 @@ class Within:
 
 
 def within(value: float, error: float, freedom: float, tolerance: float, comparisons: int = 1) -> Within:
-    """Whether |difference| ≤ tolerance: its confidence interval lies on one side of it (Schuirmann 1987).
+    """Test |difference| ≤ tolerance: the confidence interval lies on one side of it (Schuirmann 1987).
 
     Args:
-        comparisons: over which the chance of a mistake, ALPHA, is shared.
+        comparisons: number of comparisons among which the error probability, ALPHA, is divided.
     """
     from scipy.stats import t
 
@@ -210,9 +213,9 @@ def within(value: float, error: float, freedom: float, tolerance: float, compari
 
 
 def correlated(series: Float[np.ndarray, "samples"]) -> tuple[float, float, float]:
-    """Mean of a time series, its standard error, and how many independent samples it is worth.
+    """Mean of a time series, its standard error, and its number of independent samples.
 
-    What comes before equilibrium is left out (`pymbar.timeseries.detect_equilibration`, Chodera 2016).
+    Samples before equilibrium are omitted (`pymbar.timeseries.detect_equilibration`, Chodera 2016).
     """
     # its import says on the log that it will use jax in double precision, as mdnum does
     logging.getLogger("pymbar").setLevel(logging.ERROR)

@@ -160,7 +160,7 @@ class FlipsView(View):
 
     @property
     def one(self) -> str:
-        """"a residue" or "an atom", depending on whose neighbors are counted."""
+        """Kind of object whose neighbors are counted: "a residue" or "an atom"."""
         return "a residue" if self.by_residue else "an atom"
 
     @property

@@ -94,9 +94,7 @@ class View:
         return self._tables[name]
 
     def kept(self, codes: Mapping[str, Any]) -> list[Finding]:
-        """Return findings of summary.json that the verb does not derive again because it lacks their
-        codes.
-        """
+        """Return findings of summary.json that the verb cannot derive again because it lacks their codes."""
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
 
