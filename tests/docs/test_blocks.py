@@ -13,6 +13,7 @@ import shutil
 import sys
 import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from command_line import call
@@ -65,7 +66,8 @@ shutil.copy(outcome.path / "flips.parquet", ".")
 """,
     "json": 'mdnum.run("argon/crystal-108", steps=5, out="runs/liquid-864-1")',
     "gradients": """
-atoms = mdnum.load("metallic-glass/ni80p20-256").atoms
+atoms = ase.build.bulk("Ni", "fcc", 1.6, cubic=True) * 4
+atoms.symbols[::5] = "P"
 layers = [
     {"weight": np.full((1, 4), 0.1), "bias": np.linspace(-1, 0, 4)},
     {"weight": np.full((4, 3), 0.1), "bias": np.zeros(3)},
@@ -131,9 +133,9 @@ def commands(block: str) -> list[str]:
     return [part.strip() for line in kept for part in line.split(" && ")]
 
 
-def execute(page: str) -> None:
-    """Execute a page in the current folder."""
-    namespace: dict[str, object] = {"__name__": "page"}
+def execute(page: str, module: ModuleType) -> None:
+    """Execute a page in the current folder, with the names of a module."""
+    namespace = module.__dict__
     exec(GIVEN + ALSO.get(Path(page).stem, ""), namespace)
     for language, block in BLOCK.findall((ROOT / page).read_text(encoding="utf-8")):
         if language == "toml":
@@ -159,7 +161,10 @@ def test_the_blocks_of_a_page_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     files(tmp_path)
-    execute(page)
+    # a dataclass looks for the module that it is defined in
+    module = ModuleType("page")
+    monkeypatch.setitem(sys.modules, "page", module)
+    execute(page, module)
 
 
 def test_what_is_left_out_is_there():
