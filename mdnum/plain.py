@@ -1,4 +1,4 @@
-"""Conversion of results to plain values for JSON, TOML and terminals, and access to text files."""
+"""Conversion of results to plain values for JSON, TOML and terminals, and access to text and shipped files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, Literal, TypeVar, dataclass_transform
 
 T = TypeVar("T")
 
@@ -17,6 +17,19 @@ T = TypeVar("T")
 def beside(module: str) -> dict[str, Any]:
     """Return the tables of the TOML file next to a module (given by `__file__`); do not change them."""
     return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
+
+
+def shipped_folder(kind: Literal["systems", "demos"] = "systems") -> Path:
+    """Return the folder of shipped files: the packaged copy, or the repository's for editable installs."""
+    package = Path(__file__).parent
+    packaged = package / f"_{kind}"
+    return packaged if packaged.is_dir() else package.parent / kind
+
+
+def shipped_systems() -> list[str]:
+    """Return the names of the shipped systems, such as "argon/liquid-864", without opening a file."""
+    root = shipped_folder()
+    return sorted(path.relative_to(root).with_suffix("").as_posix() for path in root.glob("*/*.toml"))
 
 
 #: What every document of an answer has, besides `schema` and `kind`.

@@ -85,17 +85,33 @@ VERBS = ("run", "audit", "ball", "fork", "check pairs", "conform", "systems", "r
 
 
 # typer itself imports pydantic to read the options of a verb, in some versions
-@pytest.mark.parametrize(("verbs", "allowed"), [(("",), set()), (VERBS, {"pydantic"})], ids=["all", "verbs"])
+@pytest.mark.parametrize(
+    ("verbs", "allowed"), [(("", "--version"), set()), (VERBS, {"pydantic"})], ids=["all", "verbs"]
+)
 def test_help_imports_nothing_heavy(verbs: tuple[str, ...], allowed: set[str]):
     """What makes help fast is what it does not import; a wall clock would measure the machine."""
     loaded = _modules_after(
         "import contextlib\nfrom mdnum.cli import main\n"
         "for verb in sys.argv[1:]:\n"
         "    with contextlib.suppress(SystemExit):\n"
-        "        main([*verb.split(), '--help'])\n",
+        "        main([*verb.split(), '--help' if verb != '--version' else verb])\n",
         *verbs,
     )
     assert "typer" in loaded and not (HEAVY - allowed) & loaded
+
+
+def test_a_list_of_systems_loads_none_of_them():
+    loaded = _modules_after("from mdnum.cli import main\nmain(sys.argv[1:])\n", "systems", "list")
+    assert "rich" in loaded and not {"jax", "MDAnalysis", "ase", "matplotlib", "numba", "scipy"} & loaded
+
+
+def test_a_shell_completes_without_anything_heavy(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COMP_WORDS", "mdnum fork arg")
+    monkeypatch.setenv("COMP_CWORD", "2")
+    monkeypatch.setenv("_MDNUM_COMPLETE", "complete_bash")
+    # typer itself imports pydantic to read the options of a verb, in some versions
+    loaded = _modules_after("from mdnum.cli import main\nmain([])\n")
+    assert "typer" in loaded and not (HEAVY - {"pydantic"}) & loaded
 
 
 def test_help_is_fast():

@@ -102,8 +102,10 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     arguments = sys.argv[1:] if arguments is None else arguments
     as_json = "--json" in arguments
     _set_up()
+    # rich, which prints what verbs answer, reads the variable itself (https://no-color.org)
+    color = False if os.environ.get("NO_COLOR") else None
     try:
-        code = app(arguments, standalone_mode=False, prog_name="mdnum")
+        code = app(arguments, standalone_mode=False, prog_name="mdnum", color=color)
     except MdnumError as error:
         asked = error
     except _UsageError as error:

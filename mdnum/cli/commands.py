@@ -20,12 +20,12 @@ from typer.core import TyperGroup
 from mdnum import verbs
 from mdnum.cli import output
 from mdnum.errors import InputError, MdnumError
-from mdnum.plain import beside
+from mdnum.plain import beside, shipped_systems
 from mdnum.verbs import VERBS, declared
 
 # rich's help formatting costs more than the whole of --help may take
-_PLAIN: dict[str, Any] = {"rich_markup_mode": None, "add_completion": False}
-_TYPES = {"text": str, "int": int, "float": float, "path": Path, "folder": Path, "flag": bool}
+_PLAIN: dict[str, Any] = {"rich_markup_mode": None}
+_TYPES = {"text": str, "system": str, "int": int, "float": float, "path": Path, "folder": Path, "flag": bool}
 _SHARED: Mapping[str, Mapping[str, Any]] = beside(verbs.__file__)["shared"]
 
 
@@ -47,7 +47,21 @@ class _Verbs(TyperGroup):
         def refuse() -> None:
             raise broken
 
-        return _made(cmd_name, str(broken), refuse, ignore_unknown_options=True, allow_extra_args=True)
+        return _made(
+            cmd_name, {"help": str(broken)}, refuse, ignore_unknown_options=True, allow_extra_args=True
+        )
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Writes the verbs of `--help`, by the question that they answer."""
+        below: dict[str, list[tuple[str, str]]] = {}
+        for name in (names := self.list_commands(ctx)):
+            made = self.get_command(ctx, name)
+            row = (name.ljust(max(map(len, names))), made.get_short_help_str(limit=200))
+            below.setdefault(made.rich_help_panel or "Verbs of other packages", []).append(row)
+        for heading, rows in below.items():
+            formatter.write(f"\n{heading}\n")
+            with formatter.indentation():
+                formatter.write_dl(rows)
 
 
 app = typer.Typer(
@@ -86,15 +100,26 @@ class _Questions(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         group, first = self.group, args[0] if args else "--json"
+        if ctx.resilient_parsing and (not args or "usual" not in group):
+            return super().parse_args(ctx, args)  # a shell completes the first word
         if "alone" in group and set(args) <= {"--json"}:
             args = [group["alone"], *args]
         elif "usual" in group and first not in self.commands and first != "--help":
-            if "two" in group and len(args) > 1 and not args[1].startswith("-"):
+            if "two" in group and len(args) > 1 and not (args[1].startswith("-") or ctx.resilient_parsing):
                 both, folders = " ".join(args[:2]), all(map(os.path.isdir, args[:2]))
                 remedy = f"Ask `mdnum {group['two'][0 if folders else 1]} {both}`"
                 raise InputError(f"{both}: expected one system", remedy=remedy)
             args = [group["usual"], *args]
         return super().parse_args(ctx, args)
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        found = super().shell_complete(ctx, incomplete)
+        if "usual" in self.group:
+            usual = self.commands[self.group["usual"]]
+            below = usual.make_context(usual.name, [], parent=ctx, resilient_parsing=True)
+            for one in (usual, usual.params[0]):
+                found += one.shell_complete(below, incomplete)
+        return found
 
 
 def _of_verb(verb: str) -> Any:
@@ -109,8 +134,10 @@ def _of_verb(verb: str) -> Any:
         for question, said in text.get("commands", {}).items()
     }
     group = texts[verb]["group"]
-    plain = {"rich_markup_mode": None, "no_args_is_help": "alone" not in group}
-    made = _Questions(name=verb, commands=commands, help=group["help"], **plain)
+    made = _Questions(
+        name=verb, commands=commands, help=group["help"], no_args_is_help="alone" not in group,
+        rich_help_panel=group.get("heading"), **_PLAIN,
+    )  # fmt: skip
     made.group = group
     return made
 
@@ -136,12 +163,13 @@ def _command(entry: str, name: str, said: Mapping[str, Any], shared: Mapping[str
         for key, (kind, default) in kinds.items()
     ])  # fmt: skip
     function.__annotations__ = {key: kind for key, (kind, _) in kinds.items()}
-    return _made(name, said["help"], function)
+    return _made(name, said, function)
 
 
-def _made(name: str, help: str, function: Callable[..., Any], **settings: Any) -> Any:
-    maker = typer.Typer(**_PLAIN)
-    maker.command(name, help=help, context_settings=settings)(function)
+def _made(name: str, said: Mapping[str, Any], function: Callable[..., Any], **settings: Any) -> Any:
+    maker = typer.Typer(add_completion=False, **_PLAIN)
+    panel = said.get("heading")
+    maker.command(name, help=said["help"], rich_help_panel=panel, context_settings=settings)(function)
     return typer.main.get_command(maker)
 
 
@@ -159,6 +187,8 @@ def _parameter(name: str, said: Mapping[str, Any], make: Callable[..., Any]) -> 
     if "of" in said:
         module, _, attribute = said["of"].partition(":")
         text = text.format(of=", ".join(getattr(importlib.import_module(module), attribute)))
+    if said.get("type") == "system":
+        more["autocompletion"] = shipped_systems
     return kind | None if default is None else kind, make(default, *flags, help=text, **more)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.resources
 import shutil
 import tomllib
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 from mdnum import units as unit_systems
 from mdnum.errors import InputError, expect_path
+from mdnum.plain import shipped_folder, shipped_systems
 from mdnum.reading import whole_text
 from mdnum.registry import meant
 from mdnum.store.files import SIMULATION_FILE, SYSTEM_FILE, disk_errors, replacing, write_text
@@ -32,13 +32,6 @@ GIVE_OBJECTS = "Give the simulation itself, made by the same code, from Python"
 BALL_SCHEMA = "ball-schema.json"
 
 
-def shipped_folder(kind: Literal["systems", "demos"] = "systems") -> Path:
-    """Return the folder of shipped files: the packaged copy, or the repository's for editable installs."""
-    package = Path(str(importlib.resources.files("mdnum")))
-    packaged = package / f"_{kind}"
-    return packaged if packaged.is_dir() else package.parent / kind
-
-
 def names(world: Literal["md", "ball"] | None = None) -> list[str]:
     """Return the names of the shipped systems, such as "argon/liquid-864".
 
@@ -46,10 +39,7 @@ def names(world: Literal["md", "ball"] | None = None) -> list[str]:
         world: "md" or "ball" to return only the systems of this world.
     """
     root = shipped_folder()
-    found = list(root.glob("*/*.toml"))
-    if world is not None:
-        found = [path for path in found if _world(path) == world]
-    return sorted(path.relative_to(root).with_suffix("").as_posix() for path in found)
+    return [name for name in shipped_systems() if world in (None, _world(root / f"{name}.toml"))]
 
 
 def world_of(name: Any) -> str:

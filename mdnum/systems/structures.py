@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 _SMALLEST_DISTANCE = 0.3
 #: Atoms of a crystal that is built; their positions alone take half a gigabyte.
 _MOST_ATOMS = 20_000_000
-_ATOMS_IN_CELL = {"fcc": 4, "bcc": 2, "sc": 1, "diamond": 8}
+#: Atoms of the cubic cell of a crystal, by its name.
+ATOMS_IN_CELL = {"fcc": 4, "bcc": 2, "sc": 1, "diamond": 8}
 #: Cutoff radii that a coordinate or a cell vector may be long: its ulp is then 2e-8 of the cutoff.
 _FARTHEST = 1e8
 #: Lennard-Jones atoms closer than this many σ (240,000 ε) are a mistake and not a hot pair.
@@ -142,10 +143,10 @@ def _build(structure: schema.BuilderStructure) -> Atoms:
         remedy = meant(structure.symbol, atomic_numbers).rstrip() or "Use one such as Ar"
         raise InputError(f"structure.symbol = {structure.symbol!r} is not a chemical symbol", remedy=remedy)
     cells = math.prod(structure.repeat)
-    if cells > _MOST_ATOMS // _ATOMS_IN_CELL[structure.builder]:
+    if cells > _MOST_ATOMS // ATOMS_IN_CELL[structure.builder]:
         raise InputError(
             f"structure.repeat = {list(structure.repeat)} makes "
-            f"{cells * _ATOMS_IN_CELL[structure.builder]:.3g} atoms; expected at most {_MOST_ATOMS:,}",
+            f"{cells * ATOMS_IN_CELL[structure.builder]:.3g} atoms; expected at most {_MOST_ATOMS:,}",
             remedy="Repeat the cell less often",
         )
     atoms = bulk(structure.symbol, structure.builder, a=structure.lattice_constant, cubic=True)

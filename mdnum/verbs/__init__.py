@@ -49,8 +49,8 @@ def _check(module: Any) -> None:
 #: Modules by the command that they are of, and what they are about where a command has several.
 VERBS: Registry[Any] = Registry("verb", "mdnum.verbs", check=_check)
 for _name in (
-    "run", "ball", "grad", "flips", "audit", "conform", "fork", "sweep", "report", "doctor", "systems",
-    "check",
+    "run", "systems", "report", "fork", "sweep", "grad", "flips", "audit", "conform", "check", "doctor",
+    "ball",
 ):  # fmt: skip
     VERBS.add(_name, f"mdnum.verbs.{_name}")
 VERBS.add("ball demos", "mdnum.verbs.demos")

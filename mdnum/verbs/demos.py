@@ -16,12 +16,11 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from mdnum.plain import plain
+from mdnum.plain import plain, shipped_folder
 from mdnum.registry import unknown
 from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Page, Plot, Region, Section, Series, Table, pairs, points_of
 from mdnum.report.words import typeset
-from mdnum.systems.load import shipped_folder
 from mdnum.verbs import frame
 from mdnum.verbs.frame import Keep, Outcome, Verb, View
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import inspect
 import io
 import json
+import re
 import subprocess
 import sys
 import threading
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from mdnum.cli import main, output
 from mdnum.cli.commands import app
 from mdnum.errors import InputError, NumericalError
 from mdnum.plain import beside, plain
+from mdnum.report.finding import Finding
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
 from mdnum.verbs import VERBS, declared
@@ -211,6 +213,64 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]):
     assert all(verb in out for verb in ("run", "systems", "check", "report", "doctor"))
     assert call() == 2
     assert "Usage: mdnum" in capsys.readouterr().out
+
+
+def test_help_lists_every_verb_below_a_question(capsys: pytest.CaptureFixture[str]):
+    expected: dict[str, list[str]] = {}
+    for name in (name for name in VERBS if " " not in name):
+        text = declared(name)
+        expected.setdefault(text.get("command", text.get("group"))["heading"], []).append(name)
+    assert 4 <= len(expected) <= 7 and sum(map(len, expected.values())) == 12
+    call("--help")
+    listed: dict[str, list[str]] = {}
+    for block in capsys.readouterr().out.split("\n\n"):
+        heading, *rows = block.splitlines()
+        if heading in expected:
+            listed[heading] = [row.split()[0] for row in rows if row[2:3] != " "]
+    assert listed == expected
+
+
+@pytest.mark.parametrize(
+    ("words", "offered", "others"),
+    [
+        ("", {"run", "fork", "doctor"}, {"vary"}),
+        ("fork ", {"vary", "compare", "argon/crystal-108"}, {"--vary"}),
+        ("fork --v", {"--vary"}, set()),
+        ("fork argon/crystal-108 --v", {"--vary"}, set()),
+        ("fork a b ", set(), {"vary"}),
+        ("ball ball/d", {"ball/drop"}, {"ball/zeno"}),
+        ("systems copy pair/", {"pair/at-cutoff", "pair/leaving-well"}, {"ball/drop"}),
+    ],
+)
+def test_a_shell_completes(words: str, offered: set[str], others: set[str], monkeypatch, capsys):
+    monkeypatch.setenv("_MDNUM_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", f"mdnum {words}")
+    monkeypatch.setenv("COMP_CWORD", str(words.count(" ") + 1))
+    assert call() == 0
+    out, err = capsys.readouterr()
+    completed = set(out.split())
+    assert err == "" and offered <= completed and not others & completed
+
+
+@pytest.mark.parametrize(("no_color", "expected"), [("", True), ("1", False)])
+def test_no_color_is_respected(
+    no_color: str, expected: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """In tables and findings, and in what typer prints by itself; bold and dim are no colors."""
+    settings = {"NO_COLOR": no_color, "FORCE_COLOR": "1", "TERM": "xterm-256color", "HOME": str(tmp_path)}
+    # by which typer's own tests name a shell
+    for name, value in {**settings, "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}.items():
+        monkeypatch.setenv(name, value)
+    printed_by: list[Callable[[], Any]] = [
+        lambda: output.print_findings([Finding("X", "warning", "title", "text")]),
+        lambda: output.print_table("", ("status",), [["ok"], ["unsafe"]]),
+        lambda: call("--install-completion", "bash"),
+    ]
+    for prints in printed_by:
+        monkeypatch.setattr(sys, "stdout", terminal := _Terminal())
+        prints()
+        colored = re.search(r"\x1b\[(\d+;)*(3[0-8]|4[0-8]|9[0-7])[;m]", terminal.getvalue())
+        assert terminal.getvalue() and bool(colored) == expected
 
 
 def commands(group: Any) -> Iterator[Any]:
