@@ -113,7 +113,7 @@ def site(request, tmp_path, monkeypatch):
 
 def test_its_command_runs_and_its_folder_is_judged_shown_and_read(site, capsys):
     assert call("--help") == 0
-    assert "spread   Say how" in capsys.readouterr().out
+    assert "Verbs of other packages\n  spread   Say how" in capsys.readouterr().out
     assert call("spread", "--help") == 0 and "--no-sorted" in capsys.readouterr().out
     assert "strange_spread" not in sys.modules
     assert call("spread", "numbers.txt", "--no-sorted", "-o", "out") == 1
