@@ -1,4 +1,4 @@
-"""Conversion of results to plain values for JSON, TOML and terminals, and access to text and shipped files."""
+"""Conversion of results to plain values for JSON, TOML and terminals, and access to shipped files."""
 
 from __future__ import annotations
 

@@ -68,8 +68,8 @@ app = typer.Typer(
     cls=_Verbs,
     name="mdnum",
     help="Neighbor-set flips in cutoff-based molecular dynamics: which, when, and what they did.",
-    epilog="Exit codes: 0 fine, 1 findings, 2 a mistake in what was asked, 3 time (--time) was up before a "
-    "verdict, 130 interrupted.",
+    epilog="Exit codes: 0 no findings, 1 findings, 2 an error in the input, 3 the time limit "
+    "(--time) was reached before a verdict, 130 interrupted.",
     pretty_exceptions_enable=False,
     no_args_is_help=True,
     **_PLAIN,

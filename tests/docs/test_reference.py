@@ -63,7 +63,7 @@ def test_every_finding_has_its_entry_with_a_severity_and_a_sentence(pages):
 def test_every_command_and_option_has_its_entry(pages, capsys):
     page, seen = pages["commands"], 0
     assert call("--help") == 0
-    verbs = re.findall(r"^  ([a-z]+)  ", capsys.readouterr().out.partition("Commands:")[2], re.MULTILINE)
+    verbs = re.findall(r"^  ([a-z]+)  ", capsys.readouterr().out.partition("and exit.\n")[2], re.MULTILINE)
     assert {"run", "fork", "sweep", "doctor"} <= {*verbs}
     for verb in verbs:
         assert call(verb, "--help") == 0
