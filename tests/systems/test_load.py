@@ -265,5 +265,5 @@ def test_the_packaged_copy_comes_first(tmp_path: Path, monkeypatch: pytest.Monke
     packaged.mkdir(parents=True)
     (packaged / "other.toml").write_text("")
     assert ARGON in systems.names(), "the repository's, without a packaged copy"
-    monkeypatch.setattr("importlib.resources.files", lambda name: tmp_path / name)
+    monkeypatch.setattr("mdnum.plain.__file__", str(tmp_path / "mdnum" / "plain.py"))
     assert systems.names() == ["argon/other"]
