@@ -106,7 +106,7 @@ class FixedPointUnits:
         return cls(made.spacing, made.force, made.energy, stretch)
 
     def cell(self, cell: Cell) -> Cell:
-        """The box with edges that are whole numbers of spacings.
+        """Return the box with its edges rounded to whole multiples of the grid spacing.
 
         Raises:
             InputError: it is not orthorhombic, or too large.
@@ -411,7 +411,7 @@ def _counted_jvp(primals, tangents):
     raise InputError(
         "a step in fixed-point arithmetic has no derivative",
         where="precision.state",
-        remedy="Use the method reversible or symmetric, which treat rounding as the identity",
+        remedy="Use --methods reversible or symmetric: both treat rounding as the identity",
     )
 
 

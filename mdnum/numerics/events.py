@@ -32,7 +32,7 @@ class Threshold:
             raise InputError(f"unknown comparison {self.comparison!r}; known are {', '.join(INCLUSIVE)}")
 
     def margin(self, quantity):
-        """Return threshold - quantity: positive means yes.
+        """Return threshold - quantity: positive means that the decision is "yes".
 
         Error: exact if the quantity is within a factor two of the threshold (Sterbenz' lemma); the sign is
         always right, because IEEE subtraction of unequal numbers never gives zero (gradual underflow).
@@ -72,7 +72,7 @@ class Hysteresis:
             )
 
     def margin(self, quantity, before):
-        """Return the signed distance to the threshold that currently applies: positive means yes.
+        """Return the signed distance to the current threshold: positive means that the decision is "yes".
 
         Args:
             quantity: computed value(s).

@@ -255,7 +255,7 @@ class Halves(Reduction):
         return add(in_order(terms[:half], add), in_order(terms[half:], add))
 
     def depth(self, n: int) -> int:
-        """Count the additions of the longer loop, and the last addition."""
+        """Return the number of additions in the longer of the two loops, plus one for the final addition."""
         return n - n // 2 if n > 1 else 0
 
 

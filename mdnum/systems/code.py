@@ -67,7 +67,7 @@ def function(place: str, folder: Path) -> Callable[..., Any]:
             remedy="Read the code, then add --allow-code, or allow_code=True in Python",
         )
     if not file.is_file():
-        raise InputError("no such file", where=str(file), remedy="Correct potential.function")
+        raise InputError("no such file", where=str(file), remedy="Correct the key potential.function")
     own = f"mdnum_code_{file.stem}"
     # anew each time: inspect reads the source of what is defined there now
     sys.modules.pop(own, None)

@@ -382,7 +382,7 @@ def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
 
 @njit
 def _follow(before, now, order, home, vectors, change, inverse, periodic, center, columns):
-    """Write followed coordinates; return the two largest squared displacements, and the sum over all atoms.
+    """Write the unwrapped coordinates; return the two largest squared displacements and the sum of all.
 
     The lattice vectors by which atoms were moved are counted in `home`.
     """

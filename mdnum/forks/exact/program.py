@@ -1,4 +1,4 @@
-"""The discrete map of a rollout in exact real arithmetic: ball arithmetic (Arb) that proves every decision.
+"""The discrete map of a rollout in exact real arithmetic. Ball arithmetic (Arb) proves every decision.
 
 The start and all constants are the doubles that the program holds, taken as exact dyadic rationals. Positions
 and velocities are balls (intervals) of many bits. A decision is proven if its ball lies on one side of the
