@@ -215,11 +215,12 @@ def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> in
     stopped = False
 
     def again() -> str | None:
-        """Return the remedy for the folder of a stopped command that has a --resume option."""
+        """Return how to continue a stopped command: by --resume if it has that option and a folder."""
         folder = given.get("resume") or progress.folder or given.get("out")
         with suppress(MdnumError):
-            return _folder(folder).again if "resume" in typed and folder is not None else None
-        return None  # it was stopped before there was one
+            if "resume" in typed and folder is not None:
+                return _folder(folder).again
+        return said.get("again")
 
     if said.get("on_the_spot"):
         reply = getattr(VERBS[said["entry"]], said["calls"])(*arguments, **options)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -35,11 +36,13 @@ class Table:
     shown: int = 20  # rows that are shown at once; the others unfold
     bad: frozenset[int] = frozenset()  # rows that are marked, by their number
 
-    def numeric(self, column: int) -> bool:
-        """Return True if a column holds only numbers, which are right-aligned."""
-        values = [row[column] for row in self.rows]
-        return any(_is_number(value) for value in values) and all(
-            value is None or _is_number(value) for value in values
+    @cached_property
+    def numeric(self) -> tuple[bool, ...]:
+        """Whether each column holds only numbers, which are right-aligned."""
+        columns = [[row[k] for row in self.rows] for k in range(len(self.columns))]
+        return tuple(
+            any(map(_is_number, values)) and all(value is None or _is_number(value) for value in values)
+            for values in columns
         )
 
 

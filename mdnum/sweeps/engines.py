@@ -8,20 +8,27 @@ from __future__ import annotations
 
 import os
 import pickle
+import secrets
 import socket
+import subprocess
 import tempfile
+import threading
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager, suppress
-from functools import cache
+from copy import deepcopy
+from functools import cache, partial
 from pathlib import Path
 from time import sleep
 from typing import Any
 
 from mdnum.errors import InputError
 from mdnum.provenance import cores
+from mdnum.reading import whole_text
 from mdnum.safe_path import guard
+from mdnum.systems import toml
 
 #: Times that a task may take its process with it before it counts as failed; the last time it is alone.
 TRIES = 3
@@ -29,6 +36,8 @@ TRIES = 3
 _IDLE = 10
 #: Tasks that an executor is given at a time, for each worker: a scheduler need not hold all of a sweep.
 _AHEAD = 3
+#: Seconds between looks whether an engine that gives no answer is there.
+_LOOK = 5.0
 
 
 @cache
@@ -78,11 +87,14 @@ class _Engine:
 
     def __init__(
         self, make: Callable[[], Executor], width: int, threads: int,
-        end: Callable[[Executor], Any] | None = None,
+        end: Callable[[Executor], Any] | None = None, breaks: type[BaseException] = BrokenExecutor,
+        lives: Callable[[], bool] = lambda: True,
     ):  # fmt: skip
         self.make, self.end = make, end
         self.width = width  # tasks at a time
         self.threads = threads  # cores of each
+        self.breaks = breaks  # what its futures end with when none of them will have an answer
+        self.lives = lives  # false: none of its futures ends any more
         self.executor = make()
 
     def again(self) -> None:
@@ -135,9 +147,71 @@ def _dask(address: str, workers: int | None) -> _Engine:
     return engine
 
 
+def _executorlib(file: str, workers: int | None) -> _Engine:
+    """An executor of executorlib, whose class and keywords a TOML file has: jobs of SLURM by default."""
+    try:
+        import executorlib
+        from executorlib.api import ExecutorlibSocketError
+    except ImportError:
+        remedy = "Run python3 -m pip install 'mdnum[slurm]'"
+        raise InputError("executorlib is not installed", where=file, remedy=remedy) from None
+    given = toml.parse(whole_text(Path(file), file), file)
+    name, resources = given.pop("executor", "SlurmClusterExecutor"), given.pop("resource_dict", {})
+    resources = {"cwd": str(Path(file).resolve().with_suffix("")), **resources}
+    job = f"mdnum-{secrets.token_hex(4)}"
+    if name == "SlurmClusterExecutor":
+        resources["job_name"] = job
+    # without blocks each task has a process of its own, and one that equals an earlier one has its answer
+    keywords = {**given, "block_allocation": True, "init_function": partial(_ends_with, os.getpid()),
+                "resource_dict": resources, **({"max_workers": workers} if workers else {})}  # fmt: skip
+
+    feeders: list[threading.Thread] = []
+
+    def make() -> Executor:
+        before, made = set(threading.enumerate()), list[Any]()
+
+        def begin() -> None:
+            try:
+                with warnings.catch_warnings(action="ignore"):
+                    # it knows no keys of a queue's own, and takes them
+                    made.append(getattr(executorlib, name)(**deepcopy(keywords)))
+            except Exception as error:
+                made.append(error)
+
+        # its threads are daemons as this one is: what waits for a job does not keep Python from its end
+        maker = threading.Thread(target=begin, daemon=True)
+        maker.start()
+        maker.join()
+        if isinstance(made[0], Exception):
+            remedy = "Give executor, max_workers and a table resource_dict, as executorlib describes them"
+            raise InputError(f"{name}: {made[0]}", where=file, remedy=remedy)
+        feeders[:] = set(threading.enumerate()) - before
+        return made[0]
+
+    def end(executor: Executor) -> None:
+        executor.shutdown(wait=False, cancel_futures=True)
+        for thread in feeders:
+            thread.join(2)
+        if "job_name" in resources:
+            # of those at work: the others have ended their jobs
+            subprocess.run(["scancel", f"--name={job}"], capture_output=True)
+
+    return _Engine(
+        make, int(keywords.get("max_workers", 1)), int(resources.get("threads_per_core", 1)), end,
+        ExecutorlibSocketError, lambda: all(thread.is_alive() for thread in feeders),
+    )  # fmt: skip
+
+
+def _ends_with(parent: int) -> dict[str, Any]:
+    """Ends a worker with the process that started it, where that is on its machine."""
+    if os.getppid() == parent:
+        guard(parent)
+    return {}
+
+
 @contextmanager
 def opened(on: str | Executor | None, workers: int | None) -> Iterator[_Engine]:
-    """Context manager of an engine: None, tcp://host:port of a dask scheduler, or the user's executor.
+    """Context manager of an engine: None, tcp://host:port of a dask scheduler, a TOML file, or the user's executor.
 
     Raises:
         InputError: no such engine, or its package is missing.
@@ -149,8 +223,10 @@ def opened(on: str | Executor | None, workers: int | None) -> Iterator[_Engine]:
         engine = _Engine(lambda: on, width, max(1, cores() // width))
     elif on.startswith(("tcp://", "tls://", "ucx://")):
         engine = _dask(on, workers)
+    elif on.endswith(".toml"):
+        engine = _executorlib(on, workers)
     else:
-        raise InputError(f"--on {on!r}", remedy="Give tcp://host:port of a dask scheduler")
+        raise InputError(f"--on {on!r}", remedy="Give tcp://host:port of a dask scheduler, or a .toml file")
     try:
         yield engine
     finally:
@@ -196,8 +272,13 @@ def computed(
                         running[future] = some.popleft()
                     except Exception as error:
                         failed, broken = f"{type(error).__name__}: {error}", True
-                ended = wait(running, return_when=FIRST_COMPLETED).done if running else set[Future[Any]]()
-                if any(isinstance(_error(future), BrokenExecutor) for future in ended):
+                ended = set[Future[Any]]()
+                if running:
+                    ended = wait(running, _LOOK, FIRST_COMPLETED).done
+                    if not ended and not engine.lives():
+                        # such as jobs that a queue refuses: not for longer than it may have been down
+                        failed, broken, idle = "its workers were not started", True, idle + _IDLE // 3
+                if any(isinstance(_error(future), engine.breaks) for future in ended):
                     # all of its futures end
                     ended = wait(running).done
                 for future in ended:
@@ -208,7 +289,7 @@ def computed(
                         yield tasks[k], answer if wrong is None else wrong
                         continue
                     failed = f"{type(error).__name__}: {error}".splitlines()[0]
-                    broken = broken or isinstance(error, BrokenExecutor | CancelledError)
+                    broken = broken or isinstance(error, (engine.breaks, CancelledError))
                     tries[k] += lost(tasks[k], failed)
                     if tries[k] >= TRIES:
                         yield tasks[k], error

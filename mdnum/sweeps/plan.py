@@ -127,12 +127,17 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
     framed = any(measure.needs == "frames" for measure in measures)
     every = (question.save_every or max(1, steps // _FRAMES)) if framed else 0
     pace = float(own[f"{table}.timestep"])
-    rows = []
+    rows: list[Planned] = []
+    firsts, seeded = dict[str, Planned](), False
     for point in points(axes, base, seeds, question.design, question.samples):
         settings: dict[str, Any] = {"dynamics.seed": point.seed} if world == "md" else {}
         for axis in axes:
             if point.choices[axis.key] != base[axis.key] or filling:
                 settings |= axis.settings(point.choices[axis.key], world)
+        key = json.dumps({**settings, "dynamics.seed": None})
+        if seeded and key in firsts:
+            rows.append(_of_seed(firsts[key], point, settings))
+            continue
         # of the same time, whatever the step: results would differ by how long they were waited for
         share = pace / float(settings.get(f"{table}.timestep", pace))
         run = {"steps": round(steps * share), "save_every": max(1, round(every * share)) if every else 0}
@@ -141,7 +146,7 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
             if isinstance(system, Simulation | BallSystem):
                 one: Any = resolved(loaded, settings)
             else:
-                one = load(system, {**overrides, **settings})
+                one = load(loaded.path, {**overrides, **settings})
         except MdnumError as error:
             rows.append(Planned(point, setting, settings, {}, "", str(error)))
             continue
@@ -151,11 +156,22 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
         program.pop("record", None)
         state = state_point(program, hashes(one)["structure"], run)
         rows.append(Planned(point, setting, settings, state, address_of(state)))
+        if (first := firsts.setdefault(key, rows[-1])) is not rows[-1]:
+            # where the second seed of a setting changes nothing else, no setting is resolved again for one
+            seeded = _of_seed(first, point, settings) == rows[-1]
     units = "ball" if world == "ball" else loaded.units.name
     atoms = loaded.balls if world == "ball" else len(loaded.atoms) if filed else loaded.atoms
     return Plan(
         loaded, system, overrides, axes, base, seeds, measures, rows, steps, units, atoms, question
     )  # fmt: skip
+
+
+def _of_seed(one: Planned, point: Point, settings: Mapping[str, Any]) -> Planned:
+    """A point of a setting that was resolved for another seed."""
+    system = one.state["system"]
+    dynamics = {**system["dynamics"], "seed": settings["dynamics.seed"]}
+    state = {**one.state, "system": {**system, "dynamics": dynamics}}
+    return replace(one, point=point, settings=settings, state=state, address=address_of(state))
 
 
 def resolved(simulation: Any, settings: Mapping[str, Any]) -> Any:

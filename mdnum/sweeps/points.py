@@ -6,7 +6,7 @@
         signac_statepoint.json        every number and choice that defines the point
         point.json                    its results, or the reason why there are none
         series.parquet                values at each step
-      workspace/.ADDRESS.claim.N      the process that is computing it
+      claims/ADDRESS.N                the process that is computing it
 
 The address is that of signac: the MD5 of the state point as JSON. A point is computed in a separate folder,
 which one rename moves to its address; a process that is killed before leaves nothing there. A process claims
@@ -40,7 +40,7 @@ STATE_POINT, RESULT = "signac_statepoint.json", "point.json"
 #: Seconds between the signs of life of a claim, and without one after which its process counts as gone where
 #: that cannot be told otherwise (on another machine).
 _ALIVE, _GONE = 20.0, 180.0
-_CLAIM = re.compile(r"\.(?P<address>[0-9a-f]{32})\.claim\.(?P<number>\d+)")
+_CLAIM = re.compile(r"(?P<address>[0-9a-f]{32})\.(?P<number>\d+)")
 #: What computes points and measures; how they are compared and shown is another matter.
 _COMPUTES = (
     "compiled.py", "vectors.py", "bits.py", "numerics/**/*.py", "md/*.py", "ball/*.py", "systems/*.py",
@@ -101,8 +101,11 @@ class Workspace:
 
     def __init__(self, root: Path):
         self.root, self.place = root, root / "workspace"
+        # a folder of their own: one of ten thousand points takes long to list
+        self._held = root / "claims"
         with disk_errors(root):
             self.place.mkdir(parents=True, exist_ok=True)
+            self._held.mkdir(exist_ok=True)
             (root / ".signac").mkdir(exist_ok=True)
             if not (config := root / ".signac" / "config").exists():
                 write_text(config, 'schema_version = "2"\n')
@@ -141,9 +144,9 @@ class Workspace:
 
     def claims(self, address: str = "*") -> list[tuple[Path, int]]:
         """Claims of a point, or of all, with their numbers, the latest last."""
-        found = [(file, _CLAIM.fullmatch(file.name)) for file in self.place.glob(f".{address}.claim.*")]
+        found = [(file, _CLAIM.fullmatch(file.name)) for file in self._held.glob(f"{address}.*")]
         numbered = [(file, int(match["number"])) for file, match in found if match]
-        return sorted(numbered, key=lambda one: (one[0].name.partition(".claim.")[0], one[1]))
+        return sorted(numbered, key=lambda one: (one[0].stem, one[1]))
 
     @contextmanager
     def claimed(self, address: str) -> Iterator[bool]:
@@ -173,7 +176,7 @@ class Workspace:
         held = self.claims(address)
         if held and not gone(held[-1][0]):
             return None
-        claim = self.place / f".{address}.claim.{held[-1][1] + 1 if held else 0}"
+        claim = self._held / f"{address}.{held[-1][1] + 1 if held else 0}"
         with disk_errors(claim):
             try:
                 number = os.open(claim, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
@@ -191,7 +194,7 @@ class Workspace:
     def _release(self, claim: Path) -> None:
         # the own one last: another process that finds none left may begin. A later one is of a process that
         # took this one for gone
-        address, number = claim.name[1:33], int(claim.suffix[1:])
+        address, number = claim.stem, int(claim.suffix[1:])
         for file, earlier in self.claims(address):
             if earlier <= number:
                 file.unlink(missing_ok=True)

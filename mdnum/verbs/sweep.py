@@ -75,7 +75,8 @@ def sweep(
             share of each measure's size. Without it nothing is recommended.
         converged: the end of an axis that counts as converged, by key: "largest", "smallest" or a value;
             default the largest cutoff, the smallest time step, the largest system, double precision.
-        on: where to compute: tcp://host:port of a dask scheduler, or any `concurrent.futures.Executor`;
+        on: where to compute: tcp://host:port of a dask scheduler, a TOML file that describes an executor of
+            executorlib, such as jobs of SLURM, or any `concurrent.futures.Executor`;
             default processes of this machine.
         workers: processes; default one for each core.
         points_in: folder of the points, which sweeps may share; default "sweep-points" beside the new folder.
@@ -160,7 +161,7 @@ def _compute(
     """Computes the points that are not there, and waits for those that another sweep computes."""
     wanted = {one.address: one for one in plan.points if not one.wrong}
     missing = [a for a in wanted if not enough(place.result(a), plan.names)]
-    missed = place.nearest(wanted[missing[0]].state) if missing and len(missing) < len(wanted) else None
+    missed = place.nearest(wanted[missing[0]].state) if missing else None
     total, done, begun = len(missing), 0, monotonic()
     counts = {"computed": 0, "found": len(wanted) - total, "given_up": 0, "changed": missed or []}
     system = plan.system
@@ -171,8 +172,14 @@ def _compute(
     settings: dict[Setting, list[Planned]] = {}
     for address in missing:
         settings.setdefault(wanted[address].setting, []).append(wanted[address])
-    several = max(1, min(_TOGETHER, -(-total // (2 * (workers or cores())))))
-    groups = [many[k : k + several] for many in settings.values() for k in range(0, len(many), several)]
+    # how many an engine of somebody else has is not known: it is given points one by one
+    count, groups, rest = workers or (cores() if on is None else total), list[Sequence[Planned]](), total
+    for many in settings.values():
+        while many:
+            # the last ones by themselves, so that workers end together
+            several = max(1, min(_TOGETHER, rest // (4 * count)))
+            groups.append(many[:several])
+            rest, many = rest - len(groups[-1]), many[several:]
 
     def task(some: Sequence[Planned]) -> Task:
         each = tuple({"address": o.address, "state": o.state, "settings": o.settings} for o in some)

@@ -56,6 +56,11 @@ def judge(view: View) -> Verdict:
     evidence = [
         TEXTS("runs", points=s["points"], settings=s["settings"], seeds=len(s["seeds"]), steps=s["steps"])
     ]
+    if s["changed"]:
+        fields = listed(
+            [TEXTS("code") if name == "code" else name.removeprefix("asked.") for name in s["changed"]]
+        )
+        evidence.append(TEXTS("not_stored", computed=s["computed"], fields=fields))
     evidence += [TEXTS("compared", n=len(rows))] if rows else []
     evidence += [text for advice in s["advice"] if (text := _advised(view, advice))]
     return conclude(found, evidence, headline=headline, best="info")

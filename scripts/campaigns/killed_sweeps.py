@@ -121,7 +121,7 @@ def worker(task: Any, journal: str, defect: str) -> Any:
             if held and not points.gone(held[-1][0]):
                 return None
             time.sleep(0.02)
-            claim = self.place / f".{address}.claim.{held[-1][1] + 1 if held else 0}"
+            claim = self.root / "claims" / f"{address}.{held[-1][1] + 1 if held else 0}"
             claim.write_text(json.dumps(points.me()))
             return claim
 

@@ -107,3 +107,35 @@ def test_equal_tasks_are_two_to_dask(tmp_path):
         tasks = [str(tmp_path)] * 2
         assert len(list(computed(noted, tasks, on=cluster.scheduler_address))) == 2
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_file_that_is_no_executor_is_refused(tmp_path):
+    pytest.importorskip("executorlib")
+    file = tmp_path / "jobs.toml"
+    for text in ('executor = "Nothing"', 'executor = "SingleNodeExecutor"\nwaiters = 2'):
+        file.write_text(text)
+        with pytest.raises(InputError):
+            list(computed(noted, [str(tmp_path)], on=str(file)))
+
+
+def often(task: tuple[str, int]) -> int:
+    """One task kills its worker, and is noted before it does."""
+    folder, k = task
+    noted(folder)
+    if k == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return os.getpid()
+
+
+@pytest.mark.nightly
+def test_workers_of_executorlib_live_over_tasks_and_are_replaced(tmp_path):
+    pytest.importorskip("executorlib")
+    file, notes = tmp_path / "jobs.toml", tmp_path / "notes"
+    notes.mkdir()
+    file.write_text('executor = "SingleNodeExecutor"\nmax_workers = 2\nhostname_localhost = true')
+    tasks = [(str(notes), k) for k in range(8)]
+    found = dict(computed(often, tasks, on=str(file), lost=lambda task, why: task[1] == 3))
+    answers = {task[1]: answer for task, answer in found.items()}
+    assert isinstance(answers.pop(3), Exception) and len(answers) == 7
+    assert len({*answers.values()}) < 7 and os.getpid() not in answers.values()
+    _until(lambda: not any(_lives(pid) for pid in answers.values()))

@@ -87,10 +87,10 @@ def test_a_claim_of_a_killed_process_is_followed_by_another(tmp_path):
 def test_a_claim_is_released_alone(tmp_path):
     """One that came later is of a process that took the first for gone, and stays."""
     place, address = Workspace(tmp_path), "3" * 32
-    later = place.place / f".{address}.claim.1"
+    later = tmp_path / "claims" / f"{address}.1"
     with place.claimed(address) as mine:
         assert mine
-        later.write_text((place.place / f".{address}.claim.0").read_text())
+        later.write_text(later.with_suffix(".0").read_text())
     assert place.claims() == [(later, 1)]
 
 
@@ -104,7 +104,7 @@ def test_a_claim_that_found_no_room_is_removed(tmp_path):
             pass
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert not list(place.place.iterdir())
+    assert not list((tmp_path / "claims").iterdir())
 
 
 def test_another_machine_is_gone_after_a_while(tmp_path):

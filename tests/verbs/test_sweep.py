@@ -12,6 +12,7 @@ from small_systems import crystal
 
 import mdnum
 from mdnum.errors import InputError
+from mdnum.sweeps.plan import Question, planned
 from mdnum.verbs import sweep_worker
 
 
@@ -50,6 +51,20 @@ def test_a_sweep_says_what_moves_and_what_failed(swept):
     advice = {one["choice"]: one for one in made.summary["advice"]}
     assert advice["dynamics.timestep"]["end"] == 0.002 and advice["neighbors.skin"]["best"] in (0.2, 0.3)
     assert (made.folder / "report.html").exists()
+
+
+@pytest.mark.parametrize("name", ["argon/crystal-108", None])
+def test_points_of_further_seeds_have_their_own_addresses(simulation, name):
+    """As if each seed were a sweep of its own."""
+    over = {"dynamics.timestep": [0.002], "cutoff.radius": [1.9]}
+
+    def addresses(seeds: int | list[int]) -> list[tuple[Any, str]]:
+        found = planned(name or simulation, over, Question(seeds=seeds, measure="energy"), None)
+        return [(one.point.choices, one.address) for one in found.points]
+
+    together = addresses(3)
+    assert together == [one for seed in range(3) for one in addresses([seed])]
+    assert len({address for _, address in together}) == 9
 
 
 def test_runs_take_the_same_time(swept):
