@@ -211,7 +211,7 @@ def _ends_with(parent: int) -> dict[str, Any]:
 
 @contextmanager
 def opened(on: str | Executor | None, workers: int | None) -> Iterator[_Engine]:
-    """Context manager of an engine: None, tcp://host:port of a dask scheduler, a TOML file, or the user's executor.
+    """Context manager of an engine: None, tcp://host:port of dask, a TOML file, or the user's executor.
 
     Raises:
         InputError: no such engine, or its package is missing.
