@@ -31,6 +31,7 @@ INSIDE = {
     "measure_documents.py": {"mdnum.provenance"},
     "make_systems.py": {"mdnum.systems.load", "mdnum.systems.structures"},
     "scaling.py": {"mdnum.safe_path"},
+    "sweep_overhead.py": {"mdnum.sweeps.measures", "mdnum.verbs"},
 }
 PROGRAMS = sorted([*(ROOT / "scripts").rglob("*.py"), *(ROOT / "examples").glob("*.py")])
 
