@@ -29,9 +29,9 @@ _TERMS = 14
 
 
 def growth(a: Rate) -> Rate:
-    """(exp(a) - 1) / a = Σ aᵏ / (k + 1)!, of a number or of a matrix (3, 3) of a norm up to 0.5.
+    """(exp(a) - 1) / a = Σ aᵏ / (k + 1)! of a number or (3, 3) matrix with norm up to 0.5.
 
-    Of a matrix by its characteristic polynomial, so that it is differentiable where eigenvalues agree.
+    For matrices, the characteristic polynomial is used: differentiable where eigenvalues agree.
     """
     if a.ndim == 0:
         total = jnp.zeros(())
@@ -54,17 +54,17 @@ def invariants(a: Float[Array, "3 3"], square: Float[Array, "3 3"]) -> tuple[Num
 
 
 def times(a: Rate, b: Rate) -> Rate:
-    """The product of two rates of one kind."""
+    """The product of two rates, both numbers or both matrices."""
     return a @ b if a.ndim else a * b
 
 
 def exponential(a: Rate) -> Rate:
-    """exp(a), of a norm up to 0.5; exactly one where a is zero."""
+    """exp(a) of a rate a of norm up to 0.5; exactly one where a is zero."""
     return unit(a) + times(a, growth(a))
 
 
 def unit(a: Rate) -> Rate:
-    """One, of a kind."""
+    """The unit rate: the number one or the unit matrix."""
     return jnp.eye(3) if a.ndim else jnp.ones(())
 
 
@@ -74,18 +74,18 @@ def trace(a: Rate) -> Number:
 
 
 def matrix(a: Rate) -> Float[Array, "3 3"]:
-    """The matrix that a rate is."""
+    """The rate as a matrix of shape (3, 3)."""
     return a if a.ndim else a * jnp.eye(3)
 
 
 def acted(x: Vector, a: Rate) -> Vector:
-    """Vectors, as rows, times a rate, float64."""
+    """Product of vectors (as rows) and a rate, in float64."""
     x = x.astype(jnp.float64)
     return transformed(x, a) if a.ndim else x * a
 
 
 class Barostat(Integrator):
-    """What both barostats share; which words, numbers and boxes they have.
+    """Base class of both barostats, with the options that they accept.
 
     Attributes:
         kT: energy. pressure: energy/length³. relaxation, pressure_relaxation: internal time.
@@ -139,7 +139,7 @@ def volume(cell: Cell) -> Number:
 
 
 class BoxState(NamedTuple):
-    """The extra state of `MTK`."""
+    """The extra state that the integrator `MTK` carries."""
 
     rate: Rate  # of the box, one over time
     atoms: Chain  # thermostats of the atoms
@@ -173,12 +173,12 @@ class MTK(Barostat):
         return BoxState(still, Chain.at_rest(self.chain), Chain.at_rest(self.chain), jnp.zeros(()))
 
     def inertia(self, masses):
-        """Of the box, energy times time²."""
+        """Inertia of the box, energy times time²."""
         share = 3 if self.anisotropic else 1
         return (self.freedom(masses) + 3) / share * self.kT * self.pressure_relaxation**2
 
     def _held(self, v, extra, masses, time):
-        """Both chains for a time; they do not know each other."""
+        """Advance the independent thermostat chains of box and atoms by a time."""
         freedom, kT = self.freedom(masses), self.kT
         own, of_box = self._own(extra, masses)
         scale, atoms = extra.atoms.act(self.kinetic(v, masses), freedom, kT, self.relaxation, time)
@@ -233,7 +233,7 @@ class MTK(Barostat):
 
 
 class Move(NamedTuple):
-    """The extra state of `CellRescaling`: the last move of the box, and what it did."""
+    """The extra state of `CellRescaling`: the last move of the box and its effect."""
 
     strain: Rate  # logarithm of the deformation
     # root: of the volume before; step: of that root; force: on it, and excess: along the other directions,
@@ -276,7 +276,7 @@ class CellRescaling(Barostat):
 
     @property
     def _mobility(self):
-        """Of the root of the volume."""
+        """Mobility of the square root of the volume."""
         return self.compressibility / (4 * self.pressure_relaxation)
 
     def _forces(self, v, at):

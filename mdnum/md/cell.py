@@ -24,7 +24,7 @@ from mdnum.numerics.rounding import Reach
 
 
 class Cell(eqx.Module):
-    """A parallelepiped box. Usable on the host (numpy leaves) and in jit (jax leaves)."""
+    """A parallelepiped box, usable on the host (numpy leaves) and in jit (jax leaves)."""
 
     # lattice vectors as rows, length, shape (3, 3); a free axis may hold a zero vector
     matrix: Float[np.ndarray | jax.Array, "3 3"]
@@ -127,7 +127,7 @@ class Cell(eqx.Module):
         return _subtract(lattice, x, y, z, _images(lattice, x, y, z, rounding))
 
     def deformation(self, now: Cell):
-        """How this box became another, shape (3, 3): lattice vectors, as rows, are those here times it.
+        """Deformation from this box to another, shape (3, 3): new lattice rows = old rows @ deformation.
 
         Directions along free axes stay as they are. Exactly the identity where the vectors are the same.
         """
@@ -142,7 +142,7 @@ class Cell(eqx.Module):
         return self.spanned(self.matrix @ by)
 
     def spanned(self, matrix) -> Cell:
-        """The box of other lattice vectors, as rows, with the same axes periodic (inside jit)."""
+        """A box with new lattice vectors (as rows) and the same periodic axes (inside jit)."""
         flags = np.array(self.pbc)
         rows = jnp.where(flags[:, None], matrix, 0.0)
         # of the products of rows: a free axis, which has none, keeps an inverse of 0
@@ -172,7 +172,7 @@ class Cell(eqx.Module):
         return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
 
     def wrap(self, x, y, z):
-        """Components brought into the box, and the integer lattice coordinates that were taken off."""
+        """Components wrapped into the box, and the integer lattice coordinates that were subtracted."""
         if not any(self.pbc):
             zero = np.zeros_like(x) if isinstance(x, np.ndarray) else jnp.zeros_like(x)
             return (x, y, z), (zero, zero, zero)
@@ -244,7 +244,7 @@ def box_of(boxes, row):
 
 
 class HostCell:
-    """A cell's arithmetic on the host in one dtype, without a module's overhead: for many small calls."""
+    """Arithmetic of a cell on the host in one dtype, with low overhead for many small calls."""
 
     def __init__(self, cell: Cell, dtype: DTypeLike = np.float64):
         self.dtype = np.dtype(dtype)
@@ -296,7 +296,7 @@ def transformed(x, by):
 
 
 def strain_loss(reference: Cell, now: Cell, r_list):
-    """How much shorter a listed distance can have become by deforming the box alone, length.
+    """Bound on how much the deformation of the box alone can shorten a listed distance, length.
 
     A pair just outside the list moves with the box; the deformation F takes a vector of length r_list to
     at least sigma_min(F) * r_list. Added to twice the largest displacement relative to the box it must stay

@@ -34,7 +34,7 @@ class AtCutoff(NamedTuple):
 
 
 class Undecided(Exception):
-    """A ball straddles a threshold: the decision is not proven at this precision."""
+    """Raised if a ball straddles a threshold, so the decision is not proven at this precision."""
 
 
 class Cutoff(ABC):
@@ -59,11 +59,11 @@ class Cutoff(ABC):
         """
 
     def energy_jump(self, at: AtCutoff):
-        """Energy that a pair brings when it enters: the limit of the cut energy at r_cut from inside."""
+        """Energy jump when a pair enters: the limit of the cut energy at r_cut from inside."""
         return self._limits(at)[0] if self.smoothness < 0 else 0 * at.energy
 
     def force_jump(self, at: AtCutoff):
-        """Radial force (positive: repulsive) that a pair brings when it enters, energy per length."""
+        """Jump of the radial force (positive: repulsive) when a pair enters, energy per length."""
         return -2 * at.r_cut * self._limits(at)[1] if self.smoothness < 1 else 0 * at.slope
 
     def jumps(self, at: AtCutoff):
@@ -75,7 +75,7 @@ class Cutoff(ABC):
 
     @property
     def continuous(self) -> Cutoff:
-        """The cutoff with the same forces whose energy does not jump."""
+        """The cutoff with the same forces and a continuous energy."""
         return self if self.smoothness >= 0 else Level(self)
 
     def reference(
@@ -277,12 +277,12 @@ class ForceShifted(Cutoff):
 
 
 class _Switching(Cutoff):
-    """A factor s that goes from 1 at the onset to 0 at the cutoff."""
+    """Base of cutoffs with a switching factor s, from 1 at the onset to 0 at the cutoff."""
 
     switches = True
 
     def factor(self, r, at: AtCutoff):
-        """s(r) and ds/dr past the onset, in plain numpy: written a second time."""
+        """s(r) and ds/dr past the onset: an independent implementation in plain numpy."""
         raise NotImplementedError
 
     def factor_of_ball(self, r2, at: AtCutoff):
@@ -348,7 +348,7 @@ class _SwitchedInDistance(_Switching):
         """Switching function and its derivative for t in [0, 1] from onset to cutoff."""
 
     def switch_of_ball(self, t):
-        """The same in ball arithmetic."""
+        """Switching function and its derivative in ball arithmetic."""
         return self.switch(t)
 
     def cut(self, r2, u, w, at):
@@ -403,7 +403,7 @@ class Cosine(_SwitchedInDistance):
 
 
 class Level(Cutoff):
-    """Another cutoff, its energy shifted so that it ends at zero; the forces stay."""
+    """Another cutoff with its energy shifted to zero at the radius; the forces are unchanged."""
 
     name = "level"
     smoothness = 0

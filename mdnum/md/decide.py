@@ -80,7 +80,7 @@ class PairDecider:
 
     @property
     def exact_thresholds(self) -> tuple[float, ...]:
-        """What every dtype is an approximation of: the thresholds of double precision."""
+        """The thresholds in double precision, which other dtypes approximate."""
         return tuple(threshold.value for threshold in replace(self, dtype="float64").thresholds)
 
     @cached_property
@@ -151,12 +151,12 @@ class PairDecider:
         return thresholds[kind] - self.host_quantity(*displacement).astype(np.float64)
 
     def inside(self, quantity, value):
-        """The decision: quantity against threshold value(s), as the convention has it (jax or numpy)."""
+        """The decision: compare quantities with thresholds by the convention (jax or numpy)."""
         return quantity <= value if self.compare.endswith("<=") else quantity < value
 
 
 class Tables(NamedTuple):
-    """A pair table on the device."""
+    """A pair table (neighbor list) on the device."""
 
     # neighbor of each slot and atom in sorted labels, padded with the number of atoms, shape (slots/8, 8,
     # atoms)
@@ -176,7 +176,7 @@ class Tables(NamedTuple):
 
 
 class Decisions(NamedTuple):
-    """What a pass over a list decided."""
+    """Decisions from one pass over a list."""
 
     bits: UInt8[Array, "words atoms"]  # decisions, eight slots to a byte, shape (slots/8, atoms)
     # smallest |margin| of any listed pair, in the quantity's space. Only where it is within the rounding
@@ -185,7 +185,7 @@ class Decisions(NamedTuple):
 
 
 def packed(halves: UInt8[Array, "groups atoms"]) -> UInt8[Array, "words atoms"]:
-    """Decisions of groups, two groups to a byte."""
+    """Pack the decisions of groups, two groups per byte."""
     return halves[0::2] | (halves[1::2] << jnp.uint8(GROUP))
 
 
@@ -265,7 +265,7 @@ class SlotJudge:
         return self.finish(nearest, halves)
 
     def finish(self, nearest, halves) -> Decisions:
-        """The pass's decisions, two groups to a byte."""
+        """Decisions of the complete pass, two groups per byte."""
         return Decisions(packed(halves), jnp.min(nearest, initial=jnp.inf).astype(jnp.float64))
 
 
@@ -283,7 +283,7 @@ def zeros(shape: int | tuple[int, ...], dtype: Any) -> Array:
 
 
 class Changes(NamedTuple):
-    """Decisions that changed, step after step, each seen from the atom that is sorted first."""
+    """Decisions that changed, step by step, each stored once, at the atom that is sorted first."""
 
     # row, sorted atoms and whether inside now (plus 2 for each channel before), shape (room, 4)
     pairs: Int[Array, "room 4"]
@@ -294,16 +294,16 @@ class Changes(NamedTuple):
 
     @classmethod
     def empty(cls, room: int, dtype: np.dtype) -> Changes:
-        """Room for so many."""
+        """Empty buffers with space for a given number of changes."""
         return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(3, np.int64))
 
     def emptied(self) -> Changes:
-        """The same room without any."""
+        """The same buffers without any changes."""
         return self._replace(count=jnp.zeros_like(self.count))
 
     @property
     def found(self) -> int:
-        """How many have been seen, noted or not."""
+        """Number of changes found, stored or not."""
         return int(np.asarray(self.count)[0])
 
     def cut(self) -> Changes:
@@ -376,7 +376,7 @@ def _cut(parts: tuple[Array, ...], room: int) -> tuple[Array, ...]:
 
 @cache
 def _noting() -> str:
-    """The name by which XLA knows `_note`."""
+    """The name under which `_note` is registered with XLA."""
     made = cfunc(numba.types.intp(numba.types.intp), _note)
     return registered("mdnum_changes", made.ctypes, made)
 

@@ -86,7 +86,7 @@ def _binned(x, cell: Cell, low, span, bins: _Whole):
 def _searched(
     x, places, cell: Cell, start, r2_list, bins: _Whole, reach: _Whole, room: int, slots: int, blocks: int
 ):
-    """Neighbors of every sorted atom, and the most that one has, which may be more than the slots."""
+    """Neighbors of every sorted atom, and the largest neighbor count, which may exceed the slots."""
     atoms = x.shape[1]
     matrix = cell.matrix
     # layer after layer along the third axis, as the host goes

@@ -1,4 +1,4 @@
-"""The embedded-atom method from a single-element setfl table (.eam.alloy), every digit of it."""
+"""The embedded-atom method from a single-element setfl table (.eam.alloy), in full precision."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mdnum.md.manybody import ManyBody, Smoothness
 
 @dataclass(frozen=True)
 class Setfl:
-    """An embedded-atom table as the file has it."""
+    """An embedded-atom table with the contents of a setfl file."""
 
     element: str  # chemical symbol
     comment: tuple[str, ...]  # the three lines at the head of the file
@@ -150,7 +150,7 @@ class Spline(eqx.Module):
         return c0 + t * (c1 + t * (c2 + t * c3)), c1 + t * (c2 + t * c3) + t * (c2 + t * c3 + t * c3)
 
     def inside(self, x: Float[Array, "..."]) -> Array:
-        """Whether x lies on the table, a rounding's breadth included."""
+        """Whether x lies in the range of the table, within rounding error."""
         slack = 1e-9 * self.step
         return (x >= self.start - slack) & (x <= self.end + slack)
 
@@ -190,7 +190,7 @@ class EmbeddedAtom(ManyBody):
         return jnp.where(counts, self.pair(jnp.where(counts, r, 1.0)), 0.0)
 
     def embed(self, rho: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Energy of an atom in a density; NaN off the table."""
+        """Energy of an atom in a density; NaN outside the table."""
         # a factor and not a selection: it makes the slope NaN too, and forces with it
         on = self.embedding.inside(rho)
         return self.embedding(rho * jnp.where(on, 1.0, jnp.nan).astype(rho.dtype))

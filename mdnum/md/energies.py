@@ -56,7 +56,7 @@ class Convention:
 
     @property
     def label(self) -> str:
-        """Its name, for people."""
+        """Readable name of the convention."""
         base = (
             "mdnum's own" if self.native
             else "multi-image list" if self.images
@@ -130,7 +130,7 @@ class Call:
 
 @jax.custom_jvp
 def _real_slope(x: Array, inverse: Array) -> Array:
-    """Fractional coordinates whose tangents are those of real ones, as jax-md's transforms expect them."""
+    """Fractional coordinates with the tangents of real coordinates, as jax-md's transforms expect."""
     return x @ inverse
 
 
@@ -167,14 +167,14 @@ class EnergyFunction(ManyBody):
 
     @property
     def call(self) -> Call:
-        """The function with its convention."""
+        """The function together with its calling convention."""
         if isinstance(self.function, Call):
             return self.function
         return Call(self.function, Convention(native=True, box="cell"), name=self.name)
 
     @property
     def fixed_box(self) -> bool:
-        """Whether it keeps the box that it was made with."""
+        """Whether the function keeps the box that it was created with."""
         return any(self.pbc) and not self.call.how.box
 
     def energy(self, positions, neighbor, cell):
@@ -255,7 +255,7 @@ def energy_function(
 
 
 def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Convention:
-    """What a function's signature says of its convention.
+    """Calling convention of a function, derived from its signature.
 
     Args:
         parameters: whether there are some, or something that makes them.

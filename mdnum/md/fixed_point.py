@@ -60,7 +60,7 @@ def power_of_two(x: float) -> float:
 
 @dataclass(frozen=True)
 class FixedPointUnits:
-    """The units in which a run counts."""
+    """The units of a run in fixed-point numbers."""
 
     spacing: float  # of positions, length, the same along all axes
     force: float  # of pair forces, energy/length
@@ -131,7 +131,7 @@ class FixedPointUnits:
         return eqx.tree_at(lambda one: one.inverse, made, inverse)
 
     def positions(self, x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "atoms 3"]:
-        """The nearest whole multiples of the spacing."""
+        """Positions rounded to the nearest whole multiples of the spacing."""
         return np.round(np.asarray(x, np.float64) / self.spacing) * self.spacing
 
     def total(self, terms: Float[Any, "*shape"]) -> Float[Any, ""]:
@@ -139,7 +139,7 @@ class FixedPointUnits:
         return jnp.sum(jnp.round(terms * (1 / self.energy))) * self.energy
 
     def to_dict(self, timestep: float) -> dict[str, float]:
-        """What a person may want to know about the units, in those of the system."""
+        """Summary of the fixed-point units, expressed in the units of the system."""
         return {
             "spacing": self.spacing,
             "force": self.force,
@@ -174,7 +174,7 @@ class FixedPointDecider(PairDecider):
 
     @property
     def space(self) -> str:
-        """Squares are compared, whatever the convention: of whole numbers that is the same."""
+        """Squared distances are always compared; for integers every convention is equivalent."""
         return "r2"
 
     @property
@@ -193,7 +193,7 @@ class FixedPointDecider(PairDecider):
 
     @cached_property
     def bounds(self) -> tuple[float, ...]:
-        """Nothing is rounded, and no margin is zero."""
+        """Bounds on the margin's error are zero: nothing is rounded, and no margin is zero."""
         return (0.0,) * len(self.r_cut)
 
     def inside(self, quantity, value):
@@ -207,7 +207,7 @@ class FixedPointDecider(PairDecider):
         return whole[0] * whole[0] + whole[1] * whole[1] + whole[2] * whole[2]
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
-        """Squared distances, rounded once."""
+        """Squared distances on the host, rounded once."""
         return self.host_squares(dx, dy, dz).astype(np.float64) * (self.spacing * self.spacing)
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
@@ -226,7 +226,7 @@ _ROOM = 62 - _SHIFT
 
 
 class FixedPointStep(Integrator):
-    """Kicks, drifts and sums of integers: what the fixed-point schemes share."""
+    """Base of the fixed-point schemes: kicks, drifts and sums of integers."""
 
     units: FixedPointUnits = eqx.field(static=True, kw_only=True)  # the units
     # unit of momentum: that of force times half a time step
@@ -261,14 +261,14 @@ class FixedPointStep(Integrator):
 
     @abstractmethod
     def undrift(self, x, v, extra, masses, step, order):
-        """Places, velocities and extra state before the drift that follows a step."""
+        """Positions, velocities and extra state before the drift that follows a step."""
 
     def kinetic(self, v, masses):
-        """The same in every order of atoms."""
+        """Kinetic energy, independent of the order of the atoms."""
         return self.units.total(0.5 * (masses * squared_norm(v[0], v[1], v[2], self.zero)))
 
     def glide(self, x, p, masses, share: float, direction: int):
-        """Places after a share of a step at given momenta; direction -1 reverses it."""
+        """Positions after a fraction of a step at given momenta; direction -1 reverses it."""
         moved = jnp.round(p * (share * self.stride / masses))
         return x + direction * self.units.spacing * moved
 
@@ -334,7 +334,7 @@ class FixedPointLangevin(FixedPointStep):
 
 
 def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPointStep:
-    """The scheme in fixed-point numbers.
+    """The fixed-point version of an integrator.
 
     Raises:
         InputError: the friction is too small or too large for a step, or the integrator has no such twin.
@@ -386,7 +386,7 @@ def _period(kept: int) -> int:
 
 
 def forgotten_bits(integrator: Integrator) -> float:
-    """Bits that friction forgets in a step for each component of a momentum; 0 without a thermostat."""
+    """Bits that friction removes per step from each momentum component; 0 without a thermostat."""
     if isinstance(integrator, Langevin):
         return float(integrator.friction) * float(integrator.timestep) / math.log(2)
     return 0.0
@@ -459,7 +459,7 @@ class FixedPointJudge(SlotJudge):
         return bits, nearest
 
     def finish(self, nearest, halves) -> Decisions:
-        """The pass's decisions, two groups to a byte."""
+        """Decisions of the complete pass, two groups per byte."""
         unit = self.units.spacing * self.units.spacing
         closest = jnp.min(nearest, initial=jnp.iinfo(jnp.int64).max)
         margin = jnp.where(closest < _NOWHERE, (closest.astype(jnp.float64) - 0.5) * unit, jnp.inf)
@@ -496,7 +496,7 @@ class FixedPointForce(PairForce):
         return Guarded(self.model, self.zero, reproducible)
 
     def judge(self, positions: Float[Array, "3 atoms"]) -> FixedPointJudge:
-        """What decides at these positions."""
+        """The pair decider at these positions."""
         assert isinstance(self.decider, FixedPointDecider)
         return FixedPointJudge(self.decider, self.thresholds, self.cell, self.zero, positions, self.units)
 

@@ -1,4 +1,4 @@
-"""What XLA calls on a CPU: numba functions that read its call frames (xla/ffi/api/c_api.h, version 0.3)."""
+"""XLA's CPU callbacks: numba functions that read its call frames (xla/ffi/api/c_api.h, version 0.3)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ALIVE: list[Any] = []
 
 
 def registered(name: str, function: Any, *held: Any) -> str:
-    """A name by which XLA knows a C function on a CPU, which is kept with what it needs."""
+    """Register a C function with XLA on the CPU and return its name; keep its data alive."""
     ALIVE.extend([function, *held])
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform="cpu")
     return name
@@ -47,7 +47,7 @@ carray: Any = numba.carray  # pyright: ignore
 
 @intrinsic
 def pointer(typingctx: Any, address: Any) -> Any:
-    """A number as the address of memory."""
+    """Convert a number to a memory address."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
@@ -57,7 +57,7 @@ def pointer(typingctx: Any, address: Any) -> Any:
 
 @intrinsic
 def call(typingctx: Any, address: Any, arguments: Any) -> Any:
-    """What a C function at an address makes of a tuple of 64-bit arguments."""
+    """Call the C function at an address with a tuple of 64-bit arguments, and return its result."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         whole = context.get_value_type(types.intp)
@@ -70,7 +70,7 @@ def call(typingctx: Any, address: Any, arguments: Any) -> Any:
 
 @intrinsic
 def added(typingctx: Any, address: Any, amount: Any) -> Any:
-    """Add to the 64-bit number at an address, in one step for all threads; the number before."""
+    """Atomically add to the 64-bit number at an address, and return the previous number."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         at = builder.inttoptr(args[0], context.get_value_type(types.intp).as_pointer())
@@ -84,14 +84,14 @@ free = types.ExternalFunction("free", types.void(types.intp))
 
 
 def _place(builder: Any, address: Any, k: Any) -> Any:
-    """Where the k-th of the 64-bit numbers at an address is."""
+    """Location of the k-th 64-bit number at an address."""
     return builder.gep(builder.inttoptr(address, ir.IntType(64).as_pointer()), [k])
 
 
 # not arrays and functions of numba's, each of which takes a tenth of a second to compile
 @intrinsic
 def peek(typingctx: Any, address: Any, k: Any) -> Any:
-    """The k-th of the 64-bit numbers at an address."""
+    """Read the k-th 64-bit number at an address."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.load(_place(builder, *args))
@@ -101,7 +101,7 @@ def peek(typingctx: Any, address: Any, k: Any) -> Any:
 
 @intrinsic
 def poke(typingctx: Any, address: Any, k: Any, value: Any) -> Any:
-    """Make the k-th of the 64-bit numbers at an address a value."""
+    """Write a value to the k-th 64-bit number at an address."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         builder.store(args[2], _place(builder, *args[:2]))

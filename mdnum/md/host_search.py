@@ -160,7 +160,7 @@ def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
 
 @njit
 def _within(x, y, z, xi, yi, zi, r2_list, mask):
-    """Which candidates are near."""
+    """Mask of the candidates within the list radius."""
     for k in range(len(x)):
         dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         mask[k] = dx * dx + dy * dy + dz * dz <= r2_list

@@ -34,18 +34,18 @@ Order = Int[Array, "atoms"]
 
 
 def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Array, "*rest atoms"]:
-    """An array over the atoms of a list, in the user's order."""
+    """Convert an array over a list's atoms from sorted order to the user's order."""
     return jnp.zeros_like(a).at[..., order].set(a)
 
 
 class ByAtom(NamedTuple):
-    """A part of an extra state whose last axis is the atoms: it is sorted with them."""
+    """Array of an extra state whose last axis runs over atoms, sorted together with them."""
 
     value: Array
 
 
 def by_atom(change: Callable[[Array], Array], extra: Any) -> Any:
-    """An extra state with what belongs to atoms changed."""
+    """An extra state with a function applied to its per-atom arrays."""
 
     def one(part: Any) -> Any:
         return ByAtom(change(part.value)) if isinstance(part, ByAtom) else part
@@ -94,7 +94,7 @@ class AtStep(NamedTuple):
 
 
 class Integrator(eqx.Module):
-    """How positions and velocities get from one force evaluation to the next.
+    """Base class: update of positions and velocities between force evaluations.
 
     A system file has its fields as keys, but not those that are keywords only; `quantity` says which are no
     pure numbers. A static field takes the value in the file as it is.
@@ -117,13 +117,13 @@ class Integrator(eqx.Module):
 
     @classmethod
     def keys(cls) -> dict[str, Field[Any]]:
-        """Its fields, by the keys that a system file has for them."""
+        """Fields of the integrator, by their keys in a system file."""
         units = [(one.metadata.get("unit"), one) for one in fields(cls) if not one.kw_only]
         return {unit if unit in ("temperature", "seed") else one.name: one for unit, one in units}
 
     @classmethod
     def numbers(cls) -> list[str]:
-        """The keys of its numbers, which it may be differentiated by."""
+        """Keys of the numbers with respect to which the integrator can be differentiated."""
         return [key for key, one in cls.keys().items() if key != "seed" and not one.metadata.get("static")]
 
     @classmethod
@@ -145,12 +145,12 @@ class Integrator(eqx.Module):
         return None if field is None else getattr(self, field.name)
 
     def number(self, key: str, units: Units) -> float:
-        """What a system file says by a key."""
+        """Number of a field by its key, in the units of a system file."""
         field = self.keys()[key]
         return converted(field, float(getattr(self, field.name)), units, back=True)
 
     def with_number(self, key: str, value: Any, units: Units) -> Integrator:
-        """The integrator with another number by a key, without compiling anew."""
+        """The integrator with another number for a key, without recompilation."""
         field = self.keys()[key]
         # of a numpy number: a Python one would make another compiled program (a weak type)
         inner = jnp.asarray(np.float64(converted(field, value, units)))
@@ -209,13 +209,13 @@ class Integrator(eqx.Module):
         return max(3 * masses.shape[0] - self.constraints, 1)
 
     def kinetic(self, v: Vector, masses: Masses) -> Number:
-        """Kinetic energy."""
+        """Kinetic energy of all atoms."""
         speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
         return 0.5 * jnp.sum(masses * speed2)
 
     @property
     def anisotropic(self) -> bool:
-        """Whether it needs the virial as a tensor, which costs a sixth of a pair's work."""
+        """Whether the integrator needs the virial tensor, which costs a sixth of a pair's work."""
         return False
 
     @property
@@ -232,7 +232,7 @@ class Integrator(eqx.Module):
 
 
 class StepEnd(NamedTuple):
-    """What a step has made, in the order that it was given."""
+    """Result of a step, with atoms in the input order."""
 
     # v, extra: full-step velocities and the extra state with them
     v: Vector
@@ -338,13 +338,13 @@ def without_kick(integrator: Integrator) -> str | None:
 
 
 def check_kick(integrator: Integrator) -> None:
-    """Refuse an integrator that a linearization would not see, with an `InputError`."""
+    """Raise `InputError` for an integrator that a linearization does not support."""
     if why := without_kick(integrator):
         raise InputError(f"the run cannot be linearized here: {why}", where="dynamics.kind")
 
 
 def check_one_box(integrator: Integrator, what: str) -> None:
-    """Refuse an integrator that moves the box for what has one box alone, with an `InputError`."""
+    """Raise `InputError` if the integrator moves the box where a fixed box is required."""
     if integrator.moves_cell:
         raise InputError(
             f"{what} need a fixed box, but {integrator.name} changes the box", where="dynamics.kind"
@@ -352,7 +352,7 @@ def check_one_box(integrator: Integrator, what: str) -> None:
 
 
 def _is_linear(integrator: KickDrift) -> bool:
-    """Whether the drift has the same derivative by positions and velocities at two places."""
+    """Whether the drift has the same derivative (positions, velocities) at two places."""
     x, v, dx, dv = jax.random.normal(jax.random.key(0), (4, 3, 4), jnp.float64)
     zero, order = jnp.zeros((), jnp.int64), jnp.arange(4)
 

@@ -1,4 +1,4 @@
-"""The one door to jax-md: displacement, neighbor lists and pair search, with its traps held off."""
+"""The only interface to jax-md: displacement, neighbor lists and pair search, avoiding its pitfalls."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _quiet_scatter() -> Iterator[None]:
 
 
 def upstream() -> ModuleType:
-    """The package jax_md, imported when first asked for; takes seconds."""
+    """The package jax_md, imported at the first call, which takes seconds."""
     with standard_promotion():
         import jax_md
         import jax_md.custom_partition
@@ -226,7 +226,7 @@ def multi_image(
 
 
 class PairSearch:
-    """jax-md's own neighbor search for one cell, called again and again with new positions.
+    """jax-md's own neighbor search for one cell, for repeated calls with new positions.
 
     It is handed fractional coordinates folded into [0, 1) and the perpendicular widths as its box: a
     position outside the box silently drops pairs in jax-md, and its triangular-box path flags good boxes as

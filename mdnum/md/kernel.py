@@ -64,7 +64,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 class PairSums(NamedTuple):
-    """What a loop over a list gives."""
+    """Results of a loop over a list."""
 
     # of each term over the slots of each atom, first slot first, shape (terms, atoms)
     sums: Float[Array, "terms atoms"]
@@ -140,7 +140,7 @@ def left_out(potential: Any) -> str | None:
 
 
 class _NotKnown(Exception):
-    """An operation without a counterpart; its name in jax."""
+    """Raised for a jax operation without an LLVM counterpart, with the name of the operation."""
 
 
 class _Value(NamedTuple):
@@ -441,7 +441,7 @@ def _divide_once(
 
 
 def _same(single: str, value: str, name: str, kind: str) -> str:
-    """A vector of one value again and again."""
+    """A vector with the same value in every lane."""
     return (
         f"{name}.first = insertelement {kind} poison, {single} {value}, i64 0\n  "
         f"{name} = shufflevector {kind} {name}.first, {kind} poison, <WIDE x i32> zeroinitializer"
@@ -449,7 +449,7 @@ def _same(single: str, value: str, name: str, kind: str) -> str:
 
 
 def _of_width(text: str, wide: int) -> str:
-    """Lines for vectors of so many atoms."""
+    """Adapt lines of source to vectors of a given number of atoms."""
     text = re.sub(r"ALL\[(.+?)\]", lambda one: "<" + ", ".join([one[1]] * wide) + ">", text)
     kinds = {"VEC": "double", "BOOL": "i1", "BYTE": "i8", "LONG": "i64"}
     for name, kind in kinds.items():
@@ -644,7 +644,7 @@ _USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _WORD, _TABLE, _THREADS, _ASKED, _NEAREST
 
 @njit
 def _work(job):
-    """Take one block of a job after the other, until none is left."""
+    """Process the blocks of a job one by one until none is left."""
     block, blocks = added(job + 8 * _NEXT, 1), peek(job, _BLOCKS)
     if block >= blocks:
         return
@@ -688,13 +688,13 @@ def _work(job):
 
 @njit
 def _leave(job):
-    """The last one to use a job clears it away."""
+    """Leave a job; the last thread that leaves it frees its memory."""
     if added(job + 8 * _USERS, -1) == 1:
         free(job)
 
 
 def _help(job):
-    """What another thread does."""
+    """The task that a helping thread runs."""
     _work(job)
     _leave(job)
     return 0
@@ -702,7 +702,7 @@ def _help(job):
 
 @njit
 def _helped(job, frame, helpers, task):
-    """Ask XLA's threads for help; without any the work is done all the same."""
+    """Request help from XLA's threads; without help, the calling thread does all the work."""
     api, asked = peek(frame, 2), job + 8 * _ASKED
     schedule, ask = peek(api, 17), peek(api, 18)
     poke(asked, 0, 32)

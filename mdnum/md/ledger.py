@@ -1,4 +1,4 @@
-"""Pairs inside and their flips as columns, of a simulation and of anybody's trajectory alike."""
+"""Tables of pairs inside and their flips, for simulations and external trajectories."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Columns:
         return type(self)(**chosen)
 
     def equals(self, other: Columns) -> bool:
-        """Whether all columns are the same to the last bit."""
+        """Whether two tables have bitwise identical columns."""
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
     def to_pandas(self) -> Any:
@@ -42,7 +42,7 @@ class Columns:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Any]) -> Any:
-        """The rows of parts, one after the other; at least one part. Known is what all of them know."""
+        """Concatenate the rows of at least one table, keeping the columns known in all of them."""
         columns = {name: [vars(one)[name] for one in parts] for name in vars(parts[0])}
         others = {k: [v for v in one if not isinstance(v, np.ndarray)] for k, one in columns.items()}
         return cls(**{k: others[k][0] if others[k] else np.concatenate(one) for k, one in columns.items()})

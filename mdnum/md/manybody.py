@@ -1,4 +1,4 @@
-"""What a many-body potential is: an energy over a neighbor list, and what follows from it."""
+"""Many-body potentials: an energy over a neighbor list, with forces and stress derived from it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mdnum.md.jaxmd import NeighborList
 
 @dataclass(frozen=True)
 class Smoothness:
-    """What happens to the energy when a pair crosses r_cut."""
+    """Smoothness of the energy when a pair crosses r_cut."""
 
     # continuous derivatives of the energy at r_cut: -1 where the energy itself jumps, 0 where only the force
     # does, math.inf where every derivative vanishes
@@ -111,7 +111,7 @@ class ManyBody(eqx.Module):
 
 
 def leaves_by_path(potential: Any) -> dict[str, Any]:
-    """The arrays of a potential by where they are in it, such as "pair.values"."""
+    """The arrays of a potential by their paths, such as "pair.values"."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(potential)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
@@ -128,7 +128,7 @@ def quantities_of(potential: Any) -> dict[str, Any]:
 
 
 def with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
-    """The potential with other quantities; inside jit too."""
+    """The potential with other parameters; also inside jit."""
     names, tree = list(leaves_by_path(potential)), jax.tree.structure(potential)
     leaves = [values.get(name, leaf) for name, leaf in zip(names, jax.tree.leaves(potential), strict=True)]
     whole = jax.tree.unflatten(tree, leaves)

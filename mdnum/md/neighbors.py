@@ -22,7 +22,7 @@ SLOTS = 8
 
 @dataclass(frozen=True)
 class RebuildRule:
-    """When a list is rebuilt, in the words of LAMMPS's neigh_modify."""
+    """Rule for rebuilding a list, in the terms of LAMMPS's neigh_modify."""
 
     skin: float  # r_list - r_cut, length
     every: int = 1  # a list may be rebuilt only at multiples of this many steps after its build
@@ -56,24 +56,24 @@ class PairTable:
 
     @cached_property
     def index(self) -> Int[np.ndarray, "slots atoms"]:
-        """`found`, on the host."""
+        """The neighbor index table `found`, copied to the host."""
         return np.asarray(self.found)
 
     @cached_property
     def order(self) -> Int[np.ndarray, "atoms"]:
-        """`sorting`, on the host."""
+        """The order of sorted atoms, `sorting`, copied to the host."""
         return np.asarray(self.sorting)
 
     @cached_property
     def place(self) -> Int[np.ndarray, "atoms"]:
-        """Where each atom is in the sorted order: the inverse of `order`."""
+        """Index of each atom in the sorted order: the inverse of `order`."""
         place = np.empty_like(self.order)
         place[self.order] = np.arange(len(place))
         return place
 
     @property
     def slots(self) -> int:
-        """Room per atom."""
+        """Number of neighbor slots per atom."""
         return self.found.shape[0]
 
     @cached_property
@@ -121,7 +121,7 @@ class ListBuilder(Protocol):
 
     @property
     def name(self) -> str:
-        """The word of system files."""
+        """Name of the list builder in system files."""
         ...
 
     def build(
@@ -143,7 +143,7 @@ class HostBuilder:
 
 @dataclass(frozen=True)
 class JaxMdBuilder:
-    """jax-md's partition.neighbor_list, through the adaptor that keeps its traps shut."""
+    """jax-md's partition.neighbor_list, through an adaptor that avoids its pitfalls."""
 
     name: str = "jax-md"
 
@@ -169,7 +169,7 @@ BUILDERS.add("device", "mdnum.md.device_search:BUILDER")
 
 
 def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
-    """Refuse a list radius that the minimum image cannot serve.
+    """Raise if the list radius is too large for the minimum image.
 
     Raises:
         InputError: r_cut + skin exceeds half the smallest perpendicular width of the box.
@@ -186,7 +186,7 @@ def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
 
 @dataclass
 class VerletList:
-    """A list that grows its capacity when it must and remembers where it was built."""
+    """Verlet list that grows its capacity when needed and stores the positions of its last build."""
 
     builder: ListBuilder  # the neighbor search
     rule: RebuildRule  # when to rebuild

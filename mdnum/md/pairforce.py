@@ -46,7 +46,7 @@ _FEW_TYPES = 6
 
 
 class Forces(NamedTuple):
-    """What one evaluation gives."""
+    """Result of one force evaluation."""
 
     force: Float[Array, "3 atoms"]  # energy/length, shape (3, atoms)
     # energy of each atom, half of its pairs' (or, where a potential has no such division, the total on the
@@ -100,7 +100,7 @@ class PairForce(eqx.Module):
         return fence(x, self.zero) if self._short else x
 
     def judge(self, positions: Float[Array, "3 atoms"]) -> SlotJudge:
-        """What decides at these positions."""
+        """The pair decider at these positions."""
         return SlotJudge(self.decider, self.thresholds, self.cell, self.zero, positions)
 
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
@@ -117,7 +117,7 @@ class PairForce(eqx.Module):
 
     @property
     def _inside(self) -> str:
-        """How the margin of a pair inside compares with 0."""
+        """Comparison of the margin with 0 for a pair inside the cutoff."""
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
     def _geometry(self, own, other, types):
@@ -163,7 +163,7 @@ class PairForce(eqx.Module):
         return wide and few and self.reduction == Sequential() and foreign.known()
 
     def _terms(self, tensor: bool) -> Callable[..., tuple[Float[Array, "..."], ...]]:
-        """What a pair adds to force, energy and virial, from its displacement, square and decision.
+        """Contributions of a pair to force, energy and virial, from its displacement, square and decision.
 
         Args:
             tensor: whether the virial has six components, in Voigt's order.
@@ -184,7 +184,7 @@ class PairForce(eqx.Module):
         return terms
 
     def weights(self, tables: Tables) -> list[Float[Array, "atoms"]]:
-        """The weights of the terms that have some, in the order of the tables."""
+        """Weights of all weighted terms, in the order of the tables."""
         return [one[tables.order] for one in self.model.weights if one is not None]
 
     def in_blocks(
@@ -234,7 +234,7 @@ class PairForce(eqx.Module):
 
 
 class ChannelForce(PairForce):
-    """Forces of terms with different radii: one pair force after the other over the same list.
+    """Forces of terms with different radii, evaluated one after the other over the same list.
 
     Their decisions lie one behind the other along the words.
     """
@@ -373,7 +373,7 @@ VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
 def symmetric(components: Iterable[Float[Array, ""]]) -> Float[Array, "3 3"]:
-    """The matrix of six components in Voigt's order."""
+    """The symmetric matrix with six given components in Voigt order."""
     xx, yy, zz, yz, xz, xy = components
     return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
 
@@ -460,7 +460,7 @@ class ManyBodyForce(eqx.Module):
 
     @property
     def dtype(self) -> np.dtype:
-        """Of the positions that the energy function receives."""
+        """Data type of the positions that the energy function receives."""
         return self.policy.dtype("force")
 
     def placed(self, x: Float[Array, "atoms 3"], tables: Tables) -> Float[Array, "atoms 3"]:
@@ -471,12 +471,12 @@ class ManyBodyForce(eqx.Module):
     def energy_of(
         self, tables: Tables, neighbor: Any, potential: Any = None
     ) -> Callable[[Any, Any, Any], Float[Array, ""]]:
-        """The energy by sorted positions (atoms, 3), lattice vectors as rows, and a deformation of both."""
+        """Energy as a function of sorted positions (atoms, 3), lattice rows, and a deformation of both."""
         own = self.potential if potential is None else potential
         return lambda x, matrix, by: own.deformed(self.placed(x, tables), neighbor, matrix, by)
 
     def _differentiate(self, positions, tables: Tables, bits):
-        """Energy, and its derivatives by positions and by strain."""
+        """Energy and its derivatives with respect to positions and strain."""
         neighbor = self.neighbors(lax.stop_gradient(positions), tables, bits)
         energy_of, matrix = self.energy_of(tables, neighbor), self.cell.matrix.astype(self.dtype)
         unit = jnp.eye(3, dtype=self.dtype)
@@ -493,7 +493,7 @@ class ManyBodyForce(eqx.Module):
 
 
 class MdState(NamedTuple):
-    """Between two force evaluations, in the order of the tables."""
+    """State between two force evaluations, with atoms in the order of the tables."""
 
     step: Int[Array, ""]  # the step whose forces come next
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
@@ -503,7 +503,7 @@ class MdState(NamedTuple):
 
 
 class PairDynamics(eqx.Module):
-    """Pairs of a fixed list that flip when they are told to.
+    """Dynamics on a fixed list of pairs with imposed decisions.
 
     For replays (one run handed the decisions of another) and for gradients at fixed decisions. A rollout
     does the same in its compiled epochs, where the decisions are the list's own.
@@ -527,11 +527,11 @@ class PairDynamics(eqx.Module):
         return jnp.stack(groups)
 
     def decide(self, state: MdState) -> UInt8[Array, "words atoms"]:
-        """The list's own decisions."""
+        """Decisions of the list at the current positions."""
         return self.force.decide(state.x, self.tables).bits
 
     def step(self, state: MdState, decisions: UInt8[Array, "words atoms"]) -> MdState:
-        """One step, with the forces of the pairs that are decided to be inside."""
+        """Take one time step, with the forces of the pairs that are decided to be inside."""
         made = self.force(state.x, self.tables, decisions=False, given=decisions)
         order, cell = self.tables.order, self.force.cell
         end = one_step(self.integrator, cell, self.masses, order, *state, made)

@@ -81,24 +81,24 @@ class PairPotential(eqx.Module):
 
     @property
     def typed(self) -> PairPotential:
-        """It with its parameters by species as two by pair type, those of the first and of the second one."""
+        """The potential with each per-species parameter as two per-pair-type values (first, second atom)."""
         return self
 
     def split(self) -> tuple[Any, Any]:
-        """It with its parameters by pair type alone, and with the shared ones alone; None for the others."""
+        """Two copies: one with only the per-pair-type parameters, one with only the shared; others None."""
         return self, jax.tree.map(lambda _: None, self)
 
     @property
     def leaves(self) -> dict[str, Any]:
-        """Its parameters by pair type, by name, each of shape (types,)."""
+        """Per-pair-type parameters by name, each of shape (types,)."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def with_leaves(self, leaves: Mapping[str, Any]) -> PairPotential:
-        """The same form with other parameters."""
+        """The same potential form with other parameters."""
         return replace(self, **leaves)
 
     def constants(self, kind: int) -> dict[str, Any]:
-        """Its parameters for one pair type, those by species as two; not those that all share."""
+        """Parameters for one pair type (per-species ones as two values), without the shared parameters."""
         return jax.tree.map(lambda leaf: float(leaf[kind]), dict(self.typed.leaves))
 
 
@@ -233,7 +233,7 @@ class PairFunction(PairPotential):
         return energy, slope * (0.5 / r)
 
     def energy(self, r2: Float[Array, "..."]) -> Float[Array, "..."]:
-        """As the first of `evaluate`."""
+        """Energy at squared distances, the first value of `evaluate`."""
         parameters = self.typed.leaves | self.shared
         return self.function(r2 if self._of_square else jnp.sqrt(r2), **parameters)
 
@@ -369,7 +369,7 @@ class CutPotential(eqx.Module):
 
     @property
     def parts(self) -> tuple[CutPotential, ...]:
-        """The channels of decisions: this one."""
+        """The channels of decisions; this potential is the only one."""
         return (self,)
 
     @property
@@ -393,12 +393,12 @@ class CutPotential(eqx.Module):
 
     @property
     def pair_types(self) -> int:
-        """How many kinds of pairs there are."""
+        """Number of pair types."""
         return self.r_cut.shape[0]
 
     @property
     def typed(self) -> CutPotential:
-        """It with its parameters by species as two by pair type."""
+        """The potential with each per-species parameter as two per-pair-type values."""
         return replace(self, potential=self.potential.typed)
 
     def at_cutoff(self) -> AtCutoff:
@@ -467,12 +467,12 @@ class Channels(eqx.Module):
 
     @property
     def cutoff(self) -> Together:
-        """The ends of all terms."""
+        """The cutoffs of all terms."""
         return Together(tuple(term.cutoff for term in self.terms.values()))
 
     @property
     def weights(self) -> tuple[Any, ...]:
-        """Those of all channels."""
+        """Weights of the terms of all channels."""
         return tuple(weight for part in self.parts for weight in part.weights)
 
     @property
@@ -493,7 +493,7 @@ class Channels(eqx.Module):
 def each_term(
     model: CutPotential | Channels, change: Callable[[CutPotential], CutPotential]
 ) -> CutPotential | Channels:
-    """A model with each of its terms changed; outside jit."""
+    """The model with every term changed by a function; outside jit."""
     made = {name: change(term) for name, term in model.terms.items()}
     return made[""] if "" in made else Channels.of_terms(made)
 

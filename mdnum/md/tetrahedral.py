@@ -46,7 +46,7 @@ class StillingerWeber(ManyBody):
 
     @property
     def r_cut(self) -> Any:
-        """a sigma, length."""
+        """Cutoff radius a sigma, length."""
         return self.a * self.sigma
 
     def energy(self, positions, neighbor, cell):
@@ -116,7 +116,7 @@ class Tersoff(ManyBody):
 
     @property
     def r_cut(self) -> Any:
-        """R + D, length."""
+        """Cutoff radius R + D, length."""
         return self.R + self.D
 
     def taper(self, r: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -22,20 +22,20 @@ _WEIGHTS = (_FIRST, 1 - 2 * _FIRST, _FIRST)
 
 
 class Chain(NamedTuple):
-    """Thermostats, each of which holds the one before it."""
+    """Nosé-Hoover chain: each thermostat controls the one before it."""
 
     rate: Float[Array, "links"]  # p_ξ / Q, one over time
     way: Float[Array, "links"]  # ξ
 
     @classmethod
     def at_rest(cls, links: int) -> Chain:
-        """Before the first step."""
+        """The state of the chain before the first step."""
         return cls(jnp.zeros(links), jnp.zeros(links))
 
     def act(
         self, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
     ) -> tuple[Number, Chain]:
-        """What velocities are multiplied by, and the chain, after it has acted for a time.
+        """The factor for the velocities and the new chain, after the chain has acted for a time.
 
         Each of three steps goes from the last link to the first, scales, and goes back (Tuckerman et al.,
         J. Phys. A 39, 5629, 2006, the operator L_NHC); error O(time⁵).
@@ -66,13 +66,13 @@ class Chain(NamedTuple):
         return scale, Chain(jnp.stack(rate), jnp.stack(way))
 
     def energy(self, freedom: int, kT: Number, relaxation: Number) -> Number:
-        """Of all links (eq. 2.8 of the chains' paper, Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635)."""
+        """Energy of all links (eq. 2.8 of Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635)."""
         shares = jnp.ones(len(self.rate)).at[0].set(freedom)
         return kT * jnp.sum(shares * (0.5 * jnp.square(relaxation * self.rate) + self.way))
 
 
 class NoseHooverChain(Integrator):
-    """The canonical ensemble, deterministic and time-reversible: velocity Verlet between two half chains.
+    """Canonical sampling with Nosé-Hoover chains: velocity Verlet between two half-steps of the chain.
 
     Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635 (1992), integrated as in Tuckerman et al., J. Phys. A
     39, 5629 (2006). A stiff system at low temperature may not be ergodic under it.
@@ -114,7 +114,7 @@ class NoseHooverChain(Integrator):
 def rescaled(
     key: Array, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
 ) -> Number:
-    """What velocities are multiplied by when their kinetic energy takes an exact stochastic step.
+    """The factor for the velocities after an exact stochastic step of their kinetic energy.
 
     Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007), eqs. A7 and A8. Velocities that are all
     zero stay so.
@@ -135,7 +135,7 @@ def rescaled(
 
 
 class CSVR(Integrator):
-    """The canonical ensemble by stochastic velocity rescaling: velocity Verlet, then a random scale factor.
+    """Canonical sampling by stochastic velocity rescaling: velocity Verlet, then a random scale factor.
 
     Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). Noise comes from a counter-based key folded
     with the step, so two runs can share it and a resumed run continues it. Conserved is the effective energy
