@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 import tokenize
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
