@@ -186,7 +186,7 @@ def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
 
 @dataclass
 class VerletList:
-    """Verlet list that grows its capacity when needed and stores the positions of its last build."""
+    """Builder of Verlet lists that increases their capacity when needed."""
 
     builder: ListBuilder  # the neighbor search
     rule: RebuildRule  # when to rebuild

@@ -74,8 +74,8 @@ class Chain(NamedTuple):
 class NoseHooverChain(Integrator):
     """Canonical sampling with Nosé-Hoover chains: velocity Verlet between two half-steps of the chain.
 
-    Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635 (1992), integrated as in Tuckerman et al., J. Phys. A
-    39, 5629 (2006). A stiff system at low temperature may not be ergodic under it.
+    Deterministic and time-reversible. Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635 (1992), integrated
+    as in Tuckerman et al., J. Phys. A 39, 5629 (2006). A stiff system at low temperature may not be ergodic.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="nose-hoover",
