@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import jax
@@ -50,6 +52,8 @@ _LOG_HEADER = "    step       time      potential        kinetic          total 
 _SHORTER = "Use a shorter dynamics.timestep, relax the structure or lower the temperature"
 # about the life of two lists: where frames are nearer, steps would be made twice for them too often
 _FRAMES_APART = 25
+# latest segments whose median is the speed of a run
+_PACES = 99
 
 
 @result
@@ -143,8 +147,8 @@ class Rollout:
         self._say("compile", int(engine.start.state.step))
         first = engine.start.reference if self.done.first is None else self.done.first
         self._show(self.simulation, first)
-        loop_began: float | None = None
-        counted = 0
+        before: float | None = None
+        paces: deque[float] = deque(maxlen=_PACES)
         for segment in engine.segments():
             if segment.closes in FAILURES:
                 blown = segment
@@ -152,15 +156,14 @@ class Rollout:
             if kept.rows:
                 self._take(kept, interval)
             now = time.perf_counter()
-            if loop_began is None:
-                # the first segment holds the compilation; the rate is that of the steps after it
+            if before is None:
                 self.done.tally.start_up_seconds = self.done.tally.start_up_seconds or now - self.began
-                loop_began = now
-            else:
-                counted += segment.rows
+            elif segment.rows and before < now:
+                # the first segments hold compilations, and a later one may: the median is that of steps
+                paces.append(segment.rows / (now - before))
+                self.done.tally.steps_per_second = median(paces)
+            before = now
             self.done.tally.seconds = self._earlier_seconds + now - self.began
-            if counted and loop_began < now:
-                self.done.tally.steps_per_second = counted / (now - loop_began)
             self._say("run", segment.last)
             if blown is None:
                 self._checkpoint(segment, force=segment.closes == "end")

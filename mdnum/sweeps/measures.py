@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,7 +15,6 @@ from jaxtyping import Float
 
 from mdnum.errors import InputError
 from mdnum.registry import Registry
-from mdnum.sweeps.statistics import correlated
 
 #: Stretches of a run whose scatter is the error of what is no mean over time.
 _BLOCKS = 8
@@ -113,6 +113,27 @@ def _blocked(of: Callable[[slice], float], rows: int, blocks: int = _BLOCKS) -> 
     parts = np.array([of(slice(a, b)) for a, b in pairwise(edges) if b > a])
     error = parts.std(ddof=1) / len(parts) ** 0.5 if len(parts) > 1 else np.nan
     return Value(of(slice(0, rows)), float(error), float(len(parts)))
+
+
+def correlated(series: Float[np.ndarray, "samples"]) -> tuple[float, float, float]:
+    """Mean of a time series, its standard error, and its number of independent samples.
+
+    Samples before equilibrium are omitted (`pymbar.timeseries.detect_equilibration`, Chodera 2016).
+    """
+    # its import says on the log that it will use jax in double precision, as mdnum does
+    logging.getLogger("pymbar").setLevel(logging.ERROR)
+    from pymbar.timeseries import detect_equilibration, statistical_inefficiency
+
+    x = np.asarray(series, float)
+    if len(x) < 4 or not np.isfinite(x).all():
+        return (float(x.mean()) if len(x) else np.nan), np.nan, np.nan
+    if np.ptp(x) <= 1e-14 * np.abs(x).max():
+        return float(x[-1]), 0.0, float(len(x))
+    # looked for in the first half: what is left of a run that was nearly all left out is an outlier
+    begin, _, _ = detect_equilibration(x[: len(x) // 2], nskip=max(1, len(x) // 50))
+    kept = x[int(begin) :]
+    samples = max(len(kept) / float(statistical_inefficiency(kept)), 1.0)
+    return float(kept.mean()), float(kept.std(ddof=1) / samples**0.5) if len(kept) > 1 else np.nan, samples
 
 
 @_measure("energy", "potential energy per atom")

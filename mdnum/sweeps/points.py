@@ -44,7 +44,7 @@ _CLAIM = re.compile(r"(?P<address>[0-9a-f]{32})\.(?P<number>\d+)")
 #: What computes points and measures; how they are compared and shown is another matter.
 _COMPUTES = (
     "compiled.py", "vectors.py", "bits.py", "numerics/**/*.py", "md/*.py", "ball/*.py", "systems/*.py",
-    "rollout/*.py", "sweeps/measures.py", "sweeps/statistics.py",
+    "rollout/*.py", "sweeps/measures.py",
 )  # fmt: skip
 #: Packages whose version changes what a point computes.
 _ARITHMETIC = ("jax", "jaxlib", "numpy", "llvmlite")

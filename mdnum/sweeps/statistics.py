@@ -8,7 +8,6 @@ together.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
@@ -210,24 +209,3 @@ def within(value: float, error: float, freedom: float, tolerance: float, compari
     if abs(away) >= reach:
         return Within(away >= 0, 1.0)
     return Within(None, (reach / abs(away)) ** 2 if away else np.inf)
-
-
-def correlated(series: Float[np.ndarray, "samples"]) -> tuple[float, float, float]:
-    """Mean of a time series, its standard error, and its number of independent samples.
-
-    Samples before equilibrium are omitted (`pymbar.timeseries.detect_equilibration`, Chodera 2016).
-    """
-    # its import says on the log that it will use jax in double precision, as mdnum does
-    logging.getLogger("pymbar").setLevel(logging.ERROR)
-    from pymbar.timeseries import detect_equilibration, statistical_inefficiency
-
-    x = np.asarray(series, float)
-    if len(x) < 4 or not np.isfinite(x).all():
-        return (float(x.mean()) if len(x) else np.nan), np.nan, np.nan
-    if np.ptp(x) <= 1e-14 * np.abs(x).max():
-        return float(x[-1]), 0.0, float(len(x))
-    # looked for in the first half: what is left of a run that was nearly all left out is an outlier
-    begin, _, _ = detect_equilibration(x[: len(x) // 2], nskip=max(1, len(x) // 50))
-    kept = x[int(begin) :]
-    samples = max(len(kept) / float(statistical_inefficiency(kept)), 1.0)
-    return float(kept.mean()), float(kept.std(ddof=1) / samples**0.5) if len(kept) > 1 else np.nan, samples

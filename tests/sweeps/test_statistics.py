@@ -9,7 +9,8 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom, ttest_ind
 
-from mdnum.sweeps.statistics import correlated, differences, estimates, within
+from mdnum.sweeps.measures import correlated
+from mdnum.sweeps.statistics import differences, estimates, within
 
 
 def series(rng: np.random.Generator, phi: float, length: int) -> np.ndarray:
