@@ -26,6 +26,7 @@ class _Results:
     # (value, error, independent samples) of each run, by measure and setting
     values: dict[str, dict[Setting, list[tuple[float, float, float]]]] = field(default_factory=dict)
     failures: dict[str, list[Setting]] = field(default_factory=dict)  # by reason
+    missing: list[dict[str, str]] = field(default_factory=list)  # measures without a value at a setting
     speeds: dict[Setting, list[tuple[float, int]]] = field(
         default_factory=dict
     )  # steps per second, pairs lost
@@ -72,6 +73,7 @@ def analyzed(place: Workspace, plan: Plan) -> tuple[dict[str, Any], dict[str, An
             {"why": why, "points": len(where), "settings": sorted({", ".join(setting) for setting in where})}
             for why, where in results.failures.items()
         ],
+        "missing": results.missing,
         "estimates": [
             {"measure": name, "setting": list(setting), **_finite(asdict(mean))}
             for (name, setting), mean in means.items()
@@ -88,7 +90,7 @@ def analyzed(place: Workspace, plan: Plan) -> tuple[dict[str, Any], dict[str, An
 
 
 def _read(place: Workspace, plan: Plan) -> _Results:
-    results = _Results()
+    results, missing = _Results(), {}
     for k, one in enumerate(plan.points):
         result = None if one.wrong else place.result(one.address)
         result = result or {"status": "failed", "why": one.wrong or "was not computed", "measures": {}}
@@ -112,6 +114,12 @@ def _read(place: Workspace, plan: Plan) -> _Results:
                 results.values.setdefault(measure.name, {}).setdefault(one.setting, []).append(
                     (at, error, effective)
                 )
+            elif result["status"] == "complete":
+                missing.setdefault((measure.name, one.setting), value["why"])
+    # a mean over those seeds that happen to have a value, such as runs that did split, would be biased
+    for (name, setting), why in missing.items():
+        results.values.get(name, {}).pop(setting, None)
+        results.missing.append({"measure": name, "setting": ", ".join(setting), "why": why})
     return results
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,13 +14,21 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, MdnumError
 from mdnum.registry import Registry
+from mdnum.sweeps.points import digest
+from mdnum.systems.code import function
 
 #: Stretches of a run whose scatter is the error of what is no mean over time.
 _BLOCKS = 8
 #: Bins of g(r), and the share of half the box's width that it reaches to.
 _BINS, _REACH = 200, 0.98
+#: S(k) reaches to so many times the cube root of the density, which is beyond its first peak (about 7), with
+#: so many reciprocal vectors in a shell.
+_WAVES, _VECTORS = 10.0, 300
+
+
+Needs = Literal["series", "simulation", "frames"]
 
 
 class Value(NamedTuple):
@@ -48,6 +57,19 @@ class Sample:
     k_B: float
     folder: Path
     volume: float = field(default=float("nan"))  # of a box that does not move, length³
+    outcome: Any = None  # of the run; None where only its stored series is there
+    opened: Callable[[], Any] | None = None  # makes the simulation
+
+    @cached_property
+    def simulation(self) -> Any:
+        """The `Simulation` that was run, for measures that run it again."""
+        assert self.opened is not None
+        return self.opened()
+
+    @cached_property
+    def made(self) -> dict[Any, Any]:
+        """Whatever several measures of this run share, by keys of their own."""
+        return {}
 
     @cached_property
     def frames(
@@ -75,33 +97,38 @@ class Measure:
         unit: unit in terms of quantities, such as "energy" or "length²/time".
         title: description.
         of: function that returns its value.
-        needs: "series", or "frames" of positions along the run.
+        needs: "series"; "simulation", which is run again; or "frames" of positions along the run, and its
+            outcome.
         physical: whether it is a physical result, not a property of the machine or of neighbor lists.
         world: "md" or "ball", the world of runs that have it.
+        takes: what follows "=" in its name, as "CHOICE"; `of` is then called with this argument too, "" if
+            there is none.
+        sources: files that it depends on in addition to those of every point, as `points.digest` takes them:
+            a stored value is valid as long as they are the same.
     """
 
     name: str
     unit: str
     title: str
-    of: Callable[[Sample], Value]
-    needs: Literal["series", "frames"] = "series"
+    of: Callable[..., Value]
+    needs: Needs = "series"
     physical: bool = True
     world: Literal["md", "ball"] = "md"
+    takes: str = ""
+    sources: tuple[str, ...] = ()
+
+    @property
+    def digest(self) -> str:
+        """Of its sources; empty without."""
+        return digest(self.sources) if self.sources else ""
 
 
 MEASURES: Registry[Measure] = Registry("measure", "mdnum.measures", kind=Measure)
 
 
-def _measure(
-    unit: str,
-    title: str,
-    needs: Literal["series", "frames"] = "series",
-    physical: bool = True,
-    world: Literal["md", "ball"] = "md",
-) -> Callable[..., Any]:
-    def add(of: Callable[[Sample], Value]) -> Callable[[Sample], Value]:
-        name = of.__name__
-        MEASURES.add(name, Measure(name, unit, title, of, needs, physical, world))
+def _measure(unit: str, title: str, *options: Any, **more: Any) -> Callable[..., Any]:
+    def add(of: Callable[..., Value]) -> Callable[..., Value]:
+        MEASURES.add(of.__name__, Measure(of.__name__, unit, title, of, *options, **more))
         return of
 
     return add
@@ -249,6 +276,43 @@ def radial_distribution(run: Sample) -> tuple[Float[np.ndarray, "frames bins"], 
     return np.array(rows), 0.5 * (edges[1:] + edges[:-1])
 
 
+@_measure("", "height of the highest peak of the structure factor S(k)", "frames")
+def structure_factor(run: Sample) -> Value:
+    s, _ = structure_factors(run)
+    half = s[len(s) // 2 :] if len(s) > 2 * _BLOCKS else s
+    peak = int(np.argmax(half.mean(axis=0)))
+    return _blocked(lambda rows: float(half[rows, peak].mean()), len(half), min(_BLOCKS, len(half)))
+
+
+def structure_factors(run: Sample) -> tuple[Float[np.ndarray, "frames shells"], Float[np.ndarray, "shells"]]:
+    """S(k) = |Σ exp(i k·x)|²/N of each frame, averaged over shells of reciprocal vectors, and their mean |k|.
+
+    A shell is as wide as the shortest reciprocal vector of the first cell. In a shell with many vectors only
+    some of them, evenly chosen, are used.
+    """
+    x, cells, _ = run.frames
+    reciprocal = 2 * np.pi * np.linalg.inv(cells[0]).T
+    largest = _WAVES * (run.atoms / abs(np.linalg.det(cells[0]))) ** (1 / 3)
+    reach = np.floor(largest * np.linalg.norm(cells[0], axis=1) / (2 * np.pi)).astype(int)
+    whole = np.stack(np.meshgrid(*(np.arange(-n, n + 1) for n in reach), indexing="ij"), -1).reshape(-1, 3)
+    # -k has the same S
+    whole = whole[len(whole) // 2 + 1 :]
+    length = np.linalg.norm(whole @ reciprocal, axis=1)
+    shell = np.rint(length / length.min()).astype(int)
+    keep = length <= largest
+    for one in np.unique(shell):
+        inside = np.flatnonzero(keep & (shell == one))
+        few = np.linspace(0, len(inside) - 1, min(len(inside), _VECTORS)).astype(int)
+        keep[np.delete(inside, few)] = False
+    _, at = np.unique(shell[keep], return_inverse=True)
+    count, rows = np.bincount(at), []
+    for here, cell in zip(x, cells, strict=True):
+        # fractional coordinates: the vectors move with the box
+        waves = np.exp(2j * np.pi * (here @ np.linalg.inv(cell)) @ whole[keep].T).sum(axis=0)
+        rows.append(np.bincount(at, np.abs(waves) ** 2 / run.atoms) / count)
+    return np.array(rows), np.bincount(at, length[keep]) / count
+
+
 def _mean_square(x: Float[np.ndarray, "frames atoms 3"]) -> Float[np.ndarray, "lags"]:
     """Mean squared displacement by lag, over all atoms and origins."""
     import MDAnalysis
@@ -328,11 +392,54 @@ def chosen(words: Sequence[str], world: str) -> list[Measure]:
     """
     if twice := [word for word in words if list(words).count(word) > 1]:
         raise InputError(f"--measure has {twice[0]} twice", remedy="Give each once")
-    measures = [MEASURES[word] for word in words]
+    measures = [_named(word) for word in words]
     if other := [measure.name for measure in measures if measure.world != world]:
         known = ", ".join(name for name in MEASURES.shipped if MEASURES[name].world == world)
         raise InputError(f"{other[0]} is no measure of this world", remedy=f"Known are {known}")
     return measures
+
+
+def _named(word: str) -> Measure:
+    """A measure by its name, as "energy", "fork=order" or "mine.py:height"."""
+    if ".py:" in word:
+        return _of_file(word)
+    name, _, argument = word.partition("=")
+    found = MEASURES[name]
+    if argument and not found.takes:
+        raise InputError(f"--measure {word}: {name} takes no argument", remedy=f"Give {name}")
+    return replace(found, name=word, of=partial(found.of, argument=argument)) if found.takes else found
+
+
+def _of_file(word: str) -> Measure:
+    """A function in a Python file: an outcome to a value, (value, error) or (value, error, samples).
+
+    Raises:
+        InputError: it is not allowed or not there, or the file imports what lies beside it: a digest of the
+            file would not tell when that changes.
+    """
+    place, _, name = word.rpartition(":")
+    file = Path(place).absolute()
+    of = function(f"{file.name}:{name}", file.parent, where="--measure")
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        names = [one.name for one in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom):
+            names = [("." * node.level) + (node.module or "")]
+        for one in names:
+            top = one.partition(".")[0]
+            if not top or any((file.parent / end).exists() for end in (f"{top}.py", f"{top}/__init__.py")):
+                raise InputError(
+                    f"the file imports {one}, which lies beside it and which no digest covers",
+                    where=str(file), remedy="Put everything that it needs into one file",
+                )  # fmt: skip
+
+    def value(run: Sample) -> Value:
+        found = of(run.outcome)
+        if not isinstance(found, tuple):
+            return Value(float(found))
+        # an error without its number of samples is taken as known
+        return Value(*map(float, (*found, 1e6) if len(found) == 2 else found))
+
+    return Measure(f"{file}:{name}", "", f"{name} of {file.name}", value, "frames", sources=(str(file),))
 
 
 def measured(measures: Sequence[Measure], run: Sample) -> dict[str, dict[str, Any]]:
@@ -341,15 +448,19 @@ def measured(measures: Sequence[Measure], run: Sample) -> dict[str, dict[str, An
     for one in measures:
         try:
             value = one.of(run)
-        except (ArithmeticError, LookupError, ValueError) as error:
-            found[one.name] = {"value": None, "why": f"{type(error).__name__}: {error}"}
+        except OSError:
+            raise
+        except Exception as error:
+            why = str(error) if isinstance(error, MdnumError) else f"{type(error).__name__}: {error}"
+            found[one.name] = {"value": None, "why": why, "digest": one.digest}
             continue
         if np.isfinite(value.value):
             found[one.name] = {
                 "value": float(value.value),
                 "error": value.error,
                 "effective": value.effective,
+                "digest": one.digest,
             }
         else:
-            found[one.name] = {"value": None, "why": "too few steps or frames"}
+            found[one.name] = {"value": None, "why": "too few steps or frames", "digest": one.digest}
     return found

@@ -77,6 +77,11 @@ class Plan:
         return tuple(measure.name for measure in self.measures)
 
     @property
+    def wanted(self) -> dict[str, str]:
+        """Digests of its measures' sources by name, as points store them."""
+        return {measure.name: measure.digest for measure in self.measures}
+
+    @property
     def origin(self) -> Setting:
         """Setting with the system's own values."""
         return self.setting(self.base)

@@ -24,9 +24,10 @@ import shutil
 import socket
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -53,11 +54,22 @@ _ARITHMETIC = ("jax", "jaxlib", "numpy", "llvmlite")
 @cache
 def code() -> str:
     """A digest of the source that a point is computed by, and of the versions of what it computes with."""
-    found, root = hashlib.sha256(), Path(__file__).parents[1]
-    for file in sorted(file for place in _COMPUTES for file in root.glob(place)):
-        found.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
     versions = package_versions()
-    found.update(json.dumps([versions.get(name) for name in _ARITHMETIC]).encode())
+    packages = json.dumps([versions.get(name) for name in _ARITHMETIC])
+    return hashlib.sha256((digest(_COMPUTES) + packages).encode()).hexdigest()[:16]
+
+
+def digest(places: Sequence[str]) -> str:
+    """A digest of source files.
+
+    Args:
+        places: patterns of files of mdnum, or absolute paths.
+    """
+    found, root = hashlib.sha256(), Path(__file__).parents[1]
+    files = [[Path(one)] if Path(one).is_absolute() else root.glob(one) for one in places]
+    for file in sorted(chain(*files)):
+        name = file.relative_to(root).as_posix() if file.is_relative_to(root) else file.name
+        found.update(name.encode() + b"\0" + file.read_bytes())
     return found.hexdigest()[:16]
 
 

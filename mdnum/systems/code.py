@@ -38,7 +38,7 @@ def is_allowed() -> bool:
     return _ALLOWED.get()
 
 
-def parts(place: str, folder: Path) -> tuple[Path, str]:
+def parts(place: str, folder: Path, where: str = "potential.function") -> tuple[Path, str]:
     """Split text such as "mine.py:morse" into the path of a file in a folder and a name.
 
     Raises:
@@ -46,28 +46,29 @@ def parts(place: str, folder: Path) -> tuple[Path, str]:
     """
     file, _, name = place.rpartition(":")
     if not file.endswith(".py") or not name.isidentifier():
-        raise InputError(f"{place!r} is not of the form FILE.py:NAME", where="potential.function")
+        raise InputError(f"{place!r} is not of the form FILE.py:NAME", where=where)
     return folder / file, name
 
 
-def function(place: str, folder: Path) -> Callable[..., Any]:
-    """Execute the file that a system file names, and return the named function.
+def function(place: str, folder: Path, where: str = "potential.function") -> Callable[..., Any]:
+    """Execute the file that a system file or an option names, and return the named function.
 
     Args:
         place: text such as "mine.py:morse", relative to folder.
+        where: the key or option that names it, for messages.
 
     Raises:
         InputError: execution is not allowed, the file cannot be executed, or it has no such function.
     """
-    file, name = parts(place, folder)
+    file, name = parts(place, folder, where)
     if not is_allowed():
         raise InputError(
-            f"the system file names Python code ({file}:{name}), which is not executed without permission",
-            where="potential.function",
+            f"{where} names Python code ({file}:{name}), which is not executed without permission",
+            where=where,
             remedy="Read the code, then add --allow-code, or allow_code=True in Python",
         )
     if not file.is_file():
-        raise InputError("no such file", where=str(file), remedy="Correct the key potential.function")
+        raise InputError("no such file", where=str(file), remedy=f"Correct {where}")
     own = f"mdnum_code_{file.stem}"
     # anew each time: inspect reads the source of what is defined there now
     sys.modules.pop(own, None)
@@ -77,5 +78,5 @@ def function(place: str, folder: Path) -> Callable[..., Any]:
         raise InputError(f"cannot be executed: {in_a_line(error)}", where=str(file)) from error
     found = getattr(module, name, None)
     if not callable(found):
-        raise InputError(f"has no function {name!r}", where=str(file), remedy="Correct potential.function")
+        raise InputError(f"has no function {name!r}", where=str(file), remedy=f"Correct {where}")
     return found

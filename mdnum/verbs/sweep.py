@@ -18,6 +18,7 @@ from mdnum.sweeps.engines import TRIES, computed
 from mdnum.sweeps.measures import USUAL
 from mdnum.sweeps.plan import Plan, Planned, Question, Setting, planned
 from mdnum.sweeps.points import Workspace, gone
+from mdnum.systems.code import is_allowed
 from mdnum.verbs import frame
 from mdnum.verbs.frame import Keep, Outcome, Verb
 from mdnum.verbs.sweep_page import judge, page
@@ -97,7 +98,7 @@ def sweep(
         root = Path(points_in) if points_in is not None else answer.folder.path.parent / "sweep-points"
         place = Workspace(root)
         place.swept()
-        counts = _compute(place, plan, answer.log, on, workers, keep_runs, bool(keep.get("allow_code")))
+        counts = _compute(place, plan, answer.log, on, workers, keep_runs, is_allowed())
         answer.tables, answer.summary = analyzed(place, plan)
         answer.summary |= {**counts, "points_in": str(root), "workers": workers or cores()}
     return answer.outcome
@@ -136,7 +137,7 @@ def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
     plan = planned(system, over, question, given.get("overrides"))
     place = Workspace(Path(where)) if Path(where).is_dir() else None
     stored = [place.result(one.address) if place else None for one in plan.points]
-    missing = sum(not enough(one, plan.names) for one in stored)
+    missing = sum(not enough(one, plan.wanted) for one in stored)
     known = [one["seconds"] for one in stored if one and one["status"] == "complete"]
     # a run without one to go by: two million atom-steps a second on one core, and what it takes to begin
     each = float(np.median(known)) if known else plan.atoms * plan.steps / 2e6 + 2.0
@@ -160,7 +161,7 @@ def _compute(
 ) -> dict[str, Any]:
     """Computes the points that are not there, and waits for those that another sweep computes."""
     wanted = {one.address: one for one in plan.points if not one.wrong}
-    missing = [a for a in wanted if not enough(place.result(a), plan.names)]
+    missing = [a for a in wanted if not enough(place.result(a), plan.wanted)]
     missed = place.nearest(wanted[missing[0]].state) if missing else None
     total, done, begun = len(missing), 0, monotonic()
     counts = {"computed": 0, "found": len(wanted) - total, "given_up": 0, "changed": missed or []}
@@ -185,7 +186,7 @@ def _compute(
         each = tuple({"address": o.address, "state": o.state, "settings": o.settings} for o in some)
         return Task(
             str(place.root.absolute()), each, str(system) if isinstance(system, Path) else system,
-            plan.overrides, plan.names, keep, code,
+            plan.overrides, plan.wanted, keep, code,
         )  # fmt: skip
 
     left_before = {claim for claim, _ in place.claims() if gone(claim)}
@@ -223,7 +224,7 @@ def _compute(
         left = again
         while busy:
             # what another sweep computes; of one that is gone it is computed here
-            busy = [a for a in busy if not enough(place.result(a), plan.names)]
+            busy = [a for a in busy if not enough(place.result(a), plan.wanted)]
             free = [a for a in busy if all(gone(claim) for claim, _ in place.claims(a))]
             if free:
                 left += [[wanted[a]] for a in free]

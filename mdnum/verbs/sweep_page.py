@@ -19,6 +19,11 @@ from mdnum.verbs.frame import View
 TEXTS = Texts(Path(__file__).with_name("sweep.py"))
 
 
+def _shown(name: str) -> str:
+    """A measure's name without the folder of its file."""
+    return Path(name).name if ".py:" in name else name
+
+
 def _unit(view: View, name: str) -> str:
     own = next((one["unit"] for one in view.summary["measures"] if one["name"] == name), "")
     return named(own, vars(view.units)) or own if own else ""
@@ -71,6 +76,10 @@ def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
     for one in s["failed"]:
         values = {**one, "all": s["points"], "settings": listed(one["settings"][:5]), "why": one["why"][:400]}
         yield TEXTS.finding("POINTS_FAILED", section="Points that failed", **values)
+    for name in dict.fromkeys(one["measure"] for one in s["missing"]):
+        mine = [one for one in s["missing"] if one["measure"] == name]
+        values = {"settings": len(mine), "all": s["settings"], "why": mine[0]["why"][:400]}
+        yield TEXTS.finding("MEASURE_MISSING", measure=_shown(name), **values)
     for key in FREE:
         if moved.get(key):
             yield TEXTS.finding("FREE_CHOICE_MOVES", key=key, measures=listed(moved[key]))

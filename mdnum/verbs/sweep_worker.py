@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import socket
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -17,6 +17,8 @@ from mdnum.errors import FolderError, InputError, MdnumError
 from mdnum.sweeps.measures import Sample, chosen, measured
 from mdnum.sweeps.plan import resolved
 from mdnum.sweeps.points import Workspace, code, write_result
+from mdnum.systems.code import allow_code
+from mdnum.verbs import sweep_measures  # noqa: F401  adds measures
 
 _SERIES = "series.parquet"
 
@@ -29,19 +31,25 @@ class Task:
     points: tuple[Mapping[str, Any], ...]  # each with address, state and settings
     system: Any  # path or name of a system, or a simulation that was pickled by value
     overrides: Mapping[str, Any]
-    measures: tuple[str, ...]
+    measures: Mapping[str, str]  # names, with the digests of their sources
     keep: bool  # run folders
     allow_code: bool
 
 
-def enough(result: Mapping[str, Any] | None, measures: Sequence[str]) -> bool:
+def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> bool:
     """Whether a stored result has all that is asked."""
     if result is None:
         return False
     if result["status"] == "failed":
         # what failed for no reason of its own, such as a process that was killed, is tried by the next sweep
         return not result.get("again", False)
-    return all(name in result["measures"] for name in measures)
+    return not _missing(result, measures)
+
+
+def _missing(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> list[str]:
+    """Measures that a result lacks, or has of another source."""
+    stored = {} if result is None else result["measures"]
+    return [name for name, at in measures.items() if stored.get(name, {}).get("digest") != at]
 
 
 def work(task: Task) -> list[dict[str, Any]]:
@@ -77,14 +85,18 @@ def work(task: Task) -> list[dict[str, Any]]:
 def _compute(place: Workspace, task: Task, point: Mapping[str, Any]) -> None:
     began = perf_counter()
     stored = place.result(point["address"])
-    missing = [name for name in task.measures if stored is None or name not in stored["measures"]]
-    measures = chosen(missing, "ball" if "integrator" in point["state"]["system"] else "md")
+    with allow_code(task.allow_code):
+        world = "ball" if "integrator" in point["state"]["system"] else "md"
+        measures = chosen(_missing(stored, task.measures), world)
+    if other := [one.name for one in measures if one.digest != task.measures[one.name]]:
+        message = "the file has changed since the sweep began"
+        raise InputError(message, where=other[0], remedy="Start the sweep again")
     series = place.folder(point["address"]) / _SERIES
     with place.filling(point["address"], point["state"]) as folder:
         result: dict[str, Any]
         try:
             known = stored["summary"] if stored else {}
-            if known and series.exists() and all(one.needs == "series" for one in measures):
+            if known and series.exists() and all(one.needs != "frames" for one in measures):
                 sample = _sample(task, point, folder, series, known)
             else:
                 sample = _run(task, point, folder)
@@ -107,7 +119,6 @@ def _compute(place: Workspace, task: Task, point: Mapping[str, Any]) -> None:
 def _simulation(task: Task, point: Mapping[str, Any]) -> Any:
     """A simulation, or the system of a ball."""
     from mdnum.systems import opened
-    from mdnum.systems.code import allow_code
 
     with allow_code(task.allow_code):
         if isinstance(task.system, str):
@@ -133,7 +144,7 @@ def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
     summary = {name: made.summary[name] for name in kept}
     structure = made.result.simulation
     summary |= {"k_B": structure.units.k_B, "volume": structure.cell.volume, "units": structure.units.name}
-    return _sample(task, point, folder, folder / _SERIES, summary)
+    return _sample(task, point, folder, folder / _SERIES, summary, made)
 
 
 def _bounced(system: Any, steps: int, task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
@@ -150,9 +161,14 @@ def _bounced(system: Any, steps: int, task: Task, point: Mapping[str, Any], fold
     return _sample(task, point, folder, folder / _SERIES, summary)
 
 
-def _sample(task: Task, point: Mapping[str, Any], folder: Path, series: Path, summary: Any) -> Sample:
+def _sample(
+    task: Task, point: Mapping[str, Any], folder: Path, series: Path, summary: Any, outcome: Any = None
+) -> Sample:
     import pyarrow.parquet as parquet
 
     table = parquet.read_table(series)
     columns = {name: np.asarray(table[name]) for name in table.column_names}
-    return Sample(columns, summary, summary["atoms"], summary["k_B"], folder / "run", summary["volume"])
+    return Sample(
+        columns, summary, summary["atoms"], summary["k_B"], folder / "run", summary["volume"], outcome,
+        lambda: _simulation(task, point),
+    )  # fmt: skip

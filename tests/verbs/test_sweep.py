@@ -12,6 +12,7 @@ from small_systems import crystal
 
 import mdnum
 from mdnum.errors import InputError
+from mdnum.sweeps.measures import chosen
 from mdnum.sweeps.plan import Question, planned
 from mdnum.verbs import sweep_worker
 
@@ -155,3 +156,59 @@ def test_what_cannot_be_swept_is_refused(simulation):
     for over, more in refused:
         with pytest.raises(InputError):
             mdnum.sweep(simulation, over, **more)
+
+
+@pytest.mark.nightly
+def test_a_function_of_a_file_measures_an_outcome(simulation, tmp_path):
+    """What it returns is stored with the digest of its file, and measured again when the file is another."""
+    file, over = tmp_path / "mine.py", {"dynamics.timestep": [0.004]}
+    asked: Any = {"seeds": 1, "steps": 60, "measure": f"energy,{file}:last", "allow_code": True}
+    values = []
+    for factor in (1, 2, 2):
+        text = f"{factor} * float(outcome.table('series')['potential'][-1].as_py()), 0.25"
+        file.write_text(f"def last(outcome):\n    return {text}\n")
+        with ThreadPoolExecutor(1) as pool:
+            made = mdnum.sweep(
+                simulation, over, on=pool, out=tmp_path / f"out-{len(values)}", save_every=60, **asked
+            )
+        (one,) = (row for row in made.summary["estimates"] if row["measure"] != "energy")
+        values.append((one["value"], one["error"], made.summary["computed"]))
+    own = mdnum.run(
+        mdnum.changed(simulation, {"dynamics.seed": 0}), steps=60, out=tmp_path / "run", check=False
+    )
+    last = own.table("series")["potential"][-1].as_py()
+    assert values == [(last, 0.25, 1), (2 * last, 0.25, 1), (2 * last, 0.25, 0)]
+
+
+@pytest.mark.nightly
+def test_forks_and_gradients_are_measures(simulation, tmp_path):
+    """Against `fork` and `grad` themselves."""
+    with ThreadPoolExecutor(1) as pool:
+        made = mdnum.sweep(
+            simulation, {"cutoff.radius": [1.9]}, seeds=[3], steps=400, on=pool, out=tmp_path / "sweep",
+            measure="energy,fork,split,separation,gradient=mean-potential/sigma,horizon=mean-potential/sigma",
+        )  # fmt: skip
+    assert not made.summary["failed"]
+    own = mdnum.changed(simulation, {"dynamics.seed": 3})
+    pair = mdnum.fork(own, "start", steps=400, out=tmp_path / "fork", counterfactual=False, repeats=0)
+    found = {row["measure"]: row for row in made.summary["estimates"] if row["setting"] == ["2"]}
+    dates = pair.result.dates
+    assert dates.fork and found["fork"]["value"] == pytest.approx(0.004 * dates.fork)
+    if dates.split is None:
+        assert "split" not in found and made.summary["missing"]
+    grad = mdnum.grad(own, "mean-potential", "sigma", steps=400, out=tmp_path / "grad")
+    trust = grad.result.trust
+    (slope,) = grad.result.agreement.gradient(grad.result.agreement.reference).gradient.values()
+    assert found["gradient=mean-potential/sigma"]["value"] == pytest.approx(float(slope), rel=1e-9)
+    if trust.verdict == "limited":
+        assert found["horizon=mean-potential/sigma"]["value"] == pytest.approx(0.004 * trust.horizon)
+    else:
+        assert "horizon=mean-potential/sigma" not in found
+
+
+def test_names_with_arguments():
+    (one,) = chosen(["fork=order=3"], "md")
+    assert one.name == "fork=order=3" and one.unit == "time" and len(one.digest) == 16
+    for word in ("energy=3", "forks"):
+        with pytest.raises(InputError):
+            chosen([word], "md")

@@ -1,0 +1,104 @@
+"""Measures of a sweep that run a system again: forks of two runs, and gradients with their trusted horizon.
+
+They are added to `mdnum.sweeps.measures.MEASURES` from here, above the forks and gradients that they are made
+of.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.sweeps.measures import MEASURES, Measure, Sample, Value
+
+_FORKS, _GRADIENTS = ("forks/**/*.py",), ("forks/**/*.py", "gradients/**/*.py")
+_LOSS = "LOSS/PARAMETER"
+
+
+def _pair(run: Sample, argument: str) -> Any:
+    """The run and its twin, followed until they split: by default one coordinate starts an ulp away."""
+    from mdnum.forks import fork
+    from mdnum.forks.choices import parse, twin_of
+
+    if ("fork", argument) not in run.made:
+        twin = twin_of(parse(argument or "start", "md"), run.simulation)
+        made = fork(twin, run.summary["steps"], counterfactual=False, repeats=0)
+        run.made["fork", argument] = made
+    return run.made["fork", argument]
+
+
+def _date(run: Sample, argument: str, name: str) -> Value:
+    found = _pair(run, argument)
+    step = getattr(found.dates, name)
+    if step is None:
+        raise InputError(f"no {name} within {found.steps} steps", remedy="Run longer")
+    return Value(float(step * found.twin.a.timestep))
+
+
+def fork(run: Sample, argument: str) -> Value:
+    return _date(run, argument, "fork")
+
+
+def split(run: Sample, argument: str) -> Value:
+    return _date(run, argument, "split")
+
+
+def separation(run: Sample, argument: str) -> Value:
+    found = _pair(run, argument)
+    grown = found.growth["B"]
+    if not grown.plain:
+        raise InputError("the separation does not grow exponentially", remedy="Run longer")
+    return Value(float(grown.rate / found.twin.a.timestep))
+
+
+def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
+    """The diagnosis of a gradient as `grad` makes it, and the full name of the parameter."""
+    from mdnum.gradients import Problem, parameters
+    from mdnum.gradients.diagnose import diagnose
+    from mdnum.gradients.losses import parse
+
+    word, slash, parameter = argument.rpartition("/")
+    if not slash:
+        remedy = "Write gradient=mean-potential/sigma"
+        raise InputError(f"{argument!r} is not of the form {_LOSS}", remedy=remedy)
+    if argument not in run.made:
+        steps = int(run.summary["steps"])
+        names = parameters.resolve(run.simulation, [parameter])
+        if len(names) > 1 or np.ndim(parameters.value(run.simulation, names[0])):
+            raise InputError(f"{parameter} has several values", remedy="Name one of them")
+        problem = Problem(run.simulation, parse(word, run.simulation, steps), steps)
+        parts, methods = ("agreement", "trust"), ("event-aware", "symmetric")
+        run.made[argument] = diagnose(problem, names, parts=parts, methods=methods), names[0]
+    return run.made[argument]
+
+
+def gradient(run: Sample, argument: str) -> Value:
+    found, name = _diagnosis(run, argument)
+    if found.agreement is None:
+        raise InputError(found.failed["agreement"])
+    reference = found.agreement.gradient(found.agreement.reference)
+    return Value(float(np.asarray(reference.gradient[name])))
+
+
+def horizon(run: Sample, argument: str) -> Value:
+    found, _ = _diagnosis(run, argument)
+    if found.trust is None:
+        raise InputError(found.failed["trust"])
+    if found.trust.verdict == "trusted":
+        raise InputError("the gradient is trusted to the end of the run", remedy="Run longer")
+    if found.trust.verdict != "limited":
+        raise InputError(f"undecided: {', '.join(found.trust.unknown)} were not examined")
+    return Value(float(found.trust.horizon * run.simulation.integrator.timestep))
+
+
+for _name, _unit, _title, _of in (
+    ("fork", "time", "time until two runs that differ by a rounding make different decisions", fork),
+    ("split", "time", "time until their separation is a hundredth of the cutoff", split),
+    ("separation", "1/time", "rate at which their separation grows", separation),
+    ("gradient", "", "derivative of a loss with respect to a parameter", gradient),
+    ("horizon", "time", "time up to which that derivative is trusted", horizon),
+):
+    _takes, _sources = ("CHOICE", _FORKS) if _of in (fork, split, separation) else (_LOSS, _GRADIENTS)
+    MEASURES.add(_name, Measure(_name, _unit, _title, _of, "simulation", takes=_takes, sources=_sources))
