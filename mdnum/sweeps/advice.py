@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.sweeps.design import label
-from mdnum.sweeps.statistics import SeedMean, Within, difference, within
+from mdnum.sweeps.statistics import Within, within
 
 #: Choices that should change no result, and are taken for their speed.
 FREE = ("neighbors.skin", "neighbors.builder")
@@ -24,12 +24,18 @@ _ENDS = {
 
 
 @dataclass(frozen=True)
-class Setting:
-    """A value of an axis, compared with the converged end."""
+class Compared:
+    """A value of an axis, or a setting, compared with the converged end."""
 
     value: Any
     by_measure: Mapping[str, Within]
-    worst: str | None  # measure that keeps it from being within the tolerance, or undecided
+
+    @property
+    def worst(self) -> str | None:
+        """The measure that is outside its tolerance, or is furthest from being decided."""
+        each = self.by_measure
+        ranked = sorted(each, key=lambda name: (each[name].inside is not False, -each[name].more))
+        return next((name for name in ranked if each[name].inside is not True), None)
 
     @property
     def inside(self) -> bool | None:
@@ -59,7 +65,7 @@ class Advice:
 
     key: str
     end: Any
-    settings: tuple[Setting, ...]
+    settings: tuple[Compared, ...]
     best: Any
     undecided: Any
     converged: bool | None
@@ -82,14 +88,15 @@ def _size(value: Any) -> float:
 def advise(
     key: str,
     values: Sequence[Any],
-    found: Mapping[str, Mapping[str, SeedMean]],
+    found: Mapping[str, Mapping[str, tuple[float, float, float]]],
     tolerances: Mapping[str, float],
     given: Mapping[str, str] = {},
 ) -> Advice | None:
     """Return the recommended value of an axis; None if no end is converged, or no measure has a tolerance.
 
     Args:
-        values: values of the axis. found: estimates by measure and by label of a value.
+        values: values of the axis.
+        found: differences from the end, as `difference` returns them, by measure and by label of a value.
         tolerances: tolerances by measure, in its unit.
         given: ends by key, in place of the usual ones: "largest", "smallest" or a value.
     """
@@ -99,18 +106,12 @@ def advise(
     rest = [one for one in values if one != end]
     rest.sort(key=lambda one: abs(_size(one) - _size(end)) if _numeric(one, end) else 0.0)
     comparisons = max(1, len(rest) * len(tolerances))
-    settings = [Setting(end, {}, None)]
+    settings = [Compared(end, {})]
     for value in rest:
         each: dict[str, Within] = {}
         for name, tolerance in tolerances.items():
-            one, last = found[name].get(label(value)), found[name].get(label(end))
-            if one is None or last is None:
-                each[name] = Within(None, np.inf)
-                continue
-            each[name] = within(*difference(one, last), tolerance, comparisons)
-        ranked = sorted(each, key=lambda name: (each[name].inside is not False, -each[name].more))
-        worst = next((name for name in ranked if each[name].inside is not True), None)
-        settings.append(Setting(value, each, worst))
+            each[name] = within(*found[name].get(label(value), (np.nan,) * 3), tolerance, comparisons)
+        settings.append(Compared(value, each))
     best, undecided = end, None
     for setting in settings[1:]:
         if setting.inside is not True:

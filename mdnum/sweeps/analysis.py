@@ -9,12 +9,25 @@ from typing import Any
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.sweeps.advice import FREE, advise
+from mdnum.sweeps.advice import FREE, Compared, advise, end_of
 from mdnum.sweeps.design import Axis, label
 from mdnum.sweeps.plan import Plan, Setting
 from mdnum.sweeps.points import Workspace
-from mdnum.sweeps.statistics import Difference, SeedMean, corrected, differences, effects, estimates
+from mdnum.sweeps.statistics import (
+    Difference,
+    SeedMean,
+    corrected,
+    difference,
+    effects,
+    estimates,
+    paired,
+    within,
+)
 
+#: Value, error and degrees of freedom of a difference.
+Raw = tuple[float, float, float]
+#: By measure and setting.
+Means = Mapping[tuple[str, Setting], SeedMean]
 _MOVES = {True: "yes", False: "no", None: "undecided"}
 
 
@@ -23,8 +36,8 @@ class _Results:
     """Results of points, grouped as needed for comparisons."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)  # of the table of points
-    # (value, error, independent samples) of each run, by measure and setting
-    values: dict[str, dict[Setting, list[tuple[float, float, float]]]] = field(default_factory=dict)
+    # (value, error, independent samples) of each run, by measure, setting and seed
+    values: dict[str, dict[Setting, dict[Any, tuple[float, float, float]]]] = field(default_factory=dict)
     failures: dict[str, list[Setting]] = field(default_factory=dict)  # by reason
     missing: list[dict[str, str]] = field(default_factory=list)  # measures without a value at a setting
     speeds: dict[Setting, list[tuple[float, int]]] = field(
@@ -35,21 +48,19 @@ class _Results:
 def analyzed(place: Workspace, plan: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return tables and summary of a sweep whose points have been computed."""
     results = _read(place, plan)
-    means = {
-        (name, setting): mean
-        for name, runs in results.values.items()
-        for setting, mean in estimates(runs).items()
-    }
+    joint = [plan.setting(choices) for choices in plan.question.joint]
+    means = _means(results, joint)
     if plan.question.design == "space-filling":
         compared = corrected(_ends(plan, results))
     else:
-        compared = differences(_pairs(plan, means))
+        compared = corrected(_all_differences(plan, means, results))
     rows = [
         {"measure": name, "choice": key, "setting": value, **asdict(one), "sigmas": one.sigmas,
          "moves": _MOVES[one.moves]}
         for (name, key, value), one in compared.items()
     ]  # fmt: skip
     tolerances = _tolerances(plan, means)
+    together = _together(_means(results), results, joint, tolerances) if joint else None
     tables = {
         "points": _columns(results.rows),
         "estimates": [
@@ -80,6 +91,7 @@ def analyzed(place: Workspace, plan: Plan) -> tuple[dict[str, Any], dict[str, An
         ],
         "differences": [_finite(row) for row in rows],
         "tolerances": tolerances, "advice": _advice(plan, means, tolerances, compared, results),
+        "joint": together,
         "speeds": [
             _finite({"setting": list(setting), "steps_per_second": float(np.median(np.array(runs)[:, 0])),
                      "lost_pairs": int(np.array(runs)[:, 1].sum())})
@@ -111,9 +123,8 @@ def _read(place: Workspace, plan: Plan) -> _Results:
                 "status": result["status"], "why": value.get("why", result.get("why", "")),
             })  # fmt: skip
             if value["value"] is not None:
-                results.values.setdefault(measure.name, {}).setdefault(one.setting, []).append(
-                    (at, error, effective)
-                )
+                runs = results.values.setdefault(measure.name, {}).setdefault(one.setting, {})
+                runs[one.point.seed] = at, error, effective
             elif result["status"] == "complete":
                 missing.setdefault((measure.name, one.setting), value["why"])
     # a mean over those seeds that happen to have a value, such as runs that did split, would be biased
@@ -131,17 +142,45 @@ def _finite(row: Mapping[str, Any]) -> dict[str, Any]:
     return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
 
 
-def _pairs(
-    plan: Plan, means: Mapping[tuple[str, Setting], SeedMean]
-) -> dict[tuple[str, ...], tuple[SeedMean, SeedMean]]:
-    """Pair the means at each value of each axis with those at the system's own values."""
-    return {
-        (name, axis.key, label(value)): (means[name, setting], means[name, plan.origin])
-        for name in plan.names
-        for axis in plan.axes
-        for value, setting in plan.along(axis)
-        if setting != plan.origin and (name, setting) in means and (name, plan.origin) in means
-    }
+def _along(
+    means: Means,
+    results: _Results,
+    settings: Mapping[str, Setting],
+    reference: Setting,
+    names: Sequence[str],
+) -> dict[str, dict[str, Raw]]:
+    """Differences of some settings from one of them, by measure and by label."""
+    found = {}
+    for name in names:
+        runs = results.values.get(name, {})
+        if (name, reference) not in means:
+            found[name] = {}
+            continue
+        there = {
+            key: setting for key, setting in settings.items()
+            if setting != reference and (name, setting) in means
+        }  # fmt: skip
+        raw = {key: difference(means[name, one], means[name, reference]) for key, one in there.items()}
+        last = runs[reference]
+        by_seed = {
+            key: np.array([run[0] - last[seed][0] for seed, run in runs[one].items() if seed in last])
+            for key, one in there.items()
+        }
+        found[name] = paired(raw, by_seed)
+    return found
+
+
+def _labels(plan: Plan, axis: Axis) -> dict[str, Setting]:
+    return {label(value): setting for value, setting in plan.along(axis)}
+
+
+def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[str, ...], Raw]:
+    """Of each value of each axis from the system's own."""
+    found = {}
+    for axis in plan.axes:
+        each = _along(means, results, _labels(plan, axis), plan.origin, plan.names)
+        found |= {(name, axis.key, key): raw for name, rows in each.items() for key, raw in rows.items()}
+    return found
 
 
 def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
@@ -160,13 +199,13 @@ def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
             for setting, many in runs.items()
             for _ in many
         ]
-        values = [numbers[0] for many in runs.values() for numbers in many]
+        values = [numbers[0] for many in runs.values() for numbers in many.values()]
         changes = effects(np.array(places), np.array(values))
         ends |= {(name, axis.key, "end to end"): one for axis, one in zip(plan.axes, changes, strict=True)}
     return ends
 
 
-def _tolerances(plan: Plan, means: Mapping[tuple[str, Setting], SeedMean]) -> dict[str, float]:
+def _tolerances(plan: Plan, means: Means) -> dict[str, float]:
     """Return tolerances by measure, in the measure's unit."""
     given = plan.question.tolerance
     if given is None:
@@ -186,7 +225,7 @@ def _tolerances(plan: Plan, means: Mapping[tuple[str, Setting], SeedMean]) -> di
 
 def _advice(
     plan: Plan,
-    means: Mapping[tuple[str, Setting], SeedMean],
+    means: Means,
     tolerances: Mapping[str, float],
     compared: Mapping[tuple[str, ...], Difference],
     results: _Results,
@@ -199,15 +238,12 @@ def _advice(
         if axis.key in FREE:
             rows.append(_fastest(plan, axis, moving, results))
             continue
-        found = {
-            name: {
-                label(value): means[name, setting]
-                for value, setting in plan.along(axis)
-                if (name, setting) in means
-            }
-            for name in tolerances
-        }
-        advice = advise(axis.key, axis.values, found, tolerances, plan.question.converged or {})
+        given = plan.question.converged or {}
+        labels, end = _labels(plan, axis), end_of(axis.key, axis.values, given)
+        if end is None:
+            continue
+        found = _along(means, results, labels, labels[label(end)], list(tolerances))
+        advice = advise(axis.key, axis.values, found, tolerances, given)
         if advice is not None:
             settings = [
                 _finite({"value": one.value, "inside": one.inside, "worst": one.worst, "more": one.more})
@@ -218,6 +254,49 @@ def _advice(
                 "converged": advice.converged, "settings": settings,
             })  # fmt: skip
     return rows
+
+
+def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The setting of all recommendations together, and that of all converged ends; empty where they are one.
+
+    Each choice was varied alone, so that what two of them do together is not known before these are run.
+    """
+    best = {row["choice"]: row["best"] for row in advice if row["best"] is not None}
+    ends = {row["choice"]: row["end"] for row in advice if row["end"] is not None}
+    if len(best) < 2 or not ends or plan.question.design != "one-at-a-time":
+        return []
+    both = [{**plan.base, **best}, {**plan.base, **ends}]
+    return [] if plan.setting(both[0]) == plan.setting(both[1]) else both
+
+
+def _means(results: _Results, without: Sequence[Setting] = ()) -> dict[tuple[str, Setting], SeedMean]:
+    """Means over seeds; settings that were added later do not change the errors of the others."""
+    return {
+        (name, setting): mean
+        for name, runs in results.values.items()
+        for setting, mean in estimates(
+            {one: list(each.values()) for one, each in runs.items() if one not in without}
+        ).items()
+    }
+
+
+def _together(
+    means: Means, results: _Results, joint: Sequence[Setting],
+    tolerances: Mapping[str, float],
+) -> dict[str, Any]:  # fmt: skip
+    """Whether the recommendations are within the tolerances together."""
+    setting, end = joint
+    found = _along(means, results, {"": setting}, end, list(tolerances))
+    each = {
+        name: within(*found[name].get("", (np.nan,) * 3), tolerance, len(tolerances))
+        for name, tolerance in tolerances.items()
+    }
+    one = Compared(setting, each)
+    lost = any(pairs for _, pairs in results.speeds.get(setting, []))
+    return _finite({
+        "setting": list(setting), "end": list(end), "inside": False if lost else one.inside,
+        "worst": "lost" if lost else one.worst, "more": one.more,
+    })  # fmt: skip
 
 
 def _fastest(plan: Plan, axis: Axis, moving: set[tuple[str, str]], results: _Results) -> dict[str, Any]:

@@ -33,6 +33,7 @@ class Question:
     tolerance: Mapping[str, float] | float | None = None
     converged: Mapping[str, str] | None = None
     save_every: int | None = None
+    joint: Sequence[Mapping[str, Any]] = ()  # settings that are run beside those of the design
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,8 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
     pace = float(own[f"{table}.timestep"])
     rows: list[Planned] = []
     firsts, seeded = dict[str, Planned](), False
-    for point in points(axes, base, seeds, question.design, question.samples):
+    joint = [Point(choices, seed) for seed in seeds for choices in question.joint]
+    for point in points(axes, base, seeds, question.design, question.samples) + joint:
         settings: dict[str, Any] = {"dynamics.seed": point.seed} if world == "md" else {}
         for axis in axes:
             if point.choices[axis.key] != base[axis.key] or filling:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any, Unpack
@@ -12,7 +13,7 @@ import numpy as np
 
 from mdnum.errors import InputError, MdnumError
 from mdnum.provenance import cores
-from mdnum.sweeps.analysis import analyzed
+from mdnum.sweeps.analysis import analyzed, recommended
 from mdnum.sweeps.design import Design
 from mdnum.sweeps.engines import TRIES, computed
 from mdnum.sweeps.measures import USUAL
@@ -100,6 +101,13 @@ def sweep(
         place.swept()
         counts = _compute(place, plan, answer.log, on, workers, keep_runs, is_allowed())
         answer.tables, answer.summary = analyzed(place, plan)
+        if joint := recommended(plan, answer.summary["advice"]):
+            # what was found by varying one choice at a time is run together
+            plan = planned(system, over, replace(question, joint=joint), keep.get("overrides"))
+            more = _compute(place, plan, answer.log, on, workers, keep_runs, is_allowed())
+            counts["found"] = more["found"] - counts["computed"]
+            counts |= {name: counts[name] + more[name] for name in ("computed", "given_up")}
+            answer.tables, answer.summary = analyzed(place, plan)
         answer.summary |= {**counts, "points_in": str(root), "workers": workers or cores()}
     return answer.outcome
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,7 @@ def judge(view: View) -> Verdict:
         evidence.append(TEXTS("not_stored", computed=s["computed"], fields=fields))
     evidence += [TEXTS("compared", n=len(rows))] if rows else []
     evidence += [text for advice in s["advice"] if (text := _advised(view, advice))]
+    evidence += _together(view)
     return conclude(found, evidence, headline=headline, best="info")
 
 
@@ -88,6 +89,9 @@ def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
             worst = advice["settings"][1]["worst"]
             values = {"key": advice["choice"], "end": advice["end"], "next": advice["settings"][1]["value"]}
             yield TEXTS.finding("NOT_CONVERGED", section="What to use", measure=worst, **values)
+    if (joint := s["joint"]) is not None and joint["inside"] is False:
+        values = {name: _keyed(view, joint[name]) for name in ("setting", "end")}
+        yield TEXTS.finding("JOINT_OUTSIDE", section="What to use", measure=_shown(joint["worst"]), **values)
     unknown = sorted({row["measure"] for row in s["differences"] if row["moves"] == "undecided"})
     if unknown:
         yield TEXTS.finding("NO_ERROR", measures=listed(unknown))
@@ -107,6 +111,25 @@ def _advised(view: View, advice: Mapping[str, Any]) -> str:
     if best == end:
         return TEXTS("use_end", key=key, end=end)
     return TEXTS("use", key=key, best=best, end=end)
+
+
+def _together(view: View) -> list[str]:
+    """A sentence on all recommendations together."""
+    joint = view.summary["joint"]
+    if joint is None or joint["inside"] is False:
+        return []
+    values = {name: _keyed(view, joint[name]) for name in ("setting", "end")}
+    if joint["inside"]:
+        return [TEXTS("together", **values)]
+    more = int(np.ceil(len(view.summary["seeds"]) * (joint["more"] - 1))) if joint["more"] else 0
+    name = "together_undecided" if more > 0 else "together_unknown"
+    return [TEXTS(name, measure=_shown(joint["worst"]), more=max(1, more), **values)]
+
+
+def _keyed(view: View, setting: Sequence[str]) -> str:
+    """A setting as KEY = VALUE."""
+    keys = [axis["key"] for axis in view.summary["axes"]]
+    return listed([f"{key} = {value}" for key, value in zip(keys, setting, strict=True)])
 
 
 def page(view: View, verdict: Verdict) -> Page:
@@ -175,6 +198,12 @@ def _settings(view: View) -> Table:
             use = "use" * (one["value"] == advice["best"])
             rows.append({"choice": advice["choice"], "value": str(one["value"]), "within": inside,
                          "by": one["worst"] or "", "": use})  # fmt: skip
+    if (joint := view.summary["joint"]) is not None:
+        inside = {True: "yes", False: "no", None: "not decided"}[joint["inside"]]
+        setting = _keyed(view, joint["setting"])
+        rows.append(
+            {"choice": "together", "value": setting, "within": inside, "by": joint["worst"] or "", "": ""}
+        )
     columns = {
         "choice": "choice",
         "value": "value",

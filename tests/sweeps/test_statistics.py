@@ -10,12 +10,16 @@ from scipy.signal import lfilter
 from scipy.stats import binom, ttest_ind
 
 from mdnum.sweeps.measures import correlated
-from mdnum.sweeps.statistics import differences, estimates, within
+from mdnum.sweeps.statistics import corrected, difference, estimates, paired, within
 
 
 def series(rng: np.random.Generator, phi: float, length: int) -> np.ndarray:
     """An autoregressive process, in equilibrium from the start."""
     return np.asarray(lfilter([1], [1, -phi], rng.standard_normal(length + 400)))[400:]
+
+
+def differences(pairs: dict[tuple[str, ...], Any]) -> Any:
+    return corrected({name: difference(one, base) for name, (one, base) in pairs.items()})
 
 
 def test_the_error_of_a_correlated_mean():
@@ -71,24 +75,62 @@ def test_equivalence():
     assert within(np.nan, 1.0, 3.0, 1.0).inside is None
 
 
+def test_correlated_seeds_are_compared_by_seed():
+    """Where runs of one seed have much in common, the scatter of their differences is the error."""
+    rng = np.random.default_rng(6)
+    start = rng.normal(0, 10, 8)
+    runs = {k: [(x, 1.0, 50.0) for x in start + rng.normal(0.5 * k, 1, 8)] for k in range(3)}
+    made = estimates(runs)
+    raw = {k: difference(made[k], made[0]) for k in (1, 2)}
+    by_seed = {k: np.array([a[0] - b[0] for a, b in zip(runs[k], runs[0], strict=True)]) for k in raw}
+    found = paired(raw, by_seed)
+    for k, one in by_seed.items():
+        assert found[k] == pytest.approx((one.mean(), one.std(ddof=1) / 8**0.5, 7.0))
+        assert found[k][1] < 0.3 * raw[k][1]
+    # in another order of the seeds they have nothing in common
+    mixed = {k: np.array([a[0] - b[0] for a, b in zip(runs[k], runs[0][::-1], strict=True)]) for k in raw}
+    assert paired(raw, mixed) == raw
+    assert paired(raw, {k: one[:2] for k, one in by_seed.items()}) == raw
+    # of equal differences the rounding of the values remains
+    same = paired(raw, {k: np.full(8, 0.5) for k in raw})
+    assert 0 < same[1][1] < 1e-11
+
+
 @pytest.mark.nightly
-def test_false_alarms_and_power():
-    """Sweeps of two values, four measures and eight seeds; one value moves one measure by 4.5 errors."""
-    rng, seeds, settings, sweeps = np.random.default_rng(4), 8, 3, 1200
+@pytest.mark.parametrize(("common", "sweeps"), [(0.0, 1200), (7.0, 600)])
+def test_false_alarms_and_power(common, sweeps):
+    """Sweeps of two values, four measures and eight seeds; one value moves one measure by 4.5 errors.
+
+    Args:
+        common: scatter of what all runs of a seed have in common, in errors of a run.
+    """
+    rng, seeds, settings = np.random.default_rng(4), 8, 3
     phis = (0.0, 0.5, 0.8, 0.9)
     errors = [np.std([correlated(series(rng, phi, 400))[0] for _ in range(400)]) for phi in phis]
-    false = seen = 0
+    false, seen, unpaired = 0, 0, 0
     for _ in range(sweeps):
-        pairs = {}
+        raw, made = {}, {}
         for m, (phi, error) in enumerate(zip(phis, errors, strict=True)):
             shift = 4.5 * error * (2 / seeds) ** 0.5 * (m == 2)
+            starts = common * error * rng.standard_normal(seeds)
             rows = {
-                s: [correlated(series(rng, phi, 400) + shift * (s == 2)) for _ in range(seeds)]
+                s: [correlated(series(rng, phi, 400) + shift * (s == 2) + start) for start in starts]
                 for s in range(settings)
             }
-            made = estimates(rows)
-            pairs |= {(str(m), str(s)): (made[s], made[0]) for s in range(1, settings)}
-        found = differences(pairs)
+            means = estimates(rows)
+            alone = {(str(m), str(s)): difference(means[s], means[0]) for s in range(1, settings)}
+            by_seed = {
+                (str(m), str(s)): np.array([a[0] - b[0] for a, b in zip(rows[s], rows[0], strict=True)])
+                for s in range(1, settings)
+            }
+            raw |= alone
+            made |= paired(alone, by_seed)
+        found = corrected(made)
         false += any(one.moves for key, one in found.items() if key != ("2", "2"))
         seen += found["2", "2"].moves is True
-    assert false <= binom.ppf(0.95, sweeps, 0.05) and seen >= binom.ppf(0.05, sweeps, 0.9)
+        unpaired += corrected(raw)["2", "2"].moves is True
+    assert false <= binom.ppf(0.95, sweeps, 0.05)
+    if common:
+        assert seen > 0.5 * sweeps > 10 * unpaired
+    else:
+        assert seen >= binom.ppf(0.05, sweeps, 0.9)
