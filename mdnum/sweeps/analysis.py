@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -49,7 +49,8 @@ def analyzed(place: Workspace, plan: Plan) -> tuple[dict[str, Any], dict[str, An
     """Return tables and summary of a sweep whose points have been computed."""
     results = _read(place, plan)
     joint = [plan.setting(choices) for choices in plan.question.joint]
-    means = _means(results, joint)
+    along = {setting for axis in plan.axes for _, setting in plan.along(axis)}
+    means = _means(results, {*joint} - along)
     if plan.question.design == "space-filling":
         compared = corrected(_ends(plan, results))
     else:
@@ -238,12 +239,17 @@ def _advice(
         if axis.key in FREE:
             rows.append(_fastest(plan, axis, moving, results))
             continue
-        given = plan.question.converged or {}
-        labels, end = _labels(plan, axis), end_of(axis.key, axis.values, given)
-        if end is None:
+        given, labels = plan.question.converged or {}, _labels(plan, axis)
+        # an end whose points failed is none
+        values = [
+            value
+            for value, setting in plan.along(axis)
+            if any((name, setting) in means for name in tolerances)
+        ]
+        if not values or (end := end_of(axis.key, values, given)) is None:
             continue
         found = _along(means, results, labels, labels[label(end)], list(tolerances))
-        advice = advise(axis.key, axis.values, found, tolerances, given)
+        advice = advise(axis.key, values, found, tolerances, given)
         if advice is not None:
             settings = [
                 _finite({"value": one.value, "inside": one.inside, "worst": one.worst, "more": one.more})
@@ -269,7 +275,7 @@ def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[st
     return [] if plan.setting(both[0]) == plan.setting(both[1]) else both
 
 
-def _means(results: _Results, without: Sequence[Setting] = ()) -> dict[tuple[str, Setting], SeedMean]:
+def _means(results: _Results, without: Collection[Setting] = ()) -> dict[tuple[str, Setting], SeedMean]:
     """Means over seeds; settings that were added later do not change the errors of the others."""
     return {
         (name, setting): mean

@@ -135,8 +135,10 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
     pace = float(own[f"{table}.timestep"])
     rows: list[Planned] = []
     firsts, seeded = dict[str, Planned](), False
-    joint = [Point(choices, seed) for seed in seeds for choices in question.joint]
-    for point in points(axes, base, seeds, question.design, question.samples) + joint:
+    designed = points(axes, base, seeds, question.design, question.samples)
+    own_choices = [one.choices for one in designed]
+    joint = [one for one in question.joint if one not in own_choices]
+    for point in [*designed, *(Point(choices, seed) for seed in seeds for choices in joint)]:
         settings: dict[str, Any] = {"dynamics.seed": point.seed} if world == "md" else {}
         for axis in axes:
             if point.choices[axis.key] != base[axis.key] or filling:
