@@ -61,7 +61,7 @@ def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
 
     word, slash, parameter = argument.rpartition("/")
     if not slash:
-        remedy = "Write gradient=mean-potential/sigma"
+        remedy = "Write gradient=potential/sigma"
         raise InputError(f"{argument!r} is not of the form {_LOSS}", remedy=remedy)
     if argument not in run.made:
         steps = int(run.summary["steps"])

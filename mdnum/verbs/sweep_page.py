@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -241,11 +242,12 @@ def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
             Series("one standard error", at, y - error, "line", "muted", dashed=True),
             Series("", at, y + error, "line", "muted", dashed=True),
         ]
-        unit = _unit(view, measure["name"])
-        name = f"{axis['key']}-{measure['name']}".replace(".", "-")
+        unit, shown = _unit(view, measure["name"]), _shown(measure["name"])
+        # the name of a file: that of a measure may have "=" and "/"
+        name = re.sub(r"[^A-Za-z0-9_]+", "-", f"{axis['key']}-{shown}")
         yield Plot(
             name, series=tuple(series), title=measure["title"], x_label=axis["key"],
-            y_label=f"{measure['name']} ({unit})" if unit else measure["name"], caption=TEXTS("along"),
+            y_label=f"{shown} ({unit})" if unit else shown, caption=TEXTS("along"),
             verticals=((float(axis["base"]), "its own"),),
         )  # fmt: skip
 

@@ -200,27 +200,34 @@ def test_a_function_of_a_file_measures_an_outcome(simulation, tmp_path):
 @pytest.mark.nightly
 def test_forks_and_gradients_are_measures(simulation, tmp_path):
     """Against `fork` and `grad` themselves."""
+    forks = ["fork=precision", "split=precision", "separation=precision"]
+    slope, horizon = "gradient=potential/sigma", "horizon=potential/sigma"
     with ThreadPoolExecutor(1) as pool:
         made = mdnum.sweep(
             simulation, {"cutoff.radius": [1.9]}, seeds=[3], steps=400, on=pool, out=tmp_path / "sweep",
-            measure="energy,fork,split,separation,gradient=mean-potential/sigma,horizon=mean-potential/sigma",
+            measure=",".join(["energy", *forks, slope, horizon]),
         )  # fmt: skip
     assert not made.summary["failed"]
     own = mdnum.changed(simulation, {"dynamics.seed": 3})
-    pair = mdnum.fork(own, "start", steps=400, out=tmp_path / "fork", counterfactual=False, repeats=0)
-    found = {row["measure"]: row for row in made.summary["estimates"] if row["setting"] == ["2"]}
-    dates = pair.result.dates
-    assert dates.fork and found["fork"]["value"] == pytest.approx(0.004 * dates.fork)
-    if dates.split is None:
-        assert "split" not in found and made.summary["missing"]
-    grad = mdnum.grad(own, "mean-potential", "sigma", steps=400, out=tmp_path / "grad")
-    trust = grad.result.trust
-    (slope,) = grad.result.agreement.gradient(grad.result.agreement.reference).gradient.values()
-    assert found["gradient=mean-potential/sigma"]["value"] == pytest.approx(float(slope), rel=1e-9)
-    if trust.verdict == "limited":
-        assert found["horizon=mean-potential/sigma"]["value"] == pytest.approx(0.004 * trust.horizon)
-    else:
-        assert "horizon=mean-potential/sigma" not in found
+    found = {row["measure"]: row["value"] for row in made.summary["estimates"] if row["setting"] == ["2"]}
+    missing = {row["measure"] for row in made.summary["missing"] if row["setting"] == "2"}
+    assert missing.isdisjoint(found) and {"energy", *forks, slope, horizon} == missing | {*found}
+
+    pair = mdnum.fork(
+        own, "precision", steps=400, out=tmp_path / "fork", counterfactual=False, repeats=0
+    ).result
+    fork, split, separation = forks
+    assert found[fork] == pytest.approx(0.004 * pair.dates.fork)
+    assert (split in missing) is (pair.dates.split is None)
+    assert found[separation] == pytest.approx(pair.growth["B"].rate / 0.004)
+
+    grad = mdnum.grad(own, "potential", "sigma", steps=400, out=tmp_path / "grad").result
+    (expected,) = grad.agreement.gradient(grad.agreement.reference).gradient.values()
+    assert found[slope] == pytest.approx(float(expected), rel=1e-9)
+    limited = grad.trust.verdict == "limited"
+    assert (horizon in found) is limited
+    if limited:
+        assert found[horizon] == pytest.approx(0.004 * grad.trust.horizon)
 
 
 def test_names_with_arguments():
