@@ -110,7 +110,9 @@ def advise(
     for value in rest:
         each: dict[str, Within] = {}
         for name, tolerance in tolerances.items():
-            each[name] = within(*found[name].get(label(value), (np.nan,) * 3), tolerance, comparisons)
+            each[name] = within(
+                *found[name].get(label(value), (np.nan, np.nan, np.nan)), tolerance, comparisons
+            )
         settings.append(Compared(value, each))
     best, undecided = end, None
     for setting in settings[1:]:

@@ -294,7 +294,7 @@ def _together(
     setting, end = joint
     found = _along(means, results, {"": setting}, end, list(tolerances))
     each = {
-        name: within(*found[name].get("", (np.nan,) * 3), tolerance, len(tolerances))
+        name: within(*found[name].get("", (np.nan, np.nan, np.nan)), tolerance, len(tolerances))
         for name, tolerance in tolerances.items()
     }
     one = Compared(setting, each)

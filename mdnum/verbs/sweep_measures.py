@@ -65,12 +65,12 @@ def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
         raise InputError(f"{argument!r} is not of the form {_LOSS}", remedy=remedy)
     if argument not in run.made:
         steps = int(run.summary["steps"])
-        names = parameters.resolve(run.simulation, [parameter])
-        if len(names) > 1 or np.ndim(parameters.value(run.simulation, names[0])):
+        name, *others = parameters.resolve(run.simulation, [parameter])
+        if others or np.ndim(parameters.value(run.simulation, name)):
             raise InputError(f"{parameter} has several values", remedy="Name one of them")
         problem = Problem(run.simulation, parse(word, run.simulation, steps), steps)
         parts, methods = ("agreement", "trust"), ("event-aware", "symmetric")
-        run.made[argument] = diagnose(problem, names, parts=parts, methods=methods), names[0]
+        run.made[argument] = diagnose(problem, (name,), parts=parts, methods=methods), name
     return run.made[argument]
 
 

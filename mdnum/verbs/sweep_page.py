@@ -91,7 +91,7 @@ def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
             values = {"key": advice["choice"], "end": advice["end"], "next": advice["settings"][1]["value"]}
             yield TEXTS.finding("NOT_CONVERGED", section="What to use", measure=worst, **values)
     if (joint := s["joint"]) is not None and joint["inside"] is False:
-        values = {name: _keyed(view, joint[name]) for name in ("setting", "end")}
+        values: Any = {name: _keyed(view, joint[name]) for name in ("setting", "end")}
         yield TEXTS.finding("JOINT_OUTSIDE", section="What to use", measure=_shown(joint["worst"]), **values)
     unknown = sorted({row["measure"] for row in s["differences"] if row["moves"] == "undecided"})
     if unknown:
