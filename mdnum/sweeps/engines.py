@@ -150,8 +150,8 @@ def _dask(address: str, workers: int | None) -> _Engine:
 def _executorlib(file: str, workers: int | None) -> _Engine:
     """An executor of executorlib, whose class and keywords a TOML file has: jobs of SLURM by default."""
     try:
-        import executorlib
-        from executorlib.api import ExecutorlibSocketError
+        import executorlib  # pyright: ignore[reportMissingImports]
+        from executorlib.api import ExecutorlibSocketError  # pyright: ignore[reportMissingImports]
     except ImportError:
         remedy = "Run python3 -m pip install 'mdnum[slurm]'"
         raise InputError("executorlib is not installed", where=file, remedy=remedy) from None
