@@ -248,12 +248,16 @@ def speed(run: Sample) -> Value:
     return Value(float(run.summary["steps_per_second"] or np.nan))
 
 
-@_measure("", "height of the first peak of g(r)", "frames")
-def rdf(run: Sample) -> Value:
-    g, _ = radial_distribution(run)
-    half = g[len(g) // 2 :] if len(g) > 2 * _BLOCKS else g
+def _peak(frames: Float[np.ndarray, "frames places"]) -> Value:
+    """Return the height of the peak of an average over frames; of many frames, over their second half."""
+    half = frames[len(frames) // 2 :] if len(frames) > 2 * _BLOCKS else frames
     peak = int(np.argmax(half.mean(axis=0)))
     return _blocked(lambda rows: float(half[rows, peak].mean()), len(half), min(_BLOCKS, len(half)))
+
+
+@_measure("", "height of the first peak of g(r)", "frames")
+def rdf(run: Sample) -> Value:
+    return _peak(radial_distribution(run)[0])
 
 
 def radial_distribution(run: Sample) -> tuple[Float[np.ndarray, "frames bins"], Float[np.ndarray, "bins"]]:
@@ -278,10 +282,7 @@ def radial_distribution(run: Sample) -> tuple[Float[np.ndarray, "frames bins"], 
 
 @_measure("", "height of the highest peak of the structure factor S(k)", "frames")
 def structure_factor(run: Sample) -> Value:
-    s, _ = structure_factors(run)
-    half = s[len(s) // 2 :] if len(s) > 2 * _BLOCKS else s
-    peak = int(np.argmax(half.mean(axis=0)))
-    return _blocked(lambda rows: float(half[rows, peak].mean()), len(half), min(_BLOCKS, len(half)))
+    return _peak(structure_factors(run)[0])
 
 
 def structure_factors(run: Sample) -> tuple[Float[np.ndarray, "frames shells"], Float[np.ndarray, "shells"]]:
