@@ -1,8 +1,8 @@
-"""The pages of docs/reference, made from what the package declares each time the site is built.
+"""Write the pages of docs/reference from the declarations of the package, each time the site is built.
 
 Commands come from the parser, keys of system files from their schemas, findings from the text files of verbs,
 columns from `mdnum/store`, documents from `mdnum/schemas`, names from the registries, Python from docstrings.
-So a page cannot miss what the package has, nor keep what it no longer has.
+The pages therefore always agree with the package.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-#: Registries in the order of the page: title, where it is, what is written where a name of it stands.
+#: Registries in the order of the page: title, module and attribute, and the options that accept its names.
+#: The module of measures is the one that adds those of forks and gradients.
 REGISTRIES = (
     ("Cutoffs", "mdnum.md.cutoffs:CUTOFFS", "`cutoff.kind`, `mdnum.Cut`"),
     ("Pair potentials", "mdnum.md.potentials:POTENTIALS", "`potential.kind`"),
@@ -25,7 +26,7 @@ REGISTRIES = (
     ("Choices in which two runs differ", "mdnum.forks.choices:CHOICES", "`mdnum fork --vary`"),
     ("Losses", "mdnum.gradients.losses:LOSSES", "`mdnum grad --of`"),
     ("Gradient methods", "mdnum.gradients.problem:METHODS", "`mdnum grad --methods`"),
-    ("Measures of a sweep", "mdnum.sweeps.measures:MEASURES", "`mdnum sweep --measure`"),
+    ("Measures of a sweep", "mdnum.verbs.sweep_measures:MEASURES", "`mdnum sweep --measure`"),
     ("Neighbor lists", "mdnum.references.conformance.lists:LISTS", "`mdnum conform`"),
 )
 _CODE = re.compile(r"[A-Z][A-Z0-9_]+")
@@ -36,7 +37,7 @@ _UNIT = re.compile(r"\s*\(([^()]*(?:Å|σ|eV|ps|GPa|1/|τ|ε|amu|\bm\b)[^()]*)\)
 
 
 def commands() -> Iterator[tuple[str, Any]]:
-    """Every command as it is typed, "fork map", with the parser's object of it."""
+    """Yield every command as it is typed, such as "fork map", with its parser object."""
     import typer
 
     from mdnum.cli.commands import app
@@ -51,7 +52,7 @@ def commands() -> Iterator[tuple[str, Any]]:
 
 
 def findings() -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """(command, code, sentences) of every finding, by the order of the verbs and of their text files."""
+    """Yield (command, code, sentences) of every finding, in the order of verbs and text files."""
     from mdnum.verbs import VERBS, declared
 
     for verb in VERBS:
@@ -61,7 +62,7 @@ def findings() -> Iterator[tuple[str, str, Mapping[str, Any]]]:
 
 
 def keys(schema: str) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
-    """(definition, place in the file, schema) of every table of a system file, as a reader meets them."""
+    """Yield (definition, path in the file, schema) of every table of a system file, outer tables first."""
     from mdnum.systems.load import json_schema
 
     whole = json_schema(schema)
@@ -84,7 +85,7 @@ def keys(schema: str) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
 
 
 def tables() -> Iterator[tuple[str, str, list[tuple[str, str, str]]]]:
-    """(kind of folder, table, columns with unit and description) of every folder that a verb makes."""
+    """Yield (kind of folder, table, columns with unit and description) for every folder that a verb makes."""
     from mdnum.store import columns
     from mdnum.verbs import VERBS, declared
     from mdnum.verbs.frame import layout
@@ -98,7 +99,7 @@ def tables() -> Iterator[tuple[str, str, list[tuple[str, str, str]]]]:
 
 
 def documents() -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """(kind, schema) of every JSON document."""
+    """Yield (kind, schema) of every JSON document."""
     import mdnum
 
     for path in sorted((Path(mdnum.__file__).parent / "schemas").glob("*.json")):
@@ -109,7 +110,7 @@ def documents() -> Iterator[tuple[str, Mapping[str, Any]]]:
 
 
 def _text(words: str) -> str:
-    """Words of the package as Markdown that shows them as they are, code in backticks kept."""
+    """Escape a text for Markdown, except for code in backticks."""
     pieces = re.split(r"(`[^`]*`)", words)
     return "".join(
         one if one.startswith("`") else re.sub(r"([\\*_<>$\[\]|~#{}])", r"\\\1", one) for one in pieces
@@ -127,7 +128,7 @@ def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
 
 
 def _sentence(text: str) -> str:
-    """A sentence of a text file, its fields as words in italics: "{lost:# pair}" is *lost* pairs."""
+    """Return a sentence of a text file with its fields in italics: "{lost:# pair}" becomes *lost* pairs."""
 
     def field(match: re.Match[str]) -> str:
         name, form = match[1], match[2] or ""
@@ -147,7 +148,7 @@ def _sentence(text: str) -> str:
 
 
 def anchor(verb: str, code: str) -> str:
-    """Where on the page a finding is."""
+    """Return the anchor of a finding on its page."""
     return f"{verb} {code}".lower().replace(" ", "-").replace("_", "-")
 
 
@@ -161,9 +162,9 @@ def _type(parameter: Any) -> str:
 
 
 def commands_page() -> str:
-    """Every command with its arguments and options."""
-    lines = ["# Commands and options", "", "`mdnum VERB --help` shows the same in a terminal. Every command "]
-    lines[-1] += "takes `--json`. What the commands are for: [the commands](../commands.md)."
+    """Write every command with its arguments and options."""
+    lines = ["# Commands and options", "", "`mdnum VERB --help` prints the same list in a terminal. Every "]
+    lines[-1] += "command accepts `--json`. [Commands](../commands.md) describes what each command does."
     for name, command in commands():
         level = "##" if " " not in name else "###"
         lines += [
@@ -194,16 +195,16 @@ def commands_page() -> str:
 
 
 def findings_page() -> str:
-    """Every code with its severity, what it reports and what to do."""
+    """Write every code with its severity, observation and remedy."""
     causes = _causes()
     listed = list(findings())
     lines = [
         "(findings-page)=", "# Findings", "",
-        "Every verb reports what a person should know as findings: a code, a severity, a sentence "
-        "with numbers, and what to do. `error`: do not use the numbers. `warning`: look before you "
-        "do. `info`: good to know; it does not change the exit code. Words in *italics* stand for "
-        "the numbers and names of a case. Where a sentence has several forms, or goes on where more"
-        " is known, these are listed.", "",
+        "Every verb reports its results as findings. A finding has a code, a severity, a sentence with "
+        "numbers, and a remedy. `error` means that the numbers of the run should not be used, "
+        "`warning` that they should be examined before they are used, and `info` does not change "
+        "the exit code. Words in *italics* are placeholders for numbers and names. If a sentence has"
+        " several forms or continuations, all of them are listed.", "",
     ]  # fmt: skip
     verbs = list(dict.fromkeys(verb for verb, _, _ in listed))
     for verb in verbs:
@@ -231,7 +232,7 @@ def findings_page() -> str:
 
 
 def _causes() -> dict[str, dict[str, list[str]]]:
-    """What a finding of an audit explains, and what else shows the same."""
+    """Return the consequences of each finding of an audit, and the findings with the same symptoms."""
     import mdnum.audit
     from mdnum.plain import beside
 
@@ -251,7 +252,7 @@ def _causes() -> dict[str, dict[str, list[str]]]:
 
 
 def _kind(value: Mapping[str, Any]) -> str:
-    """The type of a key in words."""
+    """Describe the type of a key."""
     if "const" in value:
         return f"`{json.dumps(value['const'], ensure_ascii=False)}`"
     if "enum" in value:
@@ -273,19 +274,19 @@ def _kind(value: Mapping[str, Any]) -> str:
 
 
 def _range(value: Mapping[str, Any]) -> str:
-    """What a number has to be, of the key or of its only alternative."""
+    """Describe the permitted range of a number, for the key or for its only alternative."""
     inner = [value, *(one for one in value.get("anyOf", ()) if one.get("type") != "null")]
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
     return ", ".join(f"{sign} {one[key]}" for one in inner[:2] for key, sign in signs.items() if key in one)
 
 
 def keys_page() -> str:
-    """Every key of a system file with its type, unit and default."""
+    """Write every key of a system file with its type, unit and default."""
     lines = [
         "# Keys of a system file", "",
-        "Written from the schemas that an editor uses (`systems/schema.json`, `systems/ball-"
-        "schema.json`). [Your own system](../systems.md) explains them with examples; where two "
-        'units are given, the first is that of `units = "metal"`, the second of `units = "lj"`.', "",
+        "This page is generated from the schemas that editors use (`systems/schema.json`, `systems/ball-"
+        "schema.json`). [Your own system](../systems.md) explains the keys with examples. If two "
+        'units are given, the first applies to `units = "metal"`, the second to `units = "lj"`.', "",
     ]  # fmt: skip
     for title, schema in (("Molecular dynamics", "schema.json"), ("The ball", "ball-schema.json")):
         lines += [f"## {title}", ""]
@@ -317,30 +318,30 @@ def keys_page() -> str:
 
 
 def columns_page() -> str:
-    """Every column of every table of every folder."""
+    """Write every column of every table of every folder."""
     lines = [
         "# Columns of tables", "",
-        "By kind of folder ([what lies in a folder](../folders.md)). A unit is made of quantities, "
-        "for which the units of the folder stand; every parquet file has it, written out, in its "
-        "own schema. *decision* is the quantity that is compared with a threshold: a length, or its"
-        " square. An empty unit is that of counts, numbers and ratios.", "",
+        "The columns are listed by kind of folder ([the files of a folder](../folders.md)). Units are "
+        "composed of quantities such as energy/length; the schema of every parquet file contains the"
+        " actual units. *decision* is the quantity that is compared with a threshold: a length, or "
+        "its square. Counts, indices and ratios have no unit.", "",
     ]  # fmt: skip
     kind = None
     for of, table, rows in tables():
         lines += [f"## Folder {of}", ""] if of != kind else []
         kind = of
         lines += [f"({anchor('columns', f'{of} {table}')})=", f"### {of}: {table}.parquet", ""]
-        lines += _table(("column", "unit", "holds"), ([f"`{a}`", _cell(b), _cell(c)] for a, b, c in rows))
+        lines += _table(("column", "unit", "content"), ([f"`{a}`", _cell(b), _cell(c)] for a, b, c in rows))
     return "\n".join(lines)
 
 
 def documents_page() -> str:
-    """Every JSON document with its keys."""
+    """Write every JSON document with its keys."""
     lines = [
         "# JSON documents", "",
-        "What `--json` prints and `summary.json` holds, by schema. [Rules of the "
-        "documents](../json.md): what versions promise, and what null means. The schemas have every"
-        " key at every depth; here are those at the top.", "",
+        "This page lists the keys of the documents that `--json` prints and `summary.json` contains, by"
+        " schema. [JSON documents](../json.md) explains their versions, and the meaning of null. The "
+        "schemas contain the keys at every depth; this page lists only the upper levels.", "",
     ]  # fmt: skip
     for kind, schema in documents():
         lines += [
@@ -357,23 +358,23 @@ def documents_page() -> str:
             shown = ", ".join(f"`{one}`" for one in inner)
             kinds = re.sub(r"\[(\w+)\]\(#[^)]*\)", r"\1", _kind(value))
             rows.append([f"`{key}`", kinds, "yes" if key in needed else "", shown])
-        lines += _table(("key", "type", "always there", "keys below it"), rows) if rows else []
+        lines += _table(("key", "type", "always present", "nested keys"), rows) if rows else []
     return "\n".join(lines)
 
 
 def names_page() -> str:
-    """Every name of every registry."""
+    """Write every name of every registry."""
     lines = [
         "# Names", "",
-        "What can be written where a cutoff, a potential, a method or a measure is named. Another "
-        "package can add names to each of these ([extending](../extending.md)).", "",
+        "This page lists the names of the available cutoffs, potentials, methods and other components. "
+        "Another package can add further names ([extending](../extending.md)).", "",
     ]  # fmt: skip
     for title, place, where in REGISTRIES:
         module, _, attribute = place.partition(":")
         registry = getattr(importlib.import_module(module), attribute)
-        lines += [f"## {title}", "", f"Written in {where}.", ""]
+        lines += [f"## {title}", "", f"These names are used in {where}.", ""]
         rows = [[f"`{name}`", _cell(_about(registry, name))] for name in registry.shipped]
-        lines += _table(("name", "what it is"), rows)
+        lines += _table(("name", "description"), rows)
     return "\n".join(lines)
 
 
@@ -383,7 +384,7 @@ def _about(registry: Any, name: str) -> str:
 
 
 def python_page() -> str:
-    """Every name of `mdnum`, from its docstring."""
+    """Write every name of `mdnum` with its docstring."""
     import mdnum
 
     kinds: dict[str, list[str]] = {"Verbs and functions": [], "Classes": [], "Errors": []}
@@ -395,10 +396,10 @@ def python_page() -> str:
             kinds["Verbs and functions"].append(name)
     lines = [
         "# Python", "",
-        "The names below are `mdnum.NAME`. **What is stable**: these names, their arguments by "
-        "keyword, the modules that [From Python](../python.md#modules) lists, codes of findings, "
-        "keys of documents and columns of tables by the rule of [their versions](../json.md). A "
-        "change to any of these is in the changelog. Everything else may change without notice.", "",
+        "The names below are used as `mdnum.NAME`. **Stability**: these names, their keyword arguments,"
+        " the modules listed in [From Python](../python.md#modules), and codes of findings are stable,"
+        " and keys of documents and columns of tables follow [their versions](../json.md). Changes of "
+        "any of these are listed in the changelog. Everything else may change without notice.", "",
     ]  # fmt: skip
     for title, names in kinds.items():
         lines += [f"## {title}", ""]
@@ -423,7 +424,7 @@ def _shown(member: object) -> bool:
     return (inspect.isfunction(function) or isinstance(member, property)) and bool(inspect.getdoc(member))
 
 
-#: Pages that are written by hand, and belong to the reference.
+#: Hand-written pages that belong to the reference.
 WRITTEN = ("commands", "folders", "json", "extending", "scripts")
 PAGES = {
     "commands": commands_page,
@@ -437,12 +438,12 @@ PAGES = {
 
 
 def write(folder: Path) -> None:
-    """Writes the pages that have changed into a folder."""
+    """Write the pages that have changed to a folder."""
     folder.mkdir(exist_ok=True)
     index = [
         "# Reference",
         "",
-        "Made from the program itself when this site was built.",
+        "These pages were generated from the program when the site was built.",
         "",
         "```{toctree}",
         ":maxdepth: 1",
@@ -457,6 +458,6 @@ def write(folder: Path) -> None:
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """Sphinx calls it."""
+    """Register the pages with Sphinx."""
     app.connect("builder-inited", lambda app: write(Path(app.srcdir) / "reference"))
     return {"parallel_read_safe": True, "parallel_write_safe": True}
