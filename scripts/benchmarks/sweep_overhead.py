@@ -1,8 +1,9 @@
 """What does a sweep cost besides its points, at one second a point?
 
-Answer. 0.040 s between two points of a worker (100 points, two workers, a quiet machine, AMD EPYC, 2026-11-27):
-from the first point to the last the sweep took 4.6 % longer than its points need. The first point began after
-3.7 s and the page took 1.7 s. With other programs on both cores it was 0.11 and 0.17 s. It takes two minutes.
+Answer. 0.040 s between two points of a worker (100 points, two workers, a quiet machine, AMD EPYC,
+2026-11-27): from the first point to the last the sweep took 4.6 % longer than its points need. The first
+point began after 3.7 s and the page took 1.7 s. With other programs on both cores it was 0.11 and 0.17 s.
+It takes two minutes.
 
     python scripts/benchmarks/sweep_overhead.py
     python scripts/benchmarks/sweep_overhead.py --points 40

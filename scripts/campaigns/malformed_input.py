@@ -16,17 +16,16 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import io
 import json
 import random
 import re
-import subprocess
 import sys
 import tempfile
-import warnings
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+from _cases import answers, called, counted, serve
+from _output import parser, say
 
 OUTCOMES = ("refused", "ran", "stopped", "TRACEBACK", "RAW", "LONG", "WRONG EXIT", "CRASH", "HANG")
 FINE = OUTCOMES[:3]
@@ -92,46 +91,13 @@ kind = "final-height"
 BUILT = 'builder = "fcc"\nsymbol = "Ar"\nlattice_constant = 5.3\n'
 
 NUMBERS = (
-    "0",
-    "-0.0",
-    "-1",
-    "1e-300",
-    "5e-324",
-    "1e-12",
-    "1e30",
-    "1e200",
-    "1e300",
-    "1.7976931348623157e308",
-    "nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "9" * 30,
-    "9" * 5000,
-    "0x7fffffffffffffff",
-    "18446744073709551616",
-    "true",
-    '"1.0"',
-    "[1.0]",
-    "{}",
-    "1979-05-27",
-    "''",
-)
+    "0", "-0.0", "-1", "1e-300", "5e-324", "1e-12", "1e30", "1e200", "1e300", "1.7976931348623157e308",
+    "nan", "inf", "-inf", "1e400", "9" * 30, "9" * 5000, "0x7fffffffffffffff", "18446744073709551616",
+    "true", '"1.0"', "[1.0]", "{}", "1979-05-27", "''",
+)  # fmt: skip
 COORDINATES = (
-    "nan",
-    "inf",
-    "-inf",
-    "1e200",
-    "1e300",
-    "-1e16",
-    "1e9",
-    "1e400",
-    "x",
-    "1,0",
-    "0x1p3",
-    "\u0661",
-    "",
-)
+    "nan", "inf", "-inf", "1e200", "1e300", "-1e16", "1e9", "1e400", "x", "1,0", "0x1p3", "\u0661", "",
+)  # fmt: skip
 TEXTS = (
     "\x1b[31mred\x1b[0m",
     "\x1b]0;title\x07",
@@ -385,25 +351,15 @@ def cases(count: int, seed: int) -> Iterator[tuple[str, Files]]:
 
 def call(words: list[str]) -> tuple[str, str]:
     """(outcome, what was printed) of one command in this process."""
-    from mdnum.cli import main
-
-    out, err = io.StringIO(), io.StringIO()
-    code: object
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            main(words)
-    except SystemExit as stopped:
-        code = stopped.code
-    except BaseException as error:  # whatever it is, nobody caught it
-        return "TRACEBACK", f"{type(error).__name__}: {error}"[:300]
-    printed = out.getvalue() + err.getvalue()
-    if _RAW.search(printed):
-        return "RAW", repr(printed[:300])
-    told = err.getvalue().splitlines()
-    if max(map(len, told), default=0) > LONGEST:
-        return "LONG", printed[:100]
+    code, out, err = called(words)
+    told = err.splitlines()
     last = told[-1] if told else ""
+    if code is None:
+        return "TRACEBACK", last[:300]
+    if _RAW.search(out + err):
+        return "RAW", repr((out + err)[:300])
+    if max(map(len, told), default=0) > LONGEST:
+        return "LONG", (out + err)[:100]
     if code == 2:
         # a run that stopped at a number that is not finite says so in the same way
         return ("refused" if last.startswith("mdnum: ") else "WRONG EXIT"), last
@@ -426,84 +382,41 @@ def examine(files: Files, folder: Path) -> tuple[str, str]:
     return ("stopped" if outcome == "refused" else outcome), said
 
 
-def _serve(count: int, seed: int) -> None:
-    """A child: the cases whose numbers are on stdin, an answer a line."""
-    every = list(cases(count, seed))
-    for line in sys.stdin:
-        with tempfile.TemporaryDirectory() as folder:
-            print(json.dumps(examine(every[int(line)][1], Path(folder))), flush=True)
-
-
-def campaign(count: int, seed: int) -> list[tuple[str, str, str]]:
-    """(kind, outcome, what was said) of every case and every command."""
-    kinds = [kind for kind, _ in cases(count, seed)]
-    found, child = [], None
-    for number, kind in enumerate(kinds):
-        if child is None:
-            child = subprocess.Popen(
-                [sys.executable, __file__, "--serve", "--cases", str(count), "--seed", str(seed)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                text=True,
-            )
-        assert child.stdin is not None and child.stdout is not None
-        child.stdin.write(f"{number}\n")
-        child.stdin.flush()
-        answer = _in_time(child)
-        if answer is None:
-            late = child.poll() is None
-            child.kill()
-            outcome, said = ("HANG", f"{PATIENCE} s") if late else ("CRASH", f"exit {child.wait()}")
-            child = None
-        else:
-            outcome, said = json.loads(answer)
-        found.append((kind, outcome, said))
+def campaign(count: int, seed: int) -> Iterator[tuple[str, str]]:
+    """(kind, outcome) of every case and every command."""
+    words = ("--cases", str(count), "--seed", str(seed))
+    found = answers(__file__, range(count), PATIENCE, *words)
+    for number, ((kind, _), (outcome, said)) in enumerate(zip(cases(count, seed), found, strict=True)):
         if outcome not in FINE:
-            print(f"  case {number} ({kind}): {outcome} {said}", flush=True)
-    if child is not None:
-        child.kill()
+            say(f"  case {number} ({kind}): {outcome} {said}")
+        yield kind, outcome
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         for words in COMMANDS:
-            outcome, said = call(list(words))
-            found.append(("command line", outcome, said))
+            outcome, said = call(words)
             if outcome not in FINE:
-                print(f"  {words!r:.60}: {outcome} {said}", flush=True)
-    return found
-
-
-def _in_time(child: subprocess.Popen[str]) -> str | None:
-    import selectors
-
-    assert child.stdout is not None
-    with selectors.DefaultSelector() as waiting:
-        waiting.register(child.stdout, selectors.EVENT_READ)
-        return (child.stdout.readline() or None) if waiting.select(PATIENCE) else None
-
-
-def table(found: list[tuple[str, str, str]]) -> str:
-    """A row for each kind of damage, in Markdown."""
-    rows = [("damage", "cases", *OUTCOMES), ("---",) * (len(OUTCOMES) + 2)]
-    names = list(dict.fromkeys(kind for kind, _, _ in found))
-    for name in [*names, "all"]:
-        counts = Counter(outcome for kind, outcome, _ in found if name in (kind, "all"))
-        rows.append((name, str(sum(counts.values())), *(str(counts[one]) for one in OUTCOMES)))
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+                say(f"  {words!r:.60}: {outcome} {said}")
+            yield "command line", outcome
 
 
 def main() -> int:
     """Runs the campaign and prints its table; 1 where an outcome was not fine."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--cases", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--cases", type=int, default=300)
+    made.add_argument("--seed", type=int, default=1)
+    made.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    asked = made.parse_args()
     if asked.serve:
-        _serve(asked.cases, asked.seed)
+        every = [files for _, files in cases(asked.cases, asked.seed)]
+
+        def one(number: int) -> tuple[str, str]:
+            with tempfile.TemporaryDirectory() as folder:
+                return examine(every[number], Path(folder))
+
+        serve(one)
         return 0
-    found = campaign(asked.cases, asked.seed)
-    print(table(found))
-    return int(any(outcome not in FINE for _, outcome, _ in found))
+    found = list(campaign(asked.cases, asked.seed))
+    print(counted("damage", OUTCOMES, found))
+    return int(any(outcome not in FINE for _, outcome in found))
 
 
 if __name__ == "__main__":

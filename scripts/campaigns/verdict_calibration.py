@@ -28,7 +28,6 @@ rule that mdnum has now.
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -38,7 +37,8 @@ from typing import Any
 
 import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
-from _output import say, start
+from _output import parser, say, start
+from _pages import between, markdown
 from ase import Atoms
 from ase.build import bulk
 from scipy.stats import beta
@@ -259,12 +259,6 @@ def truth(one: dict[str, np.ndarray]) -> list[tuple[int, int]]:
 WORDS = ("bystander", "undecided", "accelerated", "cause", "open", "no fork")
 
 
-def table(columns: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
-    """A Markdown table."""
-    lines = [columns, ("---",) * len(columns), *rows]
-    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
-
-
 def below(false: int, of: int) -> float:
     """The share that the true one is below with 95 % confidence: exact, one-sided (Clopper and Pearson,
     Biometrika 26, 404, 1934)."""
@@ -340,8 +334,8 @@ def tables(store: Path, seeds: int) -> tuple[str, str]:
             rows.append((f"{name}, placebo", len(kept), *(empty[word] for word in WORDS)))
             wrong.append((f"{name}, placebo", "accelerated", empty["accelerated"], len(kept)))
     parts = [
-        table(("system", "starts", *WORDS), rows),
-        table(
+        markdown(("system", "starts", *WORDS), rows),
+        markdown(
             ("system", "false", "starts", "share", "below (95 %)"),
             [
                 (name, f"{word}: {no}", of, f"{100 * no / of:.1f} %", f"{100 * below(no, of):.1f} %")
@@ -349,7 +343,7 @@ def tables(store: Path, seeds: int) -> tuple[str, str]:
                 if of
             ],
         ),
-        table(("system", "repeats, median", "mean", "undecided at one displacement", "at two"), repeats),
+        markdown(("system", "repeats, median", "mean", "undecided at one displacement", "at two"), repeats),
     ]
     return summed_up(rows, [one for one in wrong if one[-1]]), "\n\n".join(parts)
 
@@ -359,7 +353,7 @@ MARK = "<!-- written by scripts/campaigns/verdict_calibration.py -->"
 
 def main() -> None:
     """Parse, run what is missing, judge, print."""
-    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made = parser(__doc__)
     made.add_argument("--seeds", type=int, default=100, metavar="N", help="starts of each (default 100)")
     made.add_argument(
         "--only", nargs="+", default=[""], metavar="WORD", help="systems whose name has one of these in it"
@@ -384,15 +378,14 @@ def main() -> None:
                     for seed in range(1, chosen.seeds + 1):
                         print(f"{name} {cutoff}, start {seed}")
                         rows = scan(system(name, liquid(name, seed), cutoff, seed))
-                        print(table(("displacement over the choice's", "delayed", "of", "split"), rows))
+                        print(markdown(("displacement over the choice's", "delayed", "of", "split"), rows))
         return
     if chosen.tables is None:
         fill(chosen.store, chosen.seeds, chosen.only)
         print(*tables(chosen.store, chosen.seeds), sep="\n\n")
         return
-    parts = chosen.tables.read_text(encoding="utf-8").split(MARK)
-    parts[1], parts[3] = (f"\n\n{text}\n\n" for text in tables(chosen.store, chosen.seeds))
-    chosen.tables.write_text(MARK.join(parts), encoding="utf-8")
+    new = between(chosen.tables, MARK, *tables(chosen.store, chosen.seeds))
+    chosen.tables.write_text(new, encoding="utf-8")
 
 
 if __name__ == "__main__":

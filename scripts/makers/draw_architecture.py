@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import ast
-import sys
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,7 +20,9 @@ from html import escape
 from pathlib import Path
 from textwrap import wrap
 
-ROOT = Path(__file__).resolve().parents[2]
+import _shared  # noqa: F401  what scripts share is found by it
+from _pages import ROOT, between, markdown, write
+
 PICTURE, PAGE = ROOT / "docs" / "figures" / "architecture.svg", ROOT / "docs" / "architecture.md"
 MARK = "<!-- written by scripts/makers/draw_architecture.py -->"
 
@@ -279,12 +280,11 @@ def arrows(edges: list[tuple[str, str]], boxes: dict[str, Box]) -> list[str]:
 
 def table() -> str:
     """What each room is for and which it imports, highest layer first."""
-    rows = ["| room | what it is for | imports |", "|---|---|---|"]
-    order = [room for layer in layers() for room in layer]
+    rows, order = [], [room for layer in layers() for room in layer]
     for room in order:
         used = ", ".join(f"`{other}`" for other in order if other in imports(room)) or "nothing of mdnum"
-        rows.append(f"| `{room}` | {about(room)} | {used} |")
-    return "\n".join(rows)
+        rows.append((f"`{room}`", about(room), used))
+    return markdown(("room", "what it is for", "imports"), rows)
 
 
 def main() -> None:
@@ -292,21 +292,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--check", action="store_true", help="write nothing; exit with 1 if a file is not current"
-    )
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if not current")
     asked = parser.parse_args()
-    head, _, rest = PAGE.read_text(encoding="utf-8").partition(MARK)
-    tail = rest.partition(MARK)[2]
-    new = {PICTURE: drawing(), PAGE: f"{head}{MARK}\n\n{table()}\n\n{MARK}{tail}"}
-    stale = [
-        path for path, text in new.items() if not path.exists() or path.read_text(encoding="utf-8") != text
-    ]
-    if asked.check:
-        sys.exit("".join(f"{path.relative_to(ROOT)} is not current\n" for path in stale) or 0)
-    for path in stale:
-        path.write_text(new[path], encoding="utf-8")
-        print(path.relative_to(ROOT))
+    write({PICTURE: drawing(), PAGE: between(PAGE, MARK, table())}, asked.check)
 
 
 if __name__ == "__main__":

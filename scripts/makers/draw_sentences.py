@@ -25,18 +25,8 @@ _END = re.compile(r"(?<=[.?!:])\s+(?=[A-Z`\[*-])")
 _FIELD = re.compile(r"\{(?:[a-z_]*:\?) (\w+) \w+\}|\{(\w+)(?::#? ?([^}]*))?\}")
 #: Keys whose texts are no sentences of a finding.
 _NO_SENTENCE = (
-    "severity",
-    "section",
-    "help",
-    "metavar",
-    "type",
-    "of",
-    "kind",
-    "unit",
-    "calls",
-    "name",
-    "shares",
-)
+    "severity", "section", "help", "metavar", "type", "of", "kind", "unit", "calls", "name", "shares",
+)  # fmt: skip
 
 
 def main() -> None:

@@ -12,10 +12,11 @@ from __future__ import annotations
 import argparse
 import ast
 import re
-import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+import _shared  # noqa: F401  what scripts share is found by it
+from _pages import ROOT, between, markdown, write
+
 PAGE = ROOT / "docs" / "scripts.md"
 MARK = "<!-- written by scripts/makers/list_scripts.py -->"
 RAW = argparse.RawDescriptionHelpFormatter
@@ -57,8 +58,7 @@ def tables() -> str:
     for folder, title in TITLES.items():
         head = ("script", "what it does") if folder == "makers" else ("script", "question", "answer", "takes")
         rows = [row(path) for path in sorted((ROOT / "scripts" / folder).glob("[a-z]*.py"))]
-        lines = [head, ("---",) * len(head), *rows]
-        parts.append(f"## {title}\n\n" + "\n".join(f"| {' | '.join(cells)} |" for cells in lines))
+        parts.append(f"## {title}\n\n{markdown(head, rows)}")
     return "\n\n".join(parts)
 
 
@@ -67,12 +67,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=RAW)
     parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if not current")
     asked = parser.parse_args()
-    text = PAGE.read_text(encoding="utf-8")
-    head, _, rest = text.partition(MARK)
-    new = f"{head}{MARK}\n\n{tables()}\n\n{MARK}{rest.partition(MARK)[2]}"
-    if asked.check:
-        sys.exit(0 if new == text else f"{PAGE.relative_to(ROOT)} is not current")
-    PAGE.write_text(new, encoding="utf-8")
+    write({PAGE: between(PAGE, MARK, tables())}, asked.check)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[2]
+import _shared  # noqa: F401  what scripts share is found by it
+from _pages import ROOT, markdown
+
 DECLARED = ROOT / "docs" / "measured.toml"
 RECORDS = ROOT / "docs" / "measured"
 RAW = argparse.RawDescriptionHelpFormatter
@@ -123,9 +125,7 @@ def filled(text: str, said: Mapping[str, Mapping[str, Any]], folder: Path = RECO
         rows = [[{**one, **one["values"]}[key] for key in columns] for one in records(match[2], folder)]
         if not rows:
             raise KeyError(f"{match[2]} was not measured")
-        lines = [columns, ["---"] * len(columns), *rows]
-        shown = "\n".join("| " + " | ".join(row) + " |" for row in lines)
-        return f"{match[1]}\n\n{shown}\n\n{match[4]}"
+        return f"{match[1]}\n\n{markdown(columns, rows)}\n\n{match[4]}"
 
     return _TABLE.sub(table, _VALUE.sub(value, text))
 
