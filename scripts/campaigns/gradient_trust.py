@@ -182,9 +182,9 @@ def stored(
     """
     store.mkdir(parents=True, exist_ok=True)
     file = f"{name.replace(' ', '-').replace(',', '')}-{{}}.json"
-    for seed in seeds if examine else ():
+    for seed in seeds:
         path = store / file.format(seed)
-        if not path.exists():
+        if examine is not None and not path.exists():
             say(f"{name}: seed {seed}")
             path.write_text(json.dumps(examine(seed), default=float), encoding="utf-8")
     # more than these seeds may have been examined before
