@@ -9,7 +9,7 @@ from mdnum.audit.base import CheckResult
 from mdnum.audit.causes import cause
 from mdnum.audit.checks import CHECKS
 
-Answer = Literal["yes", "as far as asked", "with care", "no", "not asked"]
+Answer = Literal["yes", "as far as tested", "with care", "no", "not tested"]
 _NEARLY = 0.9  # of the ways of a check: from here on it counts as asked
 _FAR_BELOW = 0.1  # of the share of the forces that is wrong: a curl that would be seen of this is absent
 _QUESTIONS = ("run", "differentiate")
@@ -39,9 +39,9 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
         return "with care"
     needed, begun = needed_to(question), _begun(results)
     if not needed <= set(wanted) or not {name for name in needed if CHECKS[name].basic} <= begun:
-        return "not asked"
+        return "not tested"
     asked = {result.name for result in results if not largely_unasked(result)}
-    return "yes" if needed <= asked else "as far as asked"
+    return "yes" if needed <= asked else "as far as tested"
 
 
 def largely_unasked(result: CheckResult) -> bool:

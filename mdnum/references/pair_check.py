@@ -24,7 +24,7 @@ from mdnum.systems.construct import with_atoms
 from mdnum.systems.simulation import Simulation
 
 AGREES, AT_THE_CUTOFF, DIFFERS = "agrees", "differs at the cutoff", "differs"
-FAILED, NOT_ASKED = "failed", "not asked"
+FAILED, NOT_TESTED = "failed", "not tested"
 _SINGLE = 2.0**-24
 _NEARBY = 3  # ulps either side of r_cut in which oriented pairs are placed
 
@@ -192,7 +192,7 @@ class SearchResult:
     # name, version: which search
     name: str
     version: str | None
-    # "agrees"; "differs at the cutoff": only within its own rounding; "differs"; "failed"; "not asked": see
+    # "agrees"; "differs at the cutoff": only within its own rounding; "differs"; "failed"; "not tested": see
     # note
     verdict: str
     pairs: int = 0  # pairs found inside the cutoff
@@ -203,7 +203,7 @@ class SearchResult:
     effective: EffectiveCutoff | None = None  # the cutoff it acts on
     seconds: float = 0.0  # time of the first search, compiling included
     ours: bool = False  # whether it is mdnum's own, on which a run depends
-    note: str = ""  # why it was not asked, or how it failed
+    note: str = ""  # why it was not tested, or how it failed
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ class PairsReport:
     @property
     def ok(self) -> bool:
         """Whether mdnum's own searches agree with brute force, except within rounding error."""
-        return all(one.verdict in (AGREES, AT_THE_CUTOFF, NOT_ASKED) for one in self.results if one.ours)
+        return all(one.verdict in (AGREES, AT_THE_CUTOFF, NOT_TESTED) for one in self.results if one.ours)
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one table row per neighbor search."""
@@ -268,7 +268,7 @@ def check_pairs(
         truth.append(found.select(chosen[species[found.i], species[found.j]]))
 
     def ask(search: Search) -> SearchResult:
-        result = SearchResult(search.name, search.listed.version, NOT_ASKED, ours=search.ours)
+        result = SearchResult(search.name, search.listed.version, NOT_TESTED, ours=search.ours)
         if note := search.refusal(x, cell, pbc, groups[0][0]):
             return replace(result, note=note)
         counts, pairs, seconds = np.zeros(3, int), 0, 0.0

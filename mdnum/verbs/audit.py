@@ -469,7 +469,7 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     if early and conclusion.nothing_felt(shown):
         return TEXTS("nothing_felt", name=name)
     slugs = {question: answer.replace(" ", "_") for question, answer in said.items()}
-    asked = [TEXTS(f"{question}_{slug}") for question, slug in slugs.items() if slug != "not_asked"]
+    asked = [TEXTS(f"{question}_{slug}") for question, slug in slugs.items() if slug != "not_tested"]
     nothing = early and begun and not asked
     rest = [
         TEXTS("rest_of_check", asked=one.asked, possible=one.possible, check=one.name)
@@ -486,7 +486,7 @@ def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     else:
         head = TEXTS("both", name=name, run=asked[0], differentiate=asked[1])
     if rest:
-        beside = "as far as asked" in said.values()
+        beside = "as far as tested" in said.values()
         head = TEXTS("with_rest_beside" if beside else "with_rest", head=head, rest=", ".join(rest))
     severe = sorted(
         (one for one in found if one.severity != "info"),

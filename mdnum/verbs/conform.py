@@ -485,15 +485,15 @@ def page(view: View, verdict: Verdict) -> Page:
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
     """Yield tables with one row per area: for single searches, and for lists that are updated in a run."""
     columns: dict[str, Any] = {
-        "area": "area", "asked": "asked", "right": "passed",
+        "area": "area", "tested": "asked", "right": "passed",
         "wrong": lambda row: row["failed"] - row["silent"] or None,
         "no answer": lambda row: row["silent"] or None, "refused": lambda row: row["refused"] or None,
-        "not asked": lambda row: row["skipped"] or None, "about": "about",
+        "not tested": lambda row: row["skipped"] or None, "about": "about",
         "not answered": lambda row: "; ".join(
             f"{one['why']} ({count(one['cases'])})" for one in row["why"][:3]
         ),
     }  # fmt: skip
-    for title, used in (("a list asked once", False), ("a list in use", True)):
+    for title, used in (("a list that is built once", False), ("a list that is kept in use", True)):
         if rows := [row for row in summary["areas"] if (row["area"] in _IN_USE) == used]:
             yield table_of(rows, columns, title, bad=lambda row: row["failed"])
 

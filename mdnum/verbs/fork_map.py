@@ -171,7 +171,7 @@ def _row(edge: Boundary) -> dict[str, Any]:
         "also": edge.also, "margin_below": below.margin, "margin_above": above.margin, "bound": edge.bound,
         "loss_below": below.loss, "loss_above": above.loss, "jump": edge.jump, **gradients,
         "energy_below": below.energy, "energy_above": above.energy, "separation": edge.separation,
-        "confirmed": {True: "yes", False: "no", None: "not asked"}[edge.confirmed],
+        "confirmed": {True: "yes", False: "no", None: "not tested"}[edge.confirmed],
     }  # fmt: skip
 
 

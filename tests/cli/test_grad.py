@@ -384,7 +384,7 @@ def open_trust(*unseen: str, unknown: tuple[str, ...] = ()) -> dict[str, Any]:
     """Trust that is undecided: half the time step was not made, and these limits were not examined."""
     limits = [
         {"what": what, "horizon": None, "reached": False, "values": {},
-         "code": "half-step" if what == "near miss" else "not asked"}
+         "code": "half-step" if what == "near miss" else "not requested"}
         for what in unseen
     ]  # fmt: skip
     more = {"half": {}, "digits": {}, "near": None, "verdict": "undecided", "limited_by": ""}

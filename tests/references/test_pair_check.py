@@ -238,5 +238,5 @@ def test_searches_that_cannot_be_asked_have_a_reason():
     report = check_pairs(make(atoms, LENNARD_JONES, HARD), searches=asked, effective=False)
     limited, *others = [one.note for one in report.results]
     assert limited.endswith("axis by axis") and others == ["not installed", ""]
-    assert [one.verdict for one in report.results] == ["not asked", "not asked", "agrees"]
+    assert [one.verdict for one in report.results] == ["not tested", "not tested", "agrees"]
     assert report.ok and codes(report) == []

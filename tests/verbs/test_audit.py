@@ -228,7 +228,7 @@ NO, CARE = (TEXTS(f"same_{answer}", name="x on Ar") for answer in ("no", "with_c
 @pytest.mark.parametrize(
     ("parts", "answer", "headline"),
     [
-        ([part("forces")], "not asked", TEXTS("found_nothing", head="x on Ar", checks=1)),
+        ([part("forces")], "not tested", TEXTS("found_nothing", head="x on Ar", checks=1)),
         ([part("smoothness", ("A", "warning")), *map(part, REST)], "with care", f"{CARE}: a."),
         ([part("curl", ("B", "error"))], "no", f"{NO}: b."),
         (
@@ -269,18 +269,18 @@ def test_what_is_largely_unasked_is_not_safe():
     parts, every = [part(name) for name in ("smoothness", *REST)], ["smoothness", *REST]
     few = part("invariance", asked=11, possible=52)
     run, differentiate, headline = judged([parts[0], few, *parts[2:]])
-    assert (run, differentiate) == ("as far as asked", "yes")
+    assert (run, differentiate) == ("as far as tested", "yes")
     assert "11 of 52" in headline and "invariance" in headline and "safe to run" not in headline
     # nearly all of its ways is enough, nothing at all is not
     assert judged([parts[0], part("invariance", asked=50, possible=52), *parts[2:]])[0] == "yes"
     run, differentiate, headline = judged([], every)
-    assert run == differentiate == "not asked" and "safe" not in headline
+    assert run == differentiate == "not tested" and "safe" not in headline
     # nothing is safe as long as a check that it needs has not begun
     run, differentiate, headline = judged([few, *parts[:1]], every)
-    assert run == differentiate == "not asked"
+    assert run == differentiate == "not tested"
     assert headline.startswith("x on Ar: ") and "11 of 52" in headline
     run, differentiate, headline = judged([few, *parts[:1], *parts[2:4]], every)
-    assert (run, differentiate) == ("not asked", "yes") and "safe to differentiate" in headline
+    assert (run, differentiate) == ("not tested", "yes") and "safe to differentiate" in headline
     # codes that do not bear on a question
     told = answers([part("smoothness", ("FORCE_JUMP", "warning")), *map(part, REST)], every)
     assert (told["run"], told["differentiate"]) == ("yes", "with care")

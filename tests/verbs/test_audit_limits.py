@@ -51,9 +51,9 @@ class ByCalls:
 @pytest.mark.parametrize(
     ("kind", "atoms", "answer"),
     [
-        (planted.Good, planted.crystal(), "as far as asked"),
-        (planted.Good, planted.chain(), "as far as asked"),
-        (planted.Single, planted.crystal(), "as far as asked"),
+        (planted.Good, planted.crystal(), "as far as tested"),
+        (planted.Good, planted.chain(), "as far as tested"),
+        (planted.Single, planted.crystal(), "as far as tested"),
         (planted.Whirl, planted.chain(), "no"),
         (planted.drops(0.3, 7), planted.crystal(), "no"),
         (planted.NoSwitchInForce, planted.crystal(), "no"),
@@ -77,7 +77,7 @@ def test_time_that_is_up_before_a_verdict_says_so(monkeypatch, tmp_path):
     )
     assert outcome.summary["status"] == frame.UNDECIDED
     assert exit_code(outcome.verdict.findings, outcome.summary["status"]) == EXIT_UNDECIDED
-    assert outcome.summary["safe_to_run"] == "not asked"
+    assert outcome.summary["safe_to_run"] == "not tested"
     # resumed without a limit, it is whole
     done = mdnum.audit_calculator(timed.make, resume=tmp_path / "a", report=False)
     assert done.summary["status"] == "complete" and done.summary["safe_to_run"] == "yes"
@@ -114,7 +114,7 @@ def test_a_check_whose_calls_are_used_up_is_not_fine(monkeypatch, tmp_path):
     assert 0 < parts["invariance"]["asked"] < parts["invariance"]["possible"]
     # of dynamics the brief form is known
     assert (parts["dynamics"]["asked"], parts["dynamics"]["possible"]) == (1, 2)
-    assert found.summary["status"] == "complete" and found.summary["safe_to_run"] == "as far as asked"
+    assert found.summary["status"] == "complete" and found.summary["safe_to_run"] == "as far as tested"
     assert {one["why"] for one in found.summary["left_out"]} >= {CALLS_UP}
 
 

@@ -58,7 +58,7 @@ def test_the_folder_holds_the_piecewise_map(mapped):
     closed = [(APART - RADIUS) / SPEED / k for k in (6, 5, 4)]
     np.testing.assert_allclose(edges["above"], closed, rtol=1e-14)
     assert edges["above"].tolist() == np.nextafter(edges["below"], 1.0).tolist()
-    assert edges["step"].tolist() == [6, 5, 4] and set(edges["confirmed"]) == {"not asked"}
+    assert edges["step"].tolist() == [6, 5, 4] and set(edges["confirmed"]) == {"not tested"}
     # intervals and boundaries alternate, and between them cover what was asked for
     assert pieces["low"].tolist() == [0.06, *edges["above"]]
     assert pieces["high"].tolist() == [*edges["below"], 0.105]

@@ -364,10 +364,10 @@ def trust(
             _compared(STEP, last_agreeing(at, halved, tolerance), halved, tolerance, {
                 "largest": max(float(np.max(one[-2:])) for one in halved.values())
             }) if halved
-            else Limit(STEP, None, False, "noise" if noisy else "not asked"),
+            else Limit(STEP, None, False, "noise" if noisy else "not requested"),
             _missed(problem, own, turns, unseen, made, moved, tolerance, saltation, chosen), ambiguous,
             Limit(SCATTER, *last_below(at, scattered, 1.0), "scatter", {"replicas": replicas}) if scattered
-            else Limit(SCATTER, None, False, "not asked"),
+            else Limit(SCATTER, None, False, "not requested"),
         )  # fmt: skip
         open_ = chosen == tuple(kept) and len(kept) < len(full)
         return Judgment(*verdict_of(limits, problem.steps, chaotic, open_), limits)
