@@ -32,7 +32,7 @@ class Compared:
 
     @property
     def worst(self) -> str | None:
-        """The measure that is outside its tolerance, or is furthest from being decided."""
+        """The measure outside its tolerance; if there is none, the one that needs the most further seeds."""
         each = self.by_measure
         ranked = sorted(each, key=lambda name: (each[name].inside is not False, -each[name].more))
         return next((name for name in ranked if each[name].inside is not True), None)
@@ -45,7 +45,7 @@ class Compared:
 
     @property
     def more(self) -> float:
-        """Factor by which the number of seeds must grow to decide."""
+        """Factor by which the number of seeds must increase to decide about the tolerances."""
         return max((one.more for one in self.by_measure.values()), default=1.0)
 
 
@@ -54,10 +54,10 @@ class Advice:
     """Recommended value of one axis.
 
     Attributes:
-        key: key of the axis. end: the value that counts as converged; None if there is none.
+        key: key of the axis. end: the value that is regarded as converged; None if there is none.
         settings: every value with its comparison, starting at the converged end.
-        best: the cheapest value that, like all values nearer to the end, is within the tolerance; None if
-            there is only the end itself, or if undecided.
+        best: the value furthest from the end for which it and all values between are within the tolerance;
+            None if this is only the end itself, or if undecided.
         undecided: the first undecided value beyond best.
         converged: whether the value next to the end agrees with it within the tolerance: if not, the end
             itself may not be converged.
@@ -72,7 +72,7 @@ class Advice:
 
 
 def end_of(key: str, values: Sequence[Any], given: Mapping[str, str] = {}) -> Any:
-    """Return the value of an axis that counts as converged; None if there is none."""
+    """Return the value of an axis that is regarded as converged; None if there is none."""
     word = given.get(key, _ENDS.get(key) or _ENDS.get(key.rpartition(".")[2], ""))
     if word == "largest":
         return max(values, key=_size)
@@ -98,7 +98,7 @@ def advise(
         values: values of the axis.
         found: differences from the end, as `difference` returns them, by measure and by label of a value.
         tolerances: tolerances by measure, in its unit.
-        given: ends by key, in place of the usual ones: "largest", "smallest" or a value.
+        given: ends by key, in place of the usual ones: each is "largest", "smallest" or a value.
     """
     end = end_of(key, values, given)
     if end is None or not tolerances:

@@ -150,7 +150,7 @@ def _along(
     reference: Setting,
     names: Sequence[str],
 ) -> dict[str, dict[str, Raw]]:
-    """Differences of some settings from one of them, by measure and by label."""
+    """Return the differences of several settings from a reference setting, by measure and by label."""
     found = {}
     for name in names:
         runs = results.values.get(name, {})
@@ -176,7 +176,7 @@ def _labels(plan: Plan, axis: Axis) -> dict[str, Setting]:
 
 
 def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[str, ...], Raw]:
-    """Of each value of each axis from the system's own."""
+    """Return the differences of each value of each axis from the value in the system."""
     found = {}
     for axis in plan.axes:
         each = _along(means, results, _labels(plan, axis), plan.origin, plan.names)
@@ -185,7 +185,7 @@ def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[
 
 
 def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
-    """Change of each measure from end to end of each axis, for a space-filling design."""
+    """Return the change of each measure between the ends of each axis, for a space-filling design."""
     choices, ends = {one.setting: one.point.choices for one in plan.points}, {}
 
     def share(axis: Axis, value: Any) -> float:
@@ -231,7 +231,7 @@ def _advice(
     compared: Mapping[tuple[str, ...], Difference],
     results: _Results,
 ) -> list[dict[str, Any]]:
-    """Return the recommended value of each axis as plain values; the fastest if an axis affects nothing."""
+    """Return the recommended value of each axis as plain values; the fastest if an axis affects no result."""
     physical = {measure.name for measure in plan.measures if measure.physical}
     moving = {(key, value) for (name, key, value), one in compared.items() if one.moves and name in physical}
     rows = []
@@ -263,9 +263,9 @@ def _advice(
 
 
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The setting of all recommendations together, and that of all converged ends; empty where they are one.
+    """Return the setting with all recommended values and the setting with all converged ends; empty if equal.
 
-    Each choice was varied alone, so that what two of them do together is not known before these are run.
+    Each choice was varied alone, so the combined effect of several choices is known only after these runs.
     """
     best = {row["choice"]: row["best"] for row in advice if row["best"] is not None}
     ends = {row["choice"]: row["end"] for row in advice if row["end"] is not None}
@@ -276,7 +276,7 @@ def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[st
 
 
 def _means(results: _Results, without: Collection[Setting] = ()) -> dict[tuple[str, Setting], SeedMean]:
-    """Means over seeds; settings that were added later do not change the errors of the others."""
+    """Return means over seeds; settings that were added later do not change the errors of the others."""
     return {
         (name, setting): mean
         for name, runs in results.values.items()
@@ -290,7 +290,7 @@ def _together(
     means: Means, results: _Results, joint: Sequence[Setting],
     tolerances: Mapping[str, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Whether the recommendations are within the tolerances together."""
+    """Return whether the setting with all recommended values is within the tolerances."""
     setting, end = joint
     found = _along(means, results, {"": setting}, end, list(tolerances))
     each = {
@@ -306,7 +306,7 @@ def _together(
 
 
 def _fastest(plan: Plan, axis: Axis, moving: set[tuple[str, str]], results: _Results) -> dict[str, Any]:
-    """Return the fastest value of a choice that affects no result, among those that lost no pair."""
+    """Return the value with the fastest runs without lost pairs, for a choice that affects no result."""
     rows = []
     for value, setting in plan.along(axis):
         speeds, lost = np.array(results.speeds.get(setting, [(np.nan, 0)])).T

@@ -125,7 +125,7 @@ def points(
     design: Design = "one-at-a-time",
     samples: int = 0,
 ) -> list[Point]:
-    """Return all points, seed by seed, so that a sweep that is stopped early includes every setting.
+    """Return all points, ordered by seed, so that an interrupted sweep contains results for every setting.
 
     Args:
         base: the value of each axis that is kept while another axis is varied.
@@ -156,7 +156,7 @@ def points(
 
 
 def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
-    """Return a scrambled Sobol sequence between the ends of each axis; values that are words take turns."""
+    """Return a scrambled Sobol sequence between the ends of each axis; values that are words alternate."""
     from scipy.stats import qmc
 
     if samples < 2 or samples & (samples - 1):

@@ -42,11 +42,11 @@ _LOOK = 5.0
 
 @cache
 def _pinned(width: int) -> None:
-    """Restrict this process to reserved cores, because XLA uses all visible ones despite OMP_NUM_THREADS.
+    """Restrict this process to reserved cores, because XLA uses all visible cores despite OMP_NUM_THREADS.
     OMP_NUM_THREADS.
 
-    A core is reserved by a lock that ends with the process, so that sweeps on one machine share the cores; if
-    no core is free, one is used twice.
+    A core is reserved by a lock that is released when the process ends, so that all sweeps on a machine share
+    the cores; if no core is free, a core is used twice.
     """
     with suppress(ImportError, AttributeError, OSError):
         import fcntl
@@ -70,7 +70,7 @@ def _pinned(width: int) -> None:
 def _answered(
     work: Callable[[Any], Any], task: Any, caller: tuple[str, int], width: int
 ) -> tuple[Any, Exception | None]:
-    """Return a task's result, or its exception; an exception of the future is then the engine's."""
+    """Return the result or exception of a task; an exception of its future then comes from the engine."""
     if (socket.gethostname(), os.getpid()) != caller:
         _pinned(width)
     try:
@@ -148,7 +148,7 @@ def _dask(address: str, workers: int | None) -> _Engine:
 
 
 def _executorlib(file: str, workers: int | None) -> _Engine:
-    """An executor of executorlib, whose class and keywords a TOML file has: jobs of SLURM by default."""
+    """Return an executor of executorlib, with the class and keywords of a TOML file; default SLURM jobs."""
     try:
         import executorlib  # pyright: ignore[reportMissingImports]
         from executorlib.api import ExecutorlibSocketError  # pyright: ignore[reportMissingImports]
@@ -203,7 +203,7 @@ def _executorlib(file: str, workers: int | None) -> _Engine:
 
 
 def _ends_with(parent: int) -> dict[str, Any]:
-    """Ends a worker with the process that started it, where that is on its machine."""
+    """End this worker when the process that started it ends, if both are on the same machine."""
     if os.getppid() == parent:
         guard(parent)
     return {}

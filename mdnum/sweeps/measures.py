@@ -68,7 +68,7 @@ class Sample:
 
     @cached_property
     def made(self) -> dict[Any, Any]:
-        """Whatever several measures of this run share, by keys of their own."""
+        """Intermediate results that several measures of this run share, by name."""
         return {}
 
     @cached_property
@@ -97,14 +97,14 @@ class Measure:
         unit: unit in terms of quantities, such as "energy" or "length²/time".
         title: description.
         of: function that returns its value.
-        needs: "series"; "simulation", which is run again; or "frames" of positions along the run, and its
-            outcome.
+        needs: "series", the time series of the run; "simulation", if the system must be run again; or
+            "frames", the positions along the run and its outcome.
         physical: whether it is a physical result, not a property of the machine or of neighbor lists.
         world: "md" or "ball", the world of runs that have it.
-        takes: what follows "=" in its name, as "CHOICE"; `of` is then called with this argument too, "" if
-            there is none.
+        takes: description of the text after "=" in its name, such as "CHOICE"; `of` then has this text as a
+            further argument, "" if it was not given.
         sources: files that it depends on in addition to those of every point, as `points.digest` takes them:
-            a stored value is valid as long as they are the same.
+            a stored value is valid as long as these files are unchanged.
     """
 
     name: str
@@ -119,7 +119,7 @@ class Measure:
 
     @property
     def digest(self) -> str:
-        """Of its sources; empty without."""
+        """Digest of its source files; empty if there are none."""
         return digest(self.sources) if self.sources else ""
 
 
@@ -143,7 +143,7 @@ def _blocked(of: Callable[[slice], float], rows: int, blocks: int = _BLOCKS) -> 
 
 
 def correlated(series: Float[np.ndarray, "samples"]) -> tuple[float, float, float]:
-    """Mean of a time series, its standard error, and its number of independent samples.
+    """Return the mean of a time series, its standard error, and its number of independent samples.
 
     Samples before equilibrium are omitted (`pymbar.timeseries.detect_equilibration`, Chodera 2016).
     """
@@ -192,7 +192,7 @@ def flips(run: Sample) -> Value:
 
 @_measure("energy/time", "drift of the conserved energy per atom")
 def drift(run: Sample) -> Value:
-    """Slope of a line through the second half of the run, with its error from the scatter of blocks."""
+    """Return the slope of a line through the second half of the run; its error is the scatter of blocks."""
     rows = slice(len(run.series["time"]) // 2, None)
     time, kept = run.series["time"][rows], run.series["conserved"][rows] / run.atoms
     if len(time) < 2 * _BLOCKS:
@@ -220,8 +220,8 @@ def fluctuation(run: Sample) -> Value:
 def heat_capacity(run: Sample) -> Value:
     """Heat capacity from fluctuations, by the formula for the ensemble of the run.
 
-    At constant energy, fluctuations of the kinetic energy are used (Lebowitz, Percus, Verlet 1967), with a
-    thermostat those of the total energy.
+    At constant energy, fluctuations of the kinetic energy are used (Lebowitz, Percus, Verlet 1967); with a
+    thermostat, fluctuations of the total energy.
     """
     half = slice(len(run.series["time"]) // 2, None)
     kinetic, total = run.series["kinetic"][half], run.series["total"][half]
@@ -249,7 +249,7 @@ def speed(run: Sample) -> Value:
 
 
 def _peak(frames: Float[np.ndarray, "frames places"]) -> Value:
-    """Return the height of the peak of an average over frames; of many frames, over their second half."""
+    """Return the height of the peak of an average over frames (over their second half if there are many)."""
     half = frames[len(frames) // 2 :] if len(frames) > 2 * _BLOCKS else frames
     peak = int(np.argmax(half.mean(axis=0)))
     return _blocked(lambda rows: float(half[rows, peak].mean()), len(half), min(_BLOCKS, len(half)))
@@ -315,7 +315,7 @@ def structure_factors(run: Sample) -> tuple[Float[np.ndarray, "frames shells"], 
 
 
 def _mean_square(x: Float[np.ndarray, "frames atoms 3"]) -> Float[np.ndarray, "lags"]:
-    """Mean squared displacement by lag, over all atoms and origins."""
+    """Return the mean squared displacement for each lag, averaged over all atoms and time origins."""
     import MDAnalysis
     from MDAnalysis.analysis.msd import EinsteinMSD
 
@@ -337,7 +337,7 @@ def msd(run: Sample) -> Value:
 
 @_measure("length²/time", "self-diffusion coefficient", "frames")
 def diffusion(run: Sample) -> Value:
-    """Slope of the mean squared displacement over six, at lags of a tenth to a half of each block."""
+    """Return a sixth of the slope of the mean squared displacement, at lags from 0.1 to 0.5 of each block."""
     x, _, time = run.frames
     x = x[len(x) // 4 :] - x[len(x) // 4 :].mean(axis=1, keepdims=True)
     if len(x) < 40:
@@ -401,7 +401,7 @@ def chosen(words: Sequence[str], world: str) -> list[Measure]:
 
 
 def _named(word: str) -> Measure:
-    """A measure by its name, as "energy", "fork=order" or "mine.py:height"."""
+    """Return the measure with a name such as "energy", "fork=order" or "mine.py:height"."""
     if ".py:" in word:
         return _of_file(word)
     name, _, argument = word.partition("=")
@@ -412,11 +412,11 @@ def _named(word: str) -> Measure:
 
 
 def _of_file(word: str) -> Measure:
-    """A function in a Python file: an outcome to a value, (value, error) or (value, error, samples).
+    """Return the function in a Python file: from an outcome to value, (value, error) or with samples, too.
 
     Raises:
-        InputError: it is not allowed or not there, or the file imports what lies beside it: a digest of the
-            file would not tell when that changes.
+        InputError: code is not allowed, the function does not exist, or the file imports other files of its
+            folder, whose changes a digest of the file would not detect.
     """
     place, _, name = word.rpartition(":")
     file = Path(place).absolute()

@@ -53,7 +53,8 @@ class Plan:
     """Everything that is determined before any run.
 
     Attributes:
-        loaded: the system or simulation with its own values. system, overrides: what it is made from.
+        loaded: the system or simulation with its own values. system, overrides: the arguments from which it
+            was made.
         base: the value of each axis that is kept while another axis is varied.
         points: points in the order in which they are run.
         steps: number of steps of a run at the system's own time step.
@@ -79,7 +80,7 @@ class Plan:
 
     @property
     def wanted(self) -> dict[str, str]:
-        """Digests of its measures' sources by name, as points store them."""
+        """Digests of the source files of its measures by name, as stored with the points."""
         return {measure.name: measure.digest for measure in self.measures}
 
     @property
@@ -176,7 +177,7 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
 
 
 def _of_seed(one: Planned, point: Point, settings: Mapping[str, Any]) -> Planned:
-    """A point of a setting that was resolved for another seed."""
+    """Return a point of a setting that was already resolved for another seed."""
     system = one.state["system"]
     dynamics = {**system["dynamics"], "seed": settings["dynamics.seed"]}
     state = {**one.state, "system": {**system, "dynamics": dynamics}}
@@ -215,7 +216,7 @@ def _axes(over: Any) -> list[Axis]:
 
 
 def _own_value(axis: Axis, own: Mapping[str, Any], loaded: Any, system: Any, overrides: Any) -> Any:
-    """Return the value of an axis in the system itself."""
+    """Return the value that an axis has in the system file."""
     from mdnum.systems import BallSystem, load
     from mdnum.systems.parameters import names, number, resolve
 

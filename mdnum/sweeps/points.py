@@ -53,14 +53,14 @@ _ARITHMETIC = ("jax", "jaxlib", "numpy", "llvmlite")
 
 @cache
 def code() -> str:
-    """A digest of the source that a point is computed by, and of the versions of what it computes with."""
+    """Return a digest of the source code that computes points, and of the versions of its packages."""
     versions = package_versions()
     packages = json.dumps([versions.get(name) for name in _ARITHMETIC])
     return hashlib.sha256((digest(_COMPUTES) + packages).encode()).hexdigest()[:16]
 
 
 def digest(places: Sequence[str]) -> str:
-    """A digest of source files.
+    """Return a digest of source files.
 
     Args:
         places: patterns of files of mdnum, or absolute paths.
@@ -76,39 +76,39 @@ def digest(places: Sequence[str]) -> str:
 def state_point(
     program: Mapping[str, Any], structure: str | None, asked: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What a point is made of: the numbers and choices of its system, resolved, and what is asked of it.
+    """Return the data that define a point: all parameters and choices of its system, and the request.
 
     Args:
-        program: of a system (`System.program`); None is left out. structure: digest of its atoms.
-        asked: whatever else counts, such as the last step.
+        program: the program of a system (`System.program`); entries that are None are omitted. structure:
+            digest of the atoms. asked: further data that determine the results, such as the last step.
     """
     numbers = _given(plain(dict(program)))
     return plain({"system": numbers, "structure": structure, "asked": dict(asked), "code": code()})
 
 
 def _given(tables: Any) -> Any:
-    """Tables without what is None; signac allows no dots in keys, so they stay tables."""
+    """Remove entries that are None, and replace the dots in keys, which signac does not allow."""
     if not isinstance(tables, dict):
         return tables
     return {key.replace(".", "-"): _given(one) for key, one in tables.items() if one is not None}
 
 
 def address_of(point: Mapping[str, Any]) -> str:
-    """signac's name of a state point."""
+    """Return the name of a state point in signac."""
     return hashlib.md5(json.dumps(point, sort_keys=True).encode(), usedforsecurity=False).hexdigest()
 
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """The fields in which two state points differ."""
+    """Return the names of the fields in which two state points differ."""
     a, b = (flat({**point, **point.get("system", {}), "system": {}}) for point in (one, other))
     return [name for name in {**a, **b} if a.get(name) != b.get(name)]
 
 
 class Workspace:
-    """The points of a sweep on disk.
+    """Storage of the points of a sweep on disk.
 
     Raises:
-        FolderError: it cannot be made or read.
+        FolderError: the folder cannot be created or read.
     """
 
     def __init__(self, root: Path):
@@ -123,14 +123,14 @@ class Workspace:
                 write_text(config, 'schema_version = "2"\n')
 
     def folder(self, address: str) -> Path:
-        """Where a point's results are."""
+        """Return the folder of the results of a point."""
         return self.place / address
 
     def result(self, address: str) -> dict[str, Any] | None:
-        """What is known of a point; None where it was not computed.
+        """Return the result of a point; None if the point was not computed.
 
         Raises:
-            FolderError: its file is damaged.
+            FolderError: the file of the result is damaged.
         """
         file = self.folder(address) / RESULT
         try:
@@ -144,7 +144,7 @@ class Workspace:
             ) from None
 
     def nearest(self, point: Mapping[str, Any]) -> list[str] | None:
-        """Fields in which the stored point most like one differs from it; None where there is none."""
+        """Return the fields in which a point differs from the most similar stored point; None without any."""
         best: list[str] | None = None
         for file in self.place.glob(f"*/{STATE_POINT}"):
             with suppress(OSError, ValueError):
@@ -155,16 +155,16 @@ class Workspace:
     # --- claims -------------------------------------------------------------------------------------------
 
     def claims(self, address: str = "*") -> list[tuple[Path, int]]:
-        """Claims of a point, or of all, with their numbers, the latest last."""
+        """Return the claim files of a point, or of all points, with their numbers in ascending order."""
         found = [(file, _CLAIM.fullmatch(file.name)) for file in self._held.glob(f"{address}.*")]
         numbered = [(file, int(match["number"])) for file, match in found if match]
         return sorted(numbered, key=lambda one: (one[0].stem, one[1]))
 
     @contextmanager
     def claimed(self, address: str) -> Iterator[bool]:
-        """Whether this process has a point to itself until the end of the block.
+        """Claim a point for this process until the end of the block; yield whether the claim succeeded.
 
-        What another has just finished may be there then: look again.
+        Another process may have finished the point shortly before the claim: check for its result again.
         """
         claim = self._claim(address)
         if claim is None:
@@ -215,7 +215,7 @@ class Workspace:
 
     @contextmanager
     def filling(self, address: str, point: Mapping[str, Any]) -> Iterator[Path]:
-        """A folder to be filled, which becomes that of the point when the block ends without an error."""
+        """Yield an empty folder, which becomes the folder of the point if the block ends without an error."""
         here = self.place / f".{address}.{socket.gethostname()}.{os.getpid()}"
         shutil.rmtree(here, ignore_errors=True)
         with disk_errors(here):
@@ -240,7 +240,7 @@ class Workspace:
                 os.replace(file, target / file.name)
 
     def swept(self) -> int:
-        """Removes what processes that are gone left half done; how many folders those were."""
+        """Remove unfinished folders of processes that no longer exist, and return their number."""
         count = 0
         # folders before claims: whoever makes a folder has claimed its point before
         for folder in [one for one in self.place.glob(".*.*.*") if one.is_dir()]:
@@ -251,7 +251,7 @@ class Workspace:
 
 
 def write_result(folder: Path, found: Mapping[str, Any]) -> None:
-    """The results of a point into its folder."""
+    """Write the results of a point to its folder."""
     write_text(folder / RESULT, json.dumps(plain(dict(found)), indent=1))
 
 
@@ -259,21 +259,21 @@ def write_result(folder: Path, found: Mapping[str, Any]) -> None:
 
 
 def me() -> dict[str, Any]:
-    """This process, as its claims name it."""
+    """Return the data that identify this process in its claim files."""
     pid = os.getpid()
     return {"host": socket.gethostname(), "boot": boot(), "pid": pid, "since": born(pid), "at": time.time()}
 
 
 @cache
 def boot() -> str:
-    """A name of this machine's time since it was started; empty where it has none."""
+    """Return an identifier of the current boot of this machine; empty if it is not available."""
     with suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return ""
 
 
 def born(pid: int) -> str | None:
-    """When a process of this machine was started, in ticks; None where there is none, "" where unknown."""
+    """Return the start time of a local process, in ticks; None if it does not exist, "" if unknown."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -289,9 +289,9 @@ def born(pid: int) -> str | None:
 
 
 def gone(claim: Path) -> bool:
-    """Whether the process that made a claim is gone: its machine was started again, or it runs no more.
+    """True if the process that made a claim has ended, or its machine was restarted.
 
-    On another machine, that its last sign of life is three minutes old.
+    For a process on another machine: true if the claim file was last updated more than three minutes ago.
     """
     try:
         silent = time.time() - claim.stat().st_mtime

@@ -1,9 +1,9 @@
 """Means over seeds and differences between choices, each with its error.
 
-A run gives a mean and, from its autocorrelation, the error of this mean; several seeds give a scatter. Both
-estimate the same variance, the first with many degrees of freedom but too small if modes are slower than a
-run. Therefore the errors of the runs are scaled by a factor that all seeds of all settings determine
-together.
+Each run gives a mean and, from its autocorrelation, the error of this mean; the means of several seeds
+scatter. Errors and scatter estimate the same variance. The errors have many degrees of freedom, but are too
+small if the relaxation of a mode takes longer than a run. They are therefore multiplied by one factor, which
+is determined from all seeds of all settings.
 """
 
 from __future__ import annotations
@@ -112,12 +112,12 @@ class Difference:
 
     @property
     def moves(self) -> bool | None:
-        """True if the choice changes the result significantly; None if undecided for lack of an error."""
+        """True if the choice changes the result significantly; None if the error is unknown."""
         return None if np.isnan(self.chance) else bool(self.chance < ALPHA)
 
     @property
     def sigmas(self) -> float:
-        """Difference in units of its error."""
+        """Difference divided by its standard error."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return float(np.float64(self.value) / self.error)
 
@@ -135,15 +135,16 @@ def difference(one: SeedMean, base: SeedMean) -> tuple[float, float, float]:
 def paired(
     raw: Mapping[K, tuple[float, float, float]], by_seed: Mapping[K, Float[np.ndarray, "seeds"]]
 ) -> dict[K, tuple[float, float, float]]:
-    """Differences from one setting, from the differences of each seed where runs of one seed are correlated.
+    """Return differences from a setting, computed seed by seed if the runs with the same seed are correlated.
 
-    Runs at constant energy that begin with the same velocities keep much of what they have in common; runs
-    that forget their start do not, and the scatter of a few differences would be a poor error of theirs. So
-    the differences of the seeds have to scatter less than independent runs do, by more than chance explains,
-    in all of these comparisons together.
+    Runs at constant energy with the same initial velocities may stay correlated. For uncorrelated runs, the
+    scatter of a few differences would be a poor estimate of the error. The comparison is therefore made seed
+    by seed only if the differences of the seeds, over all comparisons together, scatter significantly less
+    than those of independent runs.
 
     Args:
-        raw: of `difference`, by comparison of one measure. by_seed: the differences of each seed.
+        raw: results of `difference` for each comparison of one measure. by_seed: the differences of each
+            seed.
     """
     from scipy.stats import chi2, t
 
@@ -190,7 +191,7 @@ def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Diff
 
 
 def effects(places: Float[np.ndarray, "points axes"], values: Float[np.ndarray, "points"]) -> list[Any]:
-    """Change of a measure from one end of each axis to the other, from a plane fitted to all points.
+    """Return the change of a measure between the ends of each axis, from a plane fitted to all points.
 
     Args:
         places: position of each point along each axis, from 0 to 1.
@@ -222,7 +223,7 @@ class Within:
 
 
 def within(value: float, error: float, freedom: float, tolerance: float, comparisons: int = 1) -> Within:
-    """Test |difference| ≤ tolerance: the confidence interval lies on one side of it (Schuirmann 1987).
+    """Test whether |difference| ≤ tolerance, by comparing its confidence interval with it (Schuirmann 1987).
 
     Args:
         comparisons: number of comparisons among which the error probability, ALPHA, is divided.
