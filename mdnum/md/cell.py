@@ -1,8 +1,8 @@
-"""The box: lattice vectors, periodicity per axis, wrapping and the minimum image, on the host and in jit.
+"""Boxes: lattice vectors, periodicity per axis, wrapping and the minimum image, on the host and in jit.
 
-Both sides do the same operations in the same order. Lattice vectors are subtracted as n * L with
-n in {-1, 0, 1} for wrapped positions; those products are exact, so a fused multiply-add gives the same
-bits as separate rounding, and numpy reproduces what jit computed.
+Host and jit execute the same operations in the same order. Lattice vectors are subtracted as n * L, with n in
+{-1, 0, 1} for wrapped positions. These products are exact, so that a fused multiply-add gives the same bits
+as separate rounding, and numpy reproduces the results of jit.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Cell(eqx.Module):
 
     @classmethod
     def create(cls, matrix, pbc: Any = True) -> Cell:
-        """A cell from lattice vectors.
+        """Make a cell from lattice vectors.
 
         Args:
             matrix: lattice vectors as rows, shape (3, 3), or three edge lengths.
@@ -78,7 +78,7 @@ class Cell(eqx.Module):
         return widths
 
     def is_narrow(self, radius):
-        """Whether a radius exceeds half a perpendicular width, so that the minimum image misses pairs."""
+        """True if a radius exceeds half a perpendicular width, so that the minimum image misses pairs."""
         return ((2 * radius) ** 2 * (self.inverse**2).sum(0) > 1).any()
 
     @property
@@ -88,13 +88,13 @@ class Cell(eqx.Module):
         return volume if volume > 0 else float("nan")
 
     def reach(self, positions: Float[np.ndarray, "atoms 3"]) -> Reach:
-        """What displacements between wrapped positions are made of, for bounds on their rounding.
+        """Return magnitudes of the terms of displacements of wrapped positions, for rounding bounds.
 
-        Along periodic axes that is a matter of the box. Along free ones atoms are given room to move apart
-        by as much again as they are apart here.
+        Along periodic axes these magnitudes follow from the box. Along free axes they allow the atoms to move
+        to twice their present distances.
 
         Args:
-            positions: where the atoms start, length.
+            positions: initial positions of the atoms, length.
         """
         flags = np.array(self.pbc)
         matrix = np.asarray(self.matrix, np.float64)
@@ -117,8 +117,8 @@ class Cell(eqx.Module):
     def minimum_image(self, x, y, z):
         """Components of a displacement reduced to its nearest image.
 
-        Right for every vector whose nearest image is shorter than half the smallest perpendicular width;
-        the caller refuses cutoffs beyond that.
+        The result is correct for every vector whose nearest image is shorter than half the smallest
+        perpendicular width; callers reject longer cutoffs.
         """
         if not any(self.pbc):
             return x, y, z
@@ -129,15 +129,17 @@ class Cell(eqx.Module):
     def deformation(self, now: Cell):
         """Deformation from this box to another, shape (3, 3): new lattice rows = old rows @ deformation.
 
-        Directions along free axes stay as they are. Exactly the identity where the vectors are the same.
+        Directions along free axes do not change. If the vectors are equal, the result is exactly the
+        identity.
         """
         return np.eye(3) + self.inverse @ (now.matrix - self.matrix)
 
     def deformed(self, by) -> Cell:
-        """The box whose lattice vectors, as rows, are those of this one times a deformation (inside jit).
+        """Return the box after a deformation, which multiplies the lattice vectors as rows (inside jit).
 
         Args:
-            by: shape (3, 3), float64. A box along x, y and z must stay so, or have orthorhombic = False.
+            by: deformation, shape (3, 3), float64. If orthorhombic is True, the deformed box must be
+                orthorhombic, too.
         """
         return self.spanned(self.matrix @ by)
 
@@ -151,13 +153,13 @@ class Cell(eqx.Module):
         return Cell(matrix, rows.T @ crossed.T / (square[0] @ crossed[0]), self.pbc, self.orthorhombic)
 
     def spent(self, x, reference: Cell, home, r_list):
-        """The largest displacement relative to the box, and half of the list's strain loss (inside jit).
+        """Return the largest displacement relative to the box plus half the strain loss (inside jit).
 
-        A list holds every pair inside while this is at most half its skin.
+        A list contains every pair inside the cutoff as long as the result is at most half its skin.
 
         Args:
-            x, home: positions now, in this box, and at the build of the list, in that of reference; length,
-                shape (3, atoms). Both boxes in float64.
+            x, home: present positions, in this box, and positions when the list was built, in the box
+                `reference`; length, shape (3, atoms). Both boxes are in float64.
             r_list: radius of the list, length.
 
         Returns:
@@ -167,7 +169,7 @@ class Cell(eqx.Module):
         return self.astype(x.dtype).farthest(moved) + 0.5 * strain_loss(reference, self, r_list)
 
     def farthest(self, moved):
-        """The largest length of displacements reduced to their nearest images, float64 (inside jit)."""
+        """Return the largest length of the nearest images of displacements, float64 (inside jit)."""
         d = self.minimum_image(*moved)
         return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
 
@@ -183,7 +185,7 @@ class Cell(eqx.Module):
 
 
 def _images(lattice, x, y, z, rounding):
-    """Lattice coordinates of a vector, rounded: how many lattice vectors to subtract per axis."""
+    """Return rounded lattice coordinates of a vector: the number of lattice vectors to subtract per axis."""
     _, m, _, orthorhombic = lattice
     if orthorhombic:
         return rounding(x * m[0, 0]), rounding(y * m[1, 1]), rounding(z * m[2, 2])
@@ -202,10 +204,10 @@ def _subtract(lattice, x, y, z, n):
 
 @njit(inline="always")
 def nearest_image(lattice, x, y, z):
-    """`Cell.minimum_image` of one displacement in compiled loops over pairs, with the same bits.
+    """Return the minimum image of one displacement, for compiled loops; same bits as `Cell.minimum_image`.
 
     Args:
-        lattice: as `box_of` has it, in the dtype of the displacement.
+        lattice: the box as returned by `box_of`, in the dtype of the displacement.
     """
     a, m, pbc, orthorhombic = lattice
     if not (pbc[0] or pbc[1] or pbc[2]):
@@ -226,15 +228,16 @@ def nearest_image(lattice, x, y, z):
 
 
 def stacked(cells: Sequence[Cell], dtype: DTypeLike = np.float64):
-    """Boxes as compiled loops over rows take them: one for all rows, or one for each (see `box_of`)."""
+    """Convert boxes to arrays for compiled loops: one box for all rows or one per row (see `box_of`)."""
     numbers = np.array([(cell.matrix, cell.inverse) for cell in cells], dtype)
     return numbers, cells[0].pbc, all(cell.orthorhombic for cell in cells)
 
 
 @njit(inline="always")
 def box_of(boxes, row):
-    """The box of a row, of boxes that were `stacked`: lattice vectors, their inverse, periodicity and whether
-    the vectors lie along x, y and z; without arrays, whose users a compiled loop would count again and again.
+    """Return the box of a row: lattice vectors, their inverse, periodicity, and whether it is orthorhombic.
+
+    The result consists of tuples, because reference counts of arrays would slow down a compiled loop.
     """
     numbers, pbc, orthorhombic = boxes
     a, m = numbers[row % len(numbers), 0], numbers[row % len(numbers), 1]
@@ -244,7 +247,7 @@ def box_of(boxes, row):
 
 
 class HostCell:
-    """Arithmetic of a cell on the host in one dtype, with low overhead for many small calls."""
+    """Fast host version of the methods of `Cell` for one dtype, for many calls with few positions."""
 
     def __init__(self, cell: Cell, dtype: DTypeLike = np.float64):
         self.dtype = np.dtype(dtype)
@@ -265,10 +268,11 @@ class HostCell:
 def wrap_positions(
     cell: Cell, positions: Float[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
-    """Positions in the box, and the images they were in; however far outside they start.
+    """Wrap positions, which may be far outside the box; return them and the images that they were in.
 
-    Error: the first pass subtracts up to n lattice vectors at once, rounding n*L; the second brings in what
-    that rounding left outside. A coordinate may still equal L after adding L to a tiny negative number.
+    Error: the first pass subtracts up to n lattice vectors at once and rounds n*L; the second pass wraps
+    positions that this rounding left outside. A coordinate may still equal L after L is added to a tiny
+    negative number.
     """
     wrapped = np.array(positions, np.float64, copy=True)
     images = np.zeros(wrapped.shape, np.int64)
@@ -290,21 +294,21 @@ def displacement(
 
 
 def transformed(x, by):
-    """Components of positions, which as rows are multiplied by a deformation (inside jit)."""
+    """Return components of positions after a deformation, which multiplies positions as rows (inside jit)."""
     # one product: XLA fuses sums that are written out with what makes their operands, again for each row
     return jnp.matmul(by.astype(x.dtype).T, x, precision="highest")
 
 
 def strain_loss(reference: Cell, now: Cell, r_list):
-    """Bound on how much the deformation of the box alone can shorten a listed distance, length.
+    """Return a bound on the decrease of a distance of length r_list by the deformation of the box alone.
 
-    A pair just outside the list moves with the box; the deformation F takes a vector of length r_list to
-    at least sigma_min(F) * r_list. Added to twice the largest displacement relative to the box it must stay
-    within the skin. On the host and inside jit.
+    The deformation F maps a vector of length r_list to a vector of length sigma_min(F) * r_list or more. The
+    list is complete as long as this bound plus twice the largest displacement relative to the box is at most
+    the skin. The function works on the host and inside jit.
 
-    Here sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|, S the symmetric part of F, t a third of its
-    trace, and the norm is Frobenius's. That is exact where the box keeps its shape, and off by at most 0.41
-    |S - t| (and the square of a rotation) where it does not; no step of the loop needs a decomposition.
+    The bound uses sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t| with the symmetric part S of F, a
+    third t of its trace, and the Frobenius norm. It needs no matrix decomposition. It is exact if the box
+    keeps its shape; otherwise its error is at most 0.41 |S - t| plus the square of a rotation.
 
     Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
     """
@@ -316,9 +320,10 @@ def strain_loss(reference: Cell, now: Cell, r_list):
 
 
 def complete(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The cell with every non-periodic vector replaced by a unit vector perpendicular to the others.
+    """Replace every non-periodic cell vector by a unit vector perpendicular to the others.
 
-    A tilted row of a free axis would otherwise leak into the choice of the image along the periodic ones.
+    Otherwise a tilted vector of a non-periodic axis would affect the choice of images along the periodic
+    axes.
 
     Args:
         cell: lattice vectors as rows, length; rows of non-periodic axes may be anything.

@@ -1,13 +1,13 @@
-"""Cutoffs: what becomes of a pair potential u(r) at r_cut, in closed form.
+"""Cutoffs: formulas that truncate, shift or switch a pair potential u(r) at r_cut.
 
-Every cutoff turns the value and slope of the bare potential, u and w = du/d(r²), into those of the cut
-one, for pairs inside. What a pair outside contributes (nothing) is decided elsewhere.
+Every cutoff maps the value u and slope w = du/d(r²) of the bare potential to those of the cut potential, for
+pairs inside the cutoff. Which pairs are inside is decided elsewhere.
 
-One class is all that a cutoff needs: its formula `cut`, its name and how smooth it is. System files, the
-command line, jumps, comparisons with other codes and certificates take it from `CUTOFFS`. Where a formula is
-written a second time (`reference`) or in ball arithmetic (`enclose`), that is used; else both follow.
+A cutoff is one class with a formula `cut`, a name and a smoothness. System files, the command line, jumps,
+comparisons with other codes and certificates look it up in `CUTOFFS`. A class may also define the independent
+implementation `reference` and the interval version `enclose`; by default both are derived from `cut`.
 
-Works on numpy and jax arrays alike, and imports neither jax nor a file of it.
+The functions work with numpy and jax arrays; this module does not import jax.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Undecided(Exception):
 
 
 class Cutoff(ABC):
-    """How a pair potential ends. The first line of a subclass's docstring describes it to people."""
+    """Base class of cutoffs. The first line of the docstring of a subclass is its description in reports."""
 
     name: ClassVar[str]  # the word of system files
     # the cut energy is C^k at r_cut (and at the onset); -1 where the energy itself jumps
@@ -59,15 +59,15 @@ class Cutoff(ABC):
         """
 
     def energy_jump(self, at: AtCutoff):
-        """Energy jump when a pair enters: the limit of the cut energy at r_cut from inside."""
+        """Return the energy jump when a pair enters: the limit of the cut energy at r_cut from inside."""
         return self._limits(at)[0] if self.smoothness < 0 else 0 * at.energy
 
     def force_jump(self, at: AtCutoff):
-        """Jump of the radial force (positive: repulsive) when a pair enters, energy per length."""
+        """Return the jump of the radial force (positive: repulsive) when a pair enters, energy per length."""
         return -2 * at.r_cut * self._limits(at)[1] if self.smoothness < 1 else 0 * at.slope
 
     def jumps(self, at: AtCutoff):
-        """Energy and force jump of each of the terms that end so: of one, but where several are added."""
+        """Return the energy jump and the force jump of each term; a single potential is one term."""
         return [(self.energy_jump(at), self.force_jump(at))]
 
     def _limits(self, at: AtCutoff):
@@ -75,19 +75,19 @@ class Cutoff(ABC):
 
     @property
     def continuous(self) -> Cutoff:
-        """The cutoff with the same forces and a continuous energy."""
+        """Return the cutoff that has the same forces and a continuous energy."""
         return self if self.smoothness >= 0 else Level(self)
 
     def reference(
         self, r: Float[np.ndarray, "pairs"], u: Float[np.ndarray, "pairs"], du: Any, at: AtCutoff
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """Energy and its derivative by r a second time, in float64 on the host: the judge of `cut`.
+        """Return energy and derivative with respect to r in float64 on the host, as a reference for `cut`.
 
-        Unless a cutoff writes it, the derivative is that of the energy of `cut`, found by jax, and not the
-        slope that `cut` returns.
+        If a cutoff does not override this method, jax computes the derivative from the energy of `cut`; the
+        slope that `cut` returns is not used.
 
         Args:
-            r, u, du: distances, bare energy and its derivative by r.
+            r, u, du: distances, bare energy and its derivative with respect to r.
             at: constants at the cutoff, numbers.
         """
         import jax
@@ -104,16 +104,16 @@ class Cutoff(ABC):
     def enclose(
         self, pull: Callable[[Any], Any], energy: Callable[[Any], Any], at: AtCutoff
     ) -> Callable[[Any], Any]:
-        """2 denergy/d(r²) of the cut potential in ball arithmetic, as a function of the ball r².
+        """Return 2 denergy/d(r²) of the cut potential in ball arithmetic, as a function of the ball r².
 
-        Unless a cutoff writes it, `cut` is run operation by operation.
+        If a cutoff does not override this method, the operations of `cut` are executed one by one.
 
         Args:
             pull, energy: 2 du/d(r²) and u of the bare potential, as functions of the ball r².
             at: constants at the cutoff, balls.
 
         Raises:
-            Undecided: by the function, where the ball lies on both sides of the onset.
+            Undecided: raised by the returned function if the ball contains the onset.
         """
         from mdnum.numerics.exact import enclosed
 
@@ -136,16 +136,17 @@ _ORDERS = len(_DERIVATIVES) - 1
 
 
 def check(cutoff: type[Cutoff] | Cutoff) -> None:
-    """That a cutoff is what it says: its slope that of its energy, its jumps and smoothness those there are.
+    """Test that the slope of a cutoff is that of its energy, and that its declared smoothness is correct.
 
-    Tried on u = 1/r² and u = 1/r⁶ with r_cut = 2, onset 1.6. The derivatives of the energy by r² (nested jvp)
-    are examined 2⁻⁴⁶ from r_cut and from both sides of the onset, to the order after the one claimed, where
-    one of them must jump for one of the two potentials. The energy jumps above 1e-9 u(r_cut), derivative k
-    above 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k: a smaller jump is not seen. Nor is one elsewhere, or above
-    the sixth derivative: a claim of 6 or more is held to 6.
+    The test uses u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. It computes derivatives of the energy
+    with respect to r² (nested jvp) at 2⁻⁴⁶ from r_cut and from both sides of the onset, up to one order above
+    the declared smoothness; at this order, a derivative must jump for one of the two potentials. The energy
+    counts as jumping above 1e-9 u(r_cut), and derivative k above 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k.
+    Jumps at other distances and beyond the sixth derivative are not detected; a declared smoothness of 6 or
+    more is tested up to 6.
 
     Raises:
-        ValueError: it is not; names the quantity and the distance.
+        ValueError: the test fails; the message names the quantity and the distance.
     """
     import jax
 
@@ -160,7 +161,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
 
 
 def _ends(made: Cutoff, power: int) -> bool:
-    """The part of `check` with u = r^(-2 power); whether a derivative jumps that may."""
+    """Execute the part of `check` for u = r^(-2 power); return whether a derivative that may jump does so."""
     import jax
     import jax.numpy as jnp
 
@@ -217,7 +218,7 @@ def _shipped(cutoff: type[Cutoff]) -> type[Cutoff]:
 
 
 class _Truncated(Cutoff):
-    """The bare force up to the cutoff."""
+    """Base of cutoffs that leave the force unchanged up to the cutoff."""
 
     def force_jump(self, at):
         return -at.slope
@@ -246,7 +247,7 @@ class Hard(_Truncated):
 
 @_shipped
 class Shifted(_Truncated):
-    """Energy shifted to zero at the radius; forces, and so the trajectory, are those of `hard`."""
+    """Energy shifted to zero at the radius; forces and trajectory are the same as for `hard`."""
 
     name = "shifted"
     smoothness = 0
@@ -282,11 +283,11 @@ class _Switching(Cutoff):
     switches = True
 
     def factor(self, r, at: AtCutoff):
-        """s(r) and ds/dr past the onset: an independent implementation in plain numpy."""
+        """Return s(r) and ds/dr beyond the onset: an independent implementation in numpy."""
         raise NotImplementedError
 
     def factor_of_ball(self, r2, at: AtCutoff):
-        """s and 2 ds/d(r²) past the onset, in ball arithmetic."""
+        """Return s and 2 ds/d(r²) beyond the onset, in ball arithmetic."""
         raise NotImplementedError
 
     def reference(self, r, u, du, at):
@@ -341,7 +342,7 @@ class Switched(_Switching):
 
 
 class _SwitchedInDistance(_Switching):
-    """A function of t, which goes from 0 at the onset to 1 at the cutoff."""
+    """Base of switching functions of t, which increases from 0 at the onset to 1 at the cutoff."""
 
     @abstractmethod
     def switch(self, t) -> tuple[Float[Any, "..."], Float[Any, "..."]]:
@@ -413,7 +414,7 @@ class Level(Cutoff):
 
     @property
     def switches(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As the other."""
+        """True if the other cutoff has an onset."""
         return self.inner.switches
 
     def cut(self, r2, u, w, at):

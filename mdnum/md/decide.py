@@ -1,7 +1,7 @@
-"""The pair decision: which pairs are inside the cutoff, by the system's own convention.
+"""Pair decisions: which pairs are inside the cutoff, by the comparison that the system file specifies.
 
-The quantity and its threshold live here alone; the force loop, the list check and the host that writes
-the ledger all compute them through this file, with the same bits.
+Only this module defines the compared quantity and its threshold. The force loop, the check of lists and the
+host code that writes the ledger use it, and obtain the same bits.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ CONVENTIONS = ("r2 <", "r2 <=", "r <", "r <=")
 
 @dataclass(frozen=True)
 class PairDecider:
-    """Whether a pair is inside: `r2 < r_cut²` or one of its three relatives."""
+    """Decision whether a pair is inside: `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
 
     r_cut: tuple[float, ...]  # cutoff of each pair type, length
     compare: str = "r2 <"  # quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <="
@@ -62,7 +62,7 @@ class PairDecider:
 
     @property
     def convention(self) -> PairDecider:
-        """Without radii, which a program is given, and without what only bounds need."""
+        """The same decider without radii, which are arguments of the program, and without data for bounds."""
         return replace(self, r_cut=(), reach=_NO_REACH, state="float64")
 
     @property
@@ -72,7 +72,7 @@ class PairDecider:
 
     @property
     def thresholds(self) -> tuple[Threshold, ...]:
-        """One threshold per pair type, in the dtype and space that the program compares in."""
+        """Thresholds per pair type, in the dtype and the quantity (r or r²) of the comparison."""
         scalar = np.dtype(self.dtype).type
         comparison = self.compare.split()[1]
         values = [scalar(r) * scalar(r) if self.space == "r2" else scalar(r) for r in self.r_cut]
@@ -87,24 +87,25 @@ class PairDecider:
     def bounds(self) -> tuple[float, ...]:
         """Bound on |computed margin - exact margin| given the state, by pair type, in the quantity's space.
 
-        The exact margin is that of the state's positions in the system's own box and against its own
-        threshold, both doubles (error analysis: numerics.rounding). Evaluated a thousandth beyond r_cut, it
-        holds for every pair up to there; one further away is decided rightly, or its margin is within the
-        bound. It is that of atoms within the reach; where they may have left it, ask `bounds_at`.
+        The exact margin is the margin of the positions of the state, with the box and threshold of the
+        system, which are doubles (error analysis: numerics.rounding). The bound is evaluated at 1.001 r_cut,
+        and holds for every pair up to this distance; for more distant pairs the decision is correct, or the
+        margin is within the bound. It assumes that atoms are within `reach`; if they may have left this
+        range, use `bounds_at`.
         """
         return tuple(float(bound) for bound in self._bounds(None))
 
     @cached_property
     def grows(self) -> bool:
-        """Whether bounds may grow with the positions."""
+        """True if bounds may increase with the positions."""
         narrows = unit_roundoff(np.dtype(self.state)) < unit_roundoff(np.dtype(self.dtype))
         return narrows and len(self.reach.lattice) < 3
 
     def bounds_at(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows types"]:
-        """`bounds` at each of some states: they grow where atoms have left the reach along a free axis.
+        """Return bounds for several states; they are larger if atoms have left the reach along a free axis.
 
-        Positions that are rounded before they are subtracted lose more the larger they are, and along a free
-        axis nothing brings them back.
+        The rounding error of a position increases with its magnitude, and along a free axis positions are not
+        wrapped.
 
         Args:
             x: wrapped positions of each state, in the dtype of the state, length.
@@ -119,7 +120,7 @@ class PairDecider:
         return bounds
 
     def _bounds(self, seen: Float[np.ndarray, "rows 3"] | None) -> list:
-        """`bounds`, by pair type, for atoms within the reach or within so much where that is more."""
+        """Return `bounds` by pair type, for atoms within the larger of the reach and the given magnitudes."""
         bound = squared_distance_bound if self.space == "r2" else distance_bound
         given = self.reach, np.dtype(self.dtype), np.dtype(self.state), seen
         return [
@@ -132,26 +133,26 @@ class PairDecider:
         return jax.device_put(np.array([t.value for t in self.thresholds], np.dtype(self.dtype)))
 
     def quantity(self, dx, dy, dz, zero: jax.Array) -> jax.Array:
-        """The compared quantity inside jit; bit for bit what `host_quantity` gives."""
+        """Return the compared quantity inside jit, with the same bits as `host_quantity`."""
         r2 = squared_norm(dx, dy, dz, zero)
         return root(r2) if self.space == "r" else r2
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
-        """The compared quantity on the host, from displacement components of the decision's dtype."""
+        """Return the compared quantity on the host, from displacement components of the decision's dtype."""
         r2 = dx * dx + dy * dy + dz * dz
         return np.sqrt(r2) if self.space == "r" else r2
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
-        """Thresholds minus quantities on the host: positive inside, with the bits of the decision.
+        """Return thresholds minus quantities on the host: positive inside, with the bits of the decision.
 
         Args:
-            displacement: three components, of the decision's dtype. kind: pair type of each.
+            displacement: three components, in the dtype of the decision. kind: pair type of each pair.
         """
         thresholds = np.array([threshold.value for threshold in self.thresholds])
         return thresholds[kind] - self.host_quantity(*displacement).astype(np.float64)
 
     def inside(self, quantity, value):
-        """The decision: compare quantities with thresholds by the convention (jax or numpy)."""
+        """Return the decisions: compare quantities with thresholds by the convention (jax or numpy)."""
         return quantity <= value if self.compare.endswith("<=") else quantity < value
 
 
@@ -185,32 +186,32 @@ class Decisions(NamedTuple):
 
 
 def packed(halves: UInt8[Array, "groups atoms"]) -> UInt8[Array, "words atoms"]:
-    """Pack the decisions of groups, two groups per byte."""
+    """Pack the decisions of groups of slots, two groups per byte."""
     return halves[0::2] | (halves[1::2] << jnp.uint8(GROUP))
 
 
 def halves_of(bits: UInt8[Array, "words atoms"]) -> UInt8[Array, "groups atoms"]:
-    """Packed decisions a group at a time, in the low bits: the inverse of `packed`."""
+    """Unpack decisions into groups, whose decisions are in the low bits: the inverse of `packed`."""
     mask = jnp.uint8((1 << GROUP) - 1)
     return jnp.stack([bits & mask, bits >> jnp.uint8(GROUP)], axis=1).reshape(-1, bits.shape[-1])
 
 
 def unpacked(half: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
-    """The decisions of one group."""
+    """Return the decisions of one group of slots as booleans."""
     # slot by slot: shifted all at once, by a vector, the loops that use them are not vectorized and take
     # twice the time
     return jnp.stack([half & jnp.uint8(1 << k) != 0 for k in range(GROUP)])
 
 
 class SlotJudge:
-    """Decides a group of slots of every atom at a time, inside jit, and keeps the tally.
+    """Decisions for groups of slots of all atoms, inside jit, with the nearest margin of each atom.
 
     Args:
         decider: the convention.
         thresholds: in its dtype and space, shape (types,).
         cell: the box.
-        zero: integer zero that XLA must not know.
-        positions: sorted, wrapped, shape (3, atoms).
+        zero: an integer zero whose value XLA does not know when it compiles.
+        positions: positions in sorted order, wrapped, shape (3, atoms).
     """
 
     def __init__(
@@ -229,14 +230,14 @@ class SlotJudge:
         self.value = thresholds
 
     def start(self) -> jax.Array:
-        """An empty tally: the nearest margin of each atom."""
+        """Return the initial value of the nearest margin of each atom."""
         return jnp.full(self.atoms, jnp.inf, self.value.dtype)
 
     def group(self, j, types):
-        """Displacement, quantity, decision and threshold of GROUP neighbors j of every atom.
+        """Return displacement, quantity, decision and threshold for GROUP neighbors j of every atom.
 
         Args:
-            j: shape (GROUP, atoms). types: their pair types, or None.
+            j: neighbors, shape (GROUP, atoms). types: their pair types, or None.
         """
         d = displacements(self.components, self.cell, j)
         quantity = self.decider.quantity(*d, self.zero)
@@ -254,7 +255,7 @@ class SlotJudge:
         return bits, nearest
 
     def decide(self, tables: Tables) -> Decisions:
-        """The decisions of a whole list, without forces."""
+        """Return the decisions of a whole list, without forces."""
 
         def block(nearest, listed):
             _, quantity, inside, threshold = self.group(*listed)
@@ -270,7 +271,7 @@ class SlotJudge:
 
 
 def displacements(components, cell: Cell, j):
-    """Nearest images of x_j - x_i, per component; indices of padding are clamped into range by XLA."""
+    """Return nearest images of x_j - x_i, per component; XLA clamps indices of padding to valid indices."""
     return cell.minimum_image(*(c.at[j].get(mode="promise_in_bounds") - c for c in components))
 
 
@@ -278,12 +279,12 @@ def displacements(components, cell: Cell, j):
 
 
 def zeros(shape: int | tuple[int, ...], dtype: Any) -> Array:
-    """Zeros on the device, without the program that jnp's would compile for each shape."""
+    """Return zeros on the device, without compiling a program for each shape as jnp.zeros does."""
     return jax.device_put(np.zeros(shape, dtype))
 
 
 class Changes(NamedTuple):
-    """Decisions that changed, step by step, each stored once, at the atom that is sorted first."""
+    """Changed decisions, step by step; each is stored once, at the atom that comes first in sorted order."""
 
     # row, sorted atoms and whether inside now (plus 2 for each channel before), shape (room, 4)
     pairs: Int[Array, "room 4"]
@@ -307,7 +308,7 @@ class Changes(NamedTuple):
         return int(np.asarray(self.count)[0])
 
     def cut(self) -> Changes:
-        """Those that there are and a few more: of a device's memory little else comes to the host."""
+        """Return buffers cut to about the number of changes, so that little data is copied to the host."""
         room = 1 << self.found.bit_length()
         if foreign.known() or room >= len(self.pairs):
             return self
@@ -324,11 +325,11 @@ class Changes(NamedTuple):
         row: Int[Array, ""],
         most: int,
     ) -> tuple[Changes, UInt8[Array, "words atoms"]]:
-        """These, and what has changed since the decisions before; and the decisions, in the memory of those.
+        """Add the changes since the previous decisions; return them and the decisions, in the same memory.
 
         Args:
-            most: how many may come at a time on a device other than a CPU, where each step takes the same
-                time however many they are. Where more come, `count` is beyond the room.
+            most: largest number of changes per step on a device other than a CPU, where the time of a step
+                does not depend on their number. If there are more, `count` exceeds the capacity.
         """
         if foreign.known() and x.dtype == np.float64:
             return self._noted_by_host(before, bits, tables, x, v, row)
@@ -370,19 +371,19 @@ class Changes(NamedTuple):
 
 @partial(jax.jit, static_argnames="room")
 def _cut(parts: tuple[Array, ...], room: int) -> tuple[Array, ...]:
-    """The first rows of each."""
+    """Return the first rows of each array."""
     return tuple(part[:room] for part in parts)
 
 
 @cache
 def _noting() -> str:
-    """The name under which `_note` is registered with XLA."""
+    """Register `_note` with XLA, and return its name."""
     made = cfunc(numba.types.intp(numba.types.intp), _note)
     return registered("mdnum_changes", made.ctypes, made)
 
 
 def _note(frame):
-    """`Changes.noted`; 0 for no error."""
+    """Execute `Changes.noted` when XLA calls it; return 0 (no error)."""
     if not asked_to_run(frame):
         return 0
     operands, results = peek(frame, 9), peek(frame, 14)
@@ -415,12 +416,12 @@ _TOGETHER = 128
 
 @njit
 def note(before, bits, index, x, v, row, pairs, ends, count):
-    """Add what changed in a row to the parts of `Changes`; what there is no room for is counted.
+    """Add the decisions that changed in a step to the arrays of `Changes`; without space, only count them.
 
-    The decisions before become those now.
+    The array of previous decisions is overwritten with the present ones.
 
-    Stretch after stretch of words, each in passes of their own: found, looked up and kept one by one, every
-    change costs a branch that is guessed wrong and waits for its neighbor to be read.
+    The words are processed in blocks, with separate passes that find changes, look up neighbors and store the
+    rows. A single pass would be slower: every change would cost a mispredicted branch and a wait for memory.
     """
     words, atoms = bits.shape
     size, flat = words * atoms, index.reshape(-1)

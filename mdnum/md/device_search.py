@@ -1,8 +1,9 @@
-"""The neighbor search of `md.host_search` in XLA: lists are built where the positions are, and stay there.
+"""Neighbor search on the device in XLA: lists are built and kept in the memory that holds the positions.
 
-An atom meets what is in the bins around its own, in the order in which the search on the host meets it: of
-the same bins both make the same table. Two numbers of a search come to the host: how many atoms the fullest
-bin holds, and the most neighbors; where an axis is free also the ends of what the atoms span.
+An atom is compared with the atoms in neighboring bins, in the same order as in `md.host_search`, so that both
+searches make the same table from the same bins. A search copies two numbers to the host: the largest number
+of atoms in a bin, and the largest number of neighbors. If an axis is free, the extent of the atoms along it
+is copied, too.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class DeviceBuilder:
     def build(
         self, positions: Float[Array | np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[Array, "slots atoms"], Int[Array, "atoms"], int]:
-        """As `neighbors.ListBuilder.build`; table and order are on the device."""
+        """Build a list like `neighbors.ListBuilder.build`; table and order stay on the device."""
         x = jnp.asarray(positions, np.float64).T
         extent, low, high = cell.widths.copy(), np.zeros(3), np.ones(3)
         if not all(cell.pbc):
@@ -63,8 +64,11 @@ def _ends(x):
 
 @partial(jax.jit, static_argnames="bins")
 def _binned(x, cell: Cell, low, span, bins: _Whole):
-    """Atoms sorted by bin: their order, where each bin begins, the bins along each axis and the positions of
-    sorted atoms, and how many the fullest bin has."""
+    """Sort atoms by bin.
+
+    Returns:
+        order of the atoms, start of each bin, bin indices and positions of sorted atoms, largest bin size.
+    """
     places, home = [], x
     for k in range(3):
         if cell.pbc[k]:
@@ -86,7 +90,7 @@ def _binned(x, cell: Cell, low, span, bins: _Whole):
 def _searched(
     x, places, cell: Cell, start, r2_list, bins: _Whole, reach: _Whole, room: int, slots: int, blocks: int
 ):
-    """Neighbors of every sorted atom, and the largest neighbor count, which may exceed the slots."""
+    """Return neighbors of every sorted atom, and the largest neighbor count, which may exceed the slots."""
     atoms = x.shape[1]
     matrix = cell.matrix
     # layer after layer along the third axis, as the host goes

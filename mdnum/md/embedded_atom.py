@@ -32,16 +32,17 @@ class Setfl:
 
 
 def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
-    """Read a table; numbers may be broken into lines in any way, and keep every digit.
+    """Read a table with all digits; line breaks between numbers are ignored.
 
-    jax-md's own reader rounds everything to float32, which costs the forces of copper 4e-4 eV/Å.
+    The reader of jax-md rounds all numbers to float32, which causes errors of 4e-4 eV/Å in the forces of
+    copper.
 
     Args:
-        symbols: of the atoms, to be compared with the table's element.
+        symbols: chemical symbols of the atoms, which must agree with the element of the table.
 
     Raises:
-        InputError: unreadable, not a setfl table, more than one element or another one, numbers that are
-            missing, left over or not finite, or a table that ends before its cutoff.
+        InputError: the file is unreadable or not a setfl table, has more than one element or another element,
+            has missing, additional or non-finite numbers, or ends before its cutoff.
 
     Source: the DYNAMO setfl format as LAMMPS documents it (pair_style eam/alloy).
     """
@@ -105,8 +106,8 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
 class Spline(eqx.Module):
     """Piecewise cubic through a table, twice continuously differentiable ("not-a-knot" ends).
 
-    The interpolant of scipy's InterpolatedUnivariateSpline(k=3), hence of ASE's EAM. Outside the table the
-    first and last cubic are carried on; see `inside`.
+    The spline equals scipy's InterpolatedUnivariateSpline(k=3), which ASE's EAM uses. Outside the table it is
+    extrapolated with the first and last cubic; see `inside`.
     """
 
     # of 1, t, t², t³ per interval, t the distance from its left end, shape (4, intervals)
@@ -118,7 +119,7 @@ class Spline(eqx.Module):
 
     @classmethod
     def through(cls, values: Float[np.ndarray, "points"], step: float, start: float = 0.0) -> Spline:
-        """The spline through values at start, start + step, ..."""
+        """Make the spline through values at start, start + step, ..."""
         from scipy.interpolate import CubicSpline
 
         # fitted on the whole numbers: knots like i * step are rounded, and their differences more so
@@ -142,7 +143,7 @@ class Spline(eqx.Module):
     def on_host(
         self, x: Float[np.ndarray, "..."]
     ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
-        """Value and slope at x without a compiler, value with the bits of jax operation by operation."""
+        """Return value and slope at x without compilation; the value has the same bits as in jax."""
         offset = x - self.start
         which = np.clip(np.floor(offset / self.step), 0, self.intervals - 1)
         t = offset - which * self.step
@@ -150,7 +151,7 @@ class Spline(eqx.Module):
         return c0 + t * (c1 + t * (c2 + t * c3)), c1 + t * (c2 + t * c3) + t * (c2 + t * c3 + t * c3)
 
     def inside(self, x: Float[Array, "..."]) -> Array:
-        """Whether x lies in the range of the table, within rounding error."""
+        """True if x is in the range of the table, within rounding error."""
         slack = 1e-9 * self.step
         return (x >= self.start - slack) & (x <= self.end + slack)
 
@@ -161,11 +162,12 @@ class Spline(eqx.Module):
 class EmbeddedAtom(ManyBody):
     """E = sum_i F(rho_i) + 1/2 sum_ij phi(r_ij), rho_i = sum_j density(r_ij), for one element.
 
-    jax-md's sums are right once it gets a list without self entries; its own list has them and counts every
-    atom's density at r = 0, and its splines round the table to float32 and return 0 beyond it.
+    The sums of jax-md are correct for a list without atoms as their own neighbors. The list of jax-md
+    contains such entries, which add the density at r = 0; its splines round the table to float32 and return 0
+    beyond it.
 
-    Error: a density off the embedding table makes the energy NaN, forces too. The spline's own error against
-    the form it tabulates is the table's, not counted here.
+    Error: if a density is outside the embedding table, energy and forces are NaN. The deviation of the spline
+    from the tabulated function is not considered an error.
 
     Source: Daw and Baskes, Phys. Rev. B 29, 6443 (1984); checked against ase.calculators.eam and a plain
     evaluation in extended precision (tests/support/oracles_manybody.py).
@@ -180,17 +182,17 @@ class EmbeddedAtom(ManyBody):
     file: str = eqx.field(static=True, kw_only=True, default="")  # the table that it was read from
 
     def charge(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Density of an atom at distance r; 0 at r = 0 (the atom itself) and from r_cut on."""
+        """Return the density of an atom at distance r; 0 at r = 0 (the atom itself) and beyond r_cut."""
         counts = (r > 0) & (r < self.r_cut)
         return jnp.where(counts, self.density(jnp.where(counts, r, 1.0)), 0.0)
 
     def phi(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Pair energy at distance r; 0 at r = 0 and from r_cut on."""
+        """Return the pair energy at distance r; 0 at r = 0 and beyond r_cut."""
         counts = (r > 0) & (r < self.r_cut)
         return jnp.where(counts, self.pair(jnp.where(counts, r, 1.0)), 0.0)
 
     def embed(self, rho: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Energy of an atom in a density; NaN outside the table."""
+        """Return the embedding energy of an atom for a density; NaN outside the table."""
         # a factor and not a selection: it makes the slope NaN too, and forces with it
         on = self.embedding.inside(rho)
         return self.embedding(rho * jnp.where(on, 1.0, jnp.nan).astype(rho.dtype))
@@ -213,7 +215,7 @@ class EmbeddedAtom(ManyBody):
 def embedded_atom(
     path: Path | str, symbols: Sequence[str] = (), pbc: tuple[bool, bool, bool] = (True, True, True)
 ) -> EmbeddedAtom:
-    """The embedded-atom potential of a setfl table, read as `read_setfl` does."""
+    """Make the embedded-atom potential of a setfl table, which is read by `read_setfl`."""
     table = read_setfl(Path(path), symbols)
     r = table.dr * np.arange(len(table.r_pair))
     # the file holds r phi: phi at r = 0 is unknown, so its spline starts one step later, as ASE's does
@@ -233,7 +235,7 @@ def embedded_atom(
 
 
 def _smoothness(table: Setfl, pair: Spline, density: Spline, embedding: Spline) -> Smoothness:
-    """Jumps at r_cut, at most: a crossing changes one pair term and the densities of two atoms."""
+    """Bound the jumps at r_cut: a crossing changes one pair term and the densities of two atoms."""
     steepest = np.max(np.abs(embedding.on_host(table.drho * np.arange(len(table.embedding)))[1]))
     at = np.array([table.r_cut])
     energy, force = (

@@ -1,8 +1,8 @@
-"""Energies over a neighbor list as people write them: which conventions there are, and one way to call all.
+"""User-defined energies over a neighbor list: calling conventions, and a uniform way to call them.
 
-Those of jax-md's world differ in where the list and the parameters stand, how the box is given, whether
-positions are fractional, whether list entries name an image, and what is returned. A signature says the
-first part, a trial call (`mdnum.systems.admission`) the rest.
+Functions written for jax-md differ in the positions of the arguments for list and parameters, the form of the
+box, real or fractional positions, lists with or without images, and the return value. The signature
+determines the order of the arguments; trial calls (`mdnum.systems.admission`) determine the rest.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ENERGIES: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class Convention:
-    """How a function is called; the fields behind `keywords` are what a trial finds out."""
+    """Calling convention of a function; the fields after `keywords` are determined by trial calls."""
 
     native: bool = False  # (parameters, positions, neighbor, cell)
     parameters: bool = False  # they come first
@@ -69,7 +69,7 @@ class Convention:
 
 @dataclass(frozen=True)
 class Call:
-    """A function in its own convention, called like mdnum's own: (parameters, positions, neighbor, cell)."""
+    """A function of any convention that is called with (parameters, positions, neighbor, cell)."""
 
     function: Callable[..., Any]
     how: Convention
@@ -78,10 +78,10 @@ class Call:
     name: str = "energy function"
 
     def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
-        """Its energy in its own units, of positions as it takes them; all that it returns with no `returns`.
+        """Return the energy in the units of the function; its whole return value if `returns` is empty.
 
         Args:
-            given: the keywords of the convention, and for mdnum's own "cell".
+            given: the keywords of the convention; for mdnum's own convention, "cell".
         """
         how = self.how
         args = (parameters, x) if how.parameters or how.native else (x,)
@@ -100,10 +100,10 @@ class Call:
         return jnp.sum(out if how.returns in ("number", "atoms") else out[how.returns])
 
     def __call__(self, parameters: Any, x: Array, neighbor: Any, cell: Array, strain: Any = None) -> Array:
-        """The energy.
+        """Return the energy.
 
         Args:
-            cell: lattice vectors as rows. strain: a further deformation of everything, near 1.
+            cell: lattice vectors as rows. strain: a further deformation of box and positions, near 1.
         """
         how = self.how
         if not how.strain:
@@ -130,7 +130,7 @@ class Call:
 
 @jax.custom_jvp
 def _real_slope(x: Array, inverse: Array) -> Array:
-    """Fractional coordinates with the tangents of real coordinates, as jax-md's transforms expect."""
+    """Return fractional coordinates with the tangents of real coordinates, as jax-md's transforms do."""
     return x @ inverse
 
 
@@ -140,18 +140,20 @@ def _real_slope_jvp(primals, tangents):
 
 
 class EnergyFunction(ManyBody):
-    """An energy with parameters in any pytree, over a neighbor list of jax-md.
+    """Energy function over a jax-md neighbor list, with parameters in any pytree.
 
     Attributes:
-        parameters: a pytree of arrays; each is a parameter `potential.parameters...` by its path.
-        function: (parameters, positions (atoms, 3), neighbor, cell (3, 3)) to energy, length and energy units
-            of the system; or a `Call` of one in another convention, as `energy_function` makes it.
-        species: chemical symbols that it knows; empty where it does not say.
-        start: what makes its parameters, (key, positions, neighbor) to a pytree; None where they are given.
-        lists: its own (allocate, update), with which the trial call compares; None where there is none.
-        unit: of length and of energy that it was declared in; empty for the simulation's.
-        noise: rounding of its energy at the trial call, a power of ten, energy.
-        notes: what the trial call found, (code, values as JSON); None before there was one.
+        parameters: a pytree of arrays; the name of each parameter is its path, `potential.parameters...`.
+        function: a function of (parameters, positions (atoms, 3), neighbor, cell (3, 3)) that returns the
+            energy, with length and energy in units of the system; or a `Call`, for a function with another
+            convention.
+        species: chemical symbols that the function supports; empty if unknown.
+        start: a function of (key, positions, neighbor) that makes the parameters; None if they are given.
+        lists: (allocate, update) of its neighbor functions, with which the trial calls compare; None without
+            any.
+        unit: declared units of length and energy; empty if they are those of the simulation.
+        noise: rounding error of the energy at the trial calls, a power of ten, energy.
+        notes: findings of the trial calls, (code, values as JSON); None before the trial calls.
     """
 
     parameters: Any
@@ -174,7 +176,7 @@ class EnergyFunction(ManyBody):
 
     @property
     def fixed_box(self) -> bool:
-        """Whether the function keeps the box that it was created with."""
+        """True if the function always uses the box with which it was created."""
         return any(self.pbc) and not self.call.how.box
 
     def energy(self, positions, neighbor, cell):
@@ -195,13 +197,14 @@ def energy_function(
     name: str = "",
     compare: str = "r <",
 ) -> EnergyFunction:
-    """A potential of an energy over a neighbor list, in any of the conventions of jax-md's world.
+    """Make a potential from an energy function over a neighbor list, with any jax-md convention.
 
-    Known are `energy_fn(R, neighbor, **kw)`; `energy_fn(params, R, neighbor, **kw)`; `energy_fn(R, *, box=,
-    neighbor=, perturbation=)`; each alone or with its neighbor functions, as jax-md's `*_neighbor_list`
-    return them; with multi-image lists; returning a number, one for each atom, or a dictionary with "total"
-    or "energy"; and mdnum's own, `f(parameters, positions, neighbor, cell)`. What the signature does not say
-    (box in rows or columns, real or fractional positions) is found by trial calls when a simulation is made.
+    Supported are `energy_fn(R, neighbor, **kw)`, `energy_fn(params, R, neighbor, **kw)`, `energy_fn(R, *,
+    box=, neighbor=, perturbation=)`, and mdnum's own form `f(parameters, positions, neighbor, cell)`. A
+    function may be given alone or with its neighbor functions, as returned by jax-md's `*_neighbor_list`, and
+    may use multi-image lists. It returns a number, a number per atom, or a dictionary with "total" or
+    "energy". Properties that the signature does not determine (box vectors in rows or columns, real or
+    fractional positions) are determined by trial calls when a simulation is made.
 
     Example:
         >>> made = jax_md.energy.lennard_jones_neighbor_list(displacement, box)
@@ -211,13 +214,14 @@ def energy_function(
         given: the energy function, or a tuple of it and its neighbor functions (and, between them, a function
             that makes parameters).
         r_cut: longest interaction radius, in the function's unit of length.
-        parameters: a pytree of arrays, for a function that takes them; default what comes with `given`.
-        format: "dense", "sparse" or "ordered-sparse"; default that of its own list, or what it takes.
-        units: of length and energy that the function is written in, such as ("Å", "kcal/mol"); default those
-            of the simulation.
-        species: chemical symbols that it knows, if not all.
-        name: for people.
-        compare: what inside means to the decisions, "r <", "r <=", "r2 <" or "r2 <=".
+        parameters: a pytree of arrays, if the function has parameters; default those included in `given`.
+        format: "dense", "sparse" or "ordered-sparse"; default the format of its own list or one that it
+            accepts.
+        units: units of length and energy of the function, such as ("Å", "kcal/mol"); default those of the
+            simulation.
+        species: chemical symbols that the function supports; default all.
+        name: name of the potential in reports.
+        compare: comparison that defines "inside": "r <", "r <=", "r2 <" or "r2 <=".
 
     Raises:
         InputError: a convention that is not known, or that takes a graph; units that are not known.
@@ -255,10 +259,10 @@ def energy_function(
 
 
 def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Convention:
-    """Calling convention of a function, derived from its signature.
+    """Return the calling convention of a function, derived from its signature.
 
     Args:
-        parameters: whether there are some, or something that makes them.
+        parameters: whether the function has parameters, or a function that makes them.
     """
     try:
         given = list(inspect.signature(function).parameters.values())

@@ -1,13 +1,13 @@
-"""A run in fixed-point numbers: positions, momenta and pair forces as whole multiples of fixed units.
+"""Runs with fixed-point numbers: positions, momenta and pair forces are integer multiples of fixed units.
 
-All units are powers of two, so a double that is a whole multiple of one is that integer, exactly, and the
-rest of a rollout carries it as any position. Sums of integers have no order, the squared distance of a
-decision has no rounding, and a step that adds one integer to another is reversed by subtracting it.
+All units are powers of two, so that doubles represent integer multiples of a unit exactly, and the rest of
+the rollout processes them like other positions. Sums of integers do not depend on their order, squared
+distances of decisions have no rounding error, and a step that adds an integer is reversed by subtracting it.
 
 The force of a pair is computed in float64 from the exact integer distance, by operations that every compiler
-rounds alike, and rounded to the unit of force. Seen from the other end it is the same number with the other
-sign, so momentum is conserved to the last bit; and neither the labels of the atoms nor the list decide any
-digit.
+rounds in the same way, and is then rounded to the unit of force. The forces on the two atoms are exactly
+opposite, so momentum is conserved to the last bit. The result does not depend on the labels of the atoms or
+on the list.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _FEWEST = 1024
 
 
 def power_of_two(x: float) -> float:
-    """The smallest power of two that is at least x."""
+    """Return the smallest power of two that is at least x."""
     mantissa, exponent = math.frexp(x)
     return math.ldexp(1.0, exponent - 1 if mantissa == 0.5 else exponent)
 
@@ -78,20 +78,20 @@ class FixedPointUnits:
         kT: float,
         timestep: float,
     ) -> FixedPointUnits:
-        """Units for a box, a list and a potential.
+        """Choose the units for a box, a list and a potential.
 
-        The spacing is the finest at which squared distances of listed pairs are exact; the unit of force the
-        finest at which neither momenta nor forces leave the range of exact sums long before a run has blown
-        up, which with the time step makes the unit of momentum.
+        The spacing is the finest for which squared distances of listed pairs are exact. The unit of force is
+        the finest for which momenta and forces stay in the range of exact sums in every valid run. The unit
+        of momentum follows from the unit of force and the time step.
 
         Args:
             r_list: radius of the neighbor lists, length.
-            momentum: size of the momentum of each atom at the start or of a thermal one, the larger, mass
+            momentum: for each atom, the larger of its initial momentum and a thermal momentum, mass
                 length/time.
             kT: temperature as an energy. timestep: internal time.
 
         Raises:
-            InputError: the box is not orthorhombic, or so large that its coordinates are no longer exact.
+            InputError: the box is not orthorhombic, or so large that coordinates are not exact.
         """
         spacing = power_of_two(1.001 * r_list / 2**REACH_BITS)
         scale = max(_depth(model), kT)
@@ -109,7 +109,7 @@ class FixedPointUnits:
         """Return the box with its edges rounded to whole multiples of the grid spacing.
 
         Raises:
-            InputError: it is not orthorhombic, or too large.
+            InputError: the box is not orthorhombic, or too large.
         """
         if not cell.orthorhombic:
             raise InputError(
@@ -131,11 +131,11 @@ class FixedPointUnits:
         return eqx.tree_at(lambda one: one.inverse, made, inverse)
 
     def positions(self, x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "atoms 3"]:
-        """Positions rounded to the nearest whole multiples of the spacing."""
+        """Return positions rounded to integer multiples of the spacing."""
         return np.round(np.asarray(x, np.float64) / self.spacing) * self.spacing
 
     def total(self, terms: Float[Any, "*shape"]) -> Float[Any, ""]:
-        """The sum of energies, each rounded to the unit first: the same in every order (inside jit)."""
+        """Return the sum of energies, each rounded to the unit first: independent of order (inside jit)."""
         return jnp.sum(jnp.round(terms * (1 / self.energy))) * self.energy
 
     def to_dict(self, timestep: float) -> dict[str, float]:
@@ -150,7 +150,7 @@ class FixedPointUnits:
 
 
 def _depth(model: CutPotential) -> float:
-    """A scale of energy of a pair potential: its depth, or its height halfway in where it only repels."""
+    """Return an energy scale of a pair potential: its depth or, if it is repulsive, its value halfway in."""
     r_cut = np.asarray(model.r_cut, np.float64)
     r = r_cut * np.linspace(0.2, 1.0, 400)[:, None]
     energy = np.asarray(model.potential.evaluate(jnp.asarray(r * r))[0])
@@ -163,23 +163,23 @@ def _depth(model: CutPotential) -> float:
 
 @dataclass(frozen=True)
 class FixedPointDecider(PairDecider):
-    """Whether a pair is inside, as a comparison of two integers.
+    """Decision whether a pair is inside, by a comparison of two integers.
 
-    The squared distance is a whole number of squared spacings. Each convention becomes `r2 < limit` with a
-    whole limit; the threshold that margins are measured from lies half a step below it, so no margin is zero
-    and none has a rounding error.
+    The squared distance is an integer in units of the squared spacing. Each convention is converted to `r2 <
+    limit` with an integer limit; margins are relative to the threshold half a unit below the limit, so that
+    no margin is zero or has a rounding error.
     """
 
     spacing: float = 1.0  # of positions, length
 
     @property
     def space(self) -> str:
-        """Squared distances are always compared; for integers every convention is equivalent."""
+        """The compared quantity: always the squared distance, since all conventions are equivalent."""
         return "r2"
 
     @property
     def limits(self) -> tuple[int, ...]:
-        """Squared distances in squared spacings from which on a pair is outside, by pair type."""
+        """Smallest squared distances (in squared spacings) at which a pair is outside, by pair type."""
         unit = Fraction(self.spacing) ** 2
         square = self.compare.startswith("r2")
         exact = [(Fraction(r * r) if square else Fraction(r) ** 2) / unit for r in self.r_cut]
@@ -187,31 +187,31 @@ class FixedPointDecider(PairDecider):
 
     @property
     def thresholds(self) -> tuple[Threshold, ...]:
-        """Half a squared step below the limits, as doubles."""
+        """Thresholds, half a squared spacing below the limits, as doubles."""
         unit = self.spacing * self.spacing
         return tuple(Threshold((limit - 0.5) * unit, "<", "r2") for limit in self.limits)
 
     @cached_property
     def bounds(self) -> tuple[float, ...]:
-        """Bounds on the margin's error are zero: nothing is rounded, and no margin is zero."""
+        """Bounds on the errors of margins: all zero, because margins are exact and never zero."""
         return (0.0,) * len(self.r_cut)
 
     def inside(self, quantity, value):
         return quantity < value
 
     def host_squares(self, dx, dy, dz) -> Int[np.ndarray, "..."]:
-        """Squared distances in squared spacings."""
+        """Return squared distances in squared spacings."""
         edge = float(2**REACH_BITS)
         parts = (np.round(np.asarray(c, np.float64) / self.spacing) for c in (dx, dy, dz))
         whole = [np.clip(c, -edge, edge).astype(np.int64) for c in parts]
         return whole[0] * whole[0] + whole[1] * whole[1] + whole[2] * whole[2]
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
-        """Squared distances on the host, rounded once."""
+        """Return squared distances on the host, rounded once."""
         return self.host_squares(dx, dy, dz).astype(np.float64) * (self.spacing * self.spacing)
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
-        """Margins, exact before they become doubles."""
+        """Return margins, which are exact before the conversion to doubles."""
         left = np.asarray(self.limits, np.int64)[kind] - self.host_squares(*displacement)
         return (left - 0.5) * (self.spacing * self.spacing)
 
@@ -226,7 +226,7 @@ _ROOM = 62 - _SHIFT
 
 
 class FixedPointStep(Integrator):
-    """Base of the fixed-point schemes: kicks, drifts and sums of integers."""
+    """Base class of fixed-point integrators, whose kicks and drifts add integers."""
 
     units: FixedPointUnits = eqx.field(static=True, kw_only=True)  # the units
     # unit of momentum: that of force times half a time step
@@ -236,15 +236,15 @@ class FixedPointStep(Integrator):
     zero: Int[Array, ""] = eqx.field(kw_only=True)  # an integer zero that XLA must not know
 
     def momentum(self, v: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
-        """Momenta in units of the impulse; a velocity of this run gives its own back exactly."""
+        """Return momenta in units of the impulse; the conversion is exact for velocities of this run."""
         return jnp.round(v * (masses / self.impulse))
 
     def velocity(self, p: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
-        """Velocities of momenta; NaN where one is too large to be recovered."""
+        """Return the velocities of momenta; NaN if a momentum is too large to be recovered."""
         return jnp.where(jnp.abs(p) < _LARGEST, p * (self.impulse / masses), jnp.nan)
 
     def kick(self, v, time, acceleration, masses):
-        """Velocities after an acceleration has acted for a time, rounded to whole momenta."""
+        """Return velocities after an acceleration has acted for a time; momenta are rounded to integers."""
         push = jnp.round(time * acceleration * (masses / self.impulse))
         return self.velocity(self.momentum(v, masses) + push, masses)
 
@@ -257,24 +257,24 @@ class FixedPointStep(Integrator):
 
     @abstractmethod
     def drift(self, x, v, extra, masses, step, order):
-        """As `begin`, after the kick."""
+        """Advance as in `begin`, after the kick."""
 
     @abstractmethod
     def undrift(self, x, v, extra, masses, step, order):
-        """Positions, velocities and extra state before the drift that follows a step."""
+        """Return positions, velocities and extra state before the drift that follows a step."""
 
     def kinetic(self, v, masses):
-        """Kinetic energy, independent of the order of the atoms."""
+        """Return the kinetic energy, independent of the order of the atoms."""
         return self.units.total(0.5 * (masses * squared_norm(v[0], v[1], v[2], self.zero)))
 
     def glide(self, x, p, masses, share: float, direction: int):
-        """Positions after a fraction of a step at given momenta; direction -1 reverses it."""
+        """Return positions after a fraction of a step at given momenta; direction -1 reverses the step."""
         moved = jnp.round(p * (share * self.stride / masses))
         return x + direction * self.units.spacing * moved
 
 
 class FixedPointVerlet(FixedPointStep):
-    """NVE in fixed-point numbers."""
+    """Velocity Verlet at constant energy, with fixed-point numbers."""
 
     name = "nve"
 
@@ -287,7 +287,7 @@ class FixedPointVerlet(FixedPointStep):
 
 
 class FixedPointLangevin(FixedPointStep):
-    """BAOAB in fixed-point numbers; what friction forgets goes into the bath, its extra state."""
+    """BAOAB with fixed-point numbers; the extra state stores the information that friction removes."""
 
     name = "langevin"
     keeps_momentum = False
@@ -299,7 +299,7 @@ class FixedPointLangevin(FixedPointStep):
     pause: Int[Array, ""] = eqx.field(kw_only=True)  # steps after which the bath is put aside
 
     def noise(self, step, masses, order) -> Float[Array, "3 atoms"]:
-        """The momentum that noise adds after a step, from the counter alone: whole units."""
+        """Return the momentum that noise adds after a step, in integer units; it depends only on the step."""
         low = np.nextafter(-1.0, 0.0)
         shape = (3, masses.shape[0])
         # the numbers that jax.random.normal makes its deviates of
@@ -334,10 +334,11 @@ class FixedPointLangevin(FixedPointStep):
 
 
 def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPointStep:
-    """The fixed-point version of an integrator.
+    """Return the fixed-point version of an integrator.
 
     Raises:
-        InputError: the friction is too small or too large for a step, or the integrator has no such twin.
+        InputError: the friction is too small or too large for the time step, or the integrator has no
+            fixed-point version.
     """
     if type(integrator) not in (VelocityVerlet, Langevin):
         raise InputError(
@@ -377,7 +378,7 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
 
 
 def _period(kept: int) -> int:
-    """Steps until a bath that grows by 2^24/kept a step might no longer fit."""
+    """Return the number of steps until a bath that grows by 2^24/kept per step may overflow."""
     if not 0 < kept < 2**_SHIFT:
         return 0
     growth = 2**_SHIFT / kept
@@ -386,7 +387,7 @@ def _period(kept: int) -> int:
 
 
 def forgotten_bits(integrator: Integrator) -> float:
-    """Bits that friction removes per step from each momentum component; 0 without a thermostat."""
+    """Return the bits that friction removes per step from each momentum component; 0 without thermostat."""
     if isinstance(integrator, Langevin):
         return float(integrator.friction) * float(integrator.timestep) / math.log(2)
     return 0.0
@@ -401,7 +402,7 @@ _ROUND_BITS = int(np.float64(_ROUND).view(np.int64))
 
 @jax.custom_jvp
 def counted(x: Float[Array, "*shape"], zero: jax.Array) -> jax.Array:
-    """The nearest integer of numbers below 2^51, plus `_ROUND_BITS`: one addition."""
+    """Return the nearest integer of numbers below 2^51, plus `_ROUND_BITS`, by a single addition."""
     return lax.bitcast_convert_type(fence(x, zero) + _ROUND, jnp.int64)
 
 
@@ -416,7 +417,7 @@ def _counted_jvp(primals, tangents):
 
 
 class FixedPointJudge(SlotJudge):
-    """Decides as `SlotJudge` does, with integers, in fixed-point units."""
+    """Version of `SlotJudge` that compares integers, in fixed-point units."""
 
     def __init__(
         self, decider: FixedPointDecider, limits, cell: Cell, zero, positions, units: FixedPointUnits
@@ -430,11 +431,11 @@ class FixedPointJudge(SlotJudge):
         self.value = limits
 
     def start(self) -> jax.Array:
-        """An empty tally: the smallest distance from the limit of each atom, in squared spacings."""
+        """Return the initial value of the nearest margin of each atom, in squared spacings."""
         return jnp.full(self.atoms, jnp.iinfo(jnp.int64).max, jnp.int64)
 
     def group(self, j, types):
-        """Displacement in spacings, squared distance, decision and limit of some neighbors of every atom."""
+        """Return displacement in spacings, squared distance, decision and limit of neighbors of each atom."""
         d = displacements(self.components, self.cell, j)
         edge = float(2**REACH_BITS)
         # what is further away than any listed pair is outside; its square might not fit
@@ -477,7 +478,7 @@ class FixedPointForce(PairForce):
     def on(
         cls, units: FixedPointUnits, model: CutPotential, cell: Cell, decider, policy, reduction
     ) -> FixedPointForce:
-        """The parameters in float64; sums are exact, so the reduction makes no difference."""
+        """Make the force with parameters in float64; sums are exact, so the reduction has no effect."""
         return cls(
             model.astype(np.float64),
             cell.astype(np.float64),
@@ -492,22 +493,22 @@ class FixedPointForce(PairForce):
 
     @property
     def law(self) -> Guarded:
-        """The potential with bits that no compiler changes."""
+        """The potential, evaluated with the same bits by every compiler."""
         return Guarded(self.model, self.zero, reproducible)
 
     def judge(self, positions: Float[Array, "3 atoms"]) -> FixedPointJudge:
-        """The pair decider at these positions."""
+        """Return the pair decider at these positions."""
         assert isinstance(self.decider, FixedPointDecider)
         return FixedPointJudge(self.decider, self.thresholds, self.cell, self.zero, positions, self.units)
 
     def decide(self, positions, tables):
-        """As `PairForce`, of integer distances."""
+        """Return decisions like `PairForce.decide`, from integer distances."""
         return self.judge(positions).decide(tables)
 
     def __call__(self, positions, tables, *, decisions, tensor=False, given=None, where=None):
-        """As `PairForce`: forces that are whole multiples of the unit of force.
+        """Return forces like `PairForce`, as integer multiples of the unit of force.
 
-        Where a pair is so close that its force would leave the range of exact sums, the energy is NaN.
+        If a pair is so close that its force exceeds the range of exact sums, the energy is NaN.
         """
         judge, units = self.judge(positions), self.units
         law, zero = self.law, self.zero
@@ -568,7 +569,7 @@ class FixedPointForce(PairForce):
 
 
 def _closest(model: CutPotential, units: FixedPointUnits) -> float:
-    """Squared distance down to which energy, force and virial of a pair are below 2^50 units."""
+    """Return the least squared distance at which energy, force and virial of a pair are below 2^50 units."""
     r_cut, atom = np.asarray(model.r_cut, np.float64), model.at_cutoff()
     r = r_cut * np.geomspace(1, 1e-3, 4000)[:, None]
     energy, slope = (

@@ -23,7 +23,7 @@ VERSION = (0, 3)
 
 @cache
 def known() -> bool:
-    """Whether XLA's interface is the one that this was written for, and programs run on a CPU."""
+    """True if XLA's interface has the supported version, and programs run on a CPU."""
     header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     text = header.read_text() if header.exists() else ""
     found = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")]
@@ -112,7 +112,7 @@ def poke(typingctx: Any, address: Any, k: Any, value: Any) -> Any:
 
 @intrinsic
 def buffer(typingctx: Any, buffers: Any, k: Any) -> Any:
-    """Where the data of the k-th of a frame's operands or results begin, and its first two dimensions."""
+    """Return the address of the data of the k-th operand or result, and its first two dimensions."""
     made = types.UniTuple(types.intp, 3)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -128,7 +128,7 @@ def buffer(typingctx: Any, buffers: Any, k: Any) -> Any:
 
 @njit
 def asked_to_run(frame):
-    """Whether a call is more than a question or a preparation; a question is answered."""
+    """True if a call requests execution; a request for the version is answered, others are ignored."""
     asked = peek(frame, 1)
     if asked != 0 and peek(asked, 1) & 0xFFFFFFFF == 1:
         # for which version of the interface was this written?

@@ -1,7 +1,7 @@
-"""A cell-list neighbor search on the host, compiled by numba: the fast builder of Verlet lists.
+"""Cell-list neighbor search on the host, compiled by numba: the fast builder of Verlet lists.
 
-Bins are half a list radius wide, or wider; an axis with room for fewer than five has a single one, and every
-atom meets every atom along it. Distances are those of the minimum image, so the caller refuses radii beyond
+Bins are at least half a list radius wide. An axis with space for fewer than five bins has one bin, so that
+all atoms along it are compared. Distances are those of the minimum image; callers reject radii larger than
 half the smallest perpendicular width.
 """
 
@@ -34,7 +34,7 @@ _MOST_BINS = 1e9
 
 @njit
 def _bin_atoms(fractional, bins, bin_of, start, order):
-    """Counting sort of atoms by bin; atoms keep their order within a bin."""
+    """Sort atoms by bin (counting sort); atoms keep their order within a bin."""
     n = fractional.shape[1]
     for i in range(n):
         b = 0
@@ -56,10 +56,10 @@ def _bin_atoms(fractional, bins, bin_of, start, order):
 
 @njit
 def _layered(x, start, bins):
-    """The atoms layer after layer along the third axis: there the bins along the second lie side by side.
+    """Sort atoms into layers along the third axis, in which bins along the second axis are contiguous.
 
     Returns:
-        positions, labels, and where each bin begins, and the end.
+        positions, labels, and the start of each bin with the end of the last.
     """
     n = x.shape[1]
     layered, label = np.empty((3, n + EIGHT)), np.empty(n + EIGHT, np.int32)
@@ -81,11 +81,11 @@ def _layered(x, start, bins):
 
 @njit
 def _runs(b0, b1, box, run, shift):
-    """The bins of a layer that are near a column, with the lattice vector that brings each run of them near.
+    """Find the bins of a layer that are near a column, with the lattice vector for each run of bins.
 
     Returns:
-        how many runs, and which one holds the column. run: place along the first axis, first and last along
-        the second.
+        number of runs, and the run that contains the column. run: index along the first axis, first and last
+            index along the second.
     """
     bins, reach, periodic, matrix = box
     found = middle = 0
@@ -113,13 +113,13 @@ def _runs(b0, b1, box, run, shift):
 
 @njit
 def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
-    """Copy the atoms that are near a column of bins, layer after layer, moved by their lattice vectors.
+    """Copy the atoms near a column of bins, layer by layer, shifted by their lattice vectors.
 
-    What is near a bin are the layers around its own: one stretch, so that every atom is copied once for a
-    whole column of bins.
+    The neighborhood of a bin consists of the layers around its own, which are contiguous; every atom is
+    therefore copied only once for a column of bins.
 
     Returns:
-        whether all fit. begin: where each layer begins, and the end; home: where its middle bin does.
+        whether the capacity sufficed. begin: start of each layer, and the end; home: start of its middle bin.
     """
     (x, own, start), (runs, middle), (bins, reach, periodic, matrix) = layered, found, box
     count, apart, wide = 0, x.shape[1], near.shape[1]
@@ -160,7 +160,7 @@ def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
 
 @njit
 def _within(x, y, z, xi, yi, zi, r2_list, mask):
-    """Mask of the candidates within the list radius."""
+    """Compute the mask of the candidates within the list radius."""
     for k in range(len(x)):
         dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         mask[k] = dx * dx + dy * dy + dz * dz <= r2_list
@@ -168,7 +168,7 @@ def _within(x, y, z, xi, yi, zi, r2_list, mask):
 
 @njit
 def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
-    """As `_within`, where an axis has a single bin and the nearest image is looked for pair by pair."""
+    """Like `_within`, if an axis has a single bin and the nearest image of each pair must be found."""
     for k in range(len(x)):
         dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         f = np.rint(dx * inverse[0, 0] + dy * inverse[1, 0] + dz * inverse[2, 0])
@@ -182,7 +182,7 @@ def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
 
 @njit
 def _compressed(mask, label, first, atoms, out, place):
-    """Write the labels that the mask keeps, of so many atoms from the first on; how many."""
+    """Write the labels of the first atoms that the mask selects; return their number."""
     filled = place
     for k in range(0, atoms, EIGHT):
         filled = kept(mask, k, label, first + k, out, filled)
@@ -191,7 +191,7 @@ def _compressed(mask, label, first, atoms, out, place):
 
 @njit
 def _transposed(rows, table, first, begin, end):
-    """The slots of consecutive atoms, which share cache lines: written together."""
+    """Write the slots of consecutive atoms, which share cache lines, together."""
     room, n = table.shape
     if end - begin == _TOGETHER and room % EIGHT == 0:
         for k in range(0, room, EIGHT):
@@ -205,10 +205,10 @@ def _transposed(rows, table, first, begin, end):
 
 @njit
 def _fill(x, layered, box, inverse, start, r2_list, table, columns):
-    """Neighbors of the (bin-sorted) atoms in some columns of bins.
+    """Write the neighbors of the atoms (sorted by bin) in some columns of bins.
 
     Returns:
-        the largest number found, which may exceed the room.
+        the largest number of neighbors, which may exceed the capacity.
     """
     bins, reach, periodic, matrix = box
     room, n = table.shape
@@ -258,7 +258,7 @@ def _fill(x, layered, box, inverse, start, r2_list, table, columns):
 
 
 def grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
-    """Number of bins and reach of the search along each axis."""
+    """Return the number of bins, and the range of the search in bins, along each axis."""
     bins = np.ones(3, np.int64)
     reach = np.zeros(3, np.int64)
     for k in range(3):
@@ -277,17 +277,17 @@ def grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
 def neighbor_table(
     positions: Float[np.ndarray, "atoms 3"], cell: Cell, r_list: float, room: int
 ) -> tuple[Int[np.ndarray, "room atoms"], Int[np.ndarray, "atoms"], int]:
-    """All neighbors within r_list of every atom, in both directions, atoms sorted by bin.
+    """Return all neighbors within r_list of every atom, in both directions, with atoms sorted by bin.
 
     Args:
         positions: wrapped positions, length.
         cell: the box.
         r_list: list radius, length, at most half the smallest perpendicular width.
-        room: slots per atom.
+        room: number of slots per atom.
 
     Returns:
-        table of sorted indices padded with the number of atoms; order, such that sorted atom k is atom
-        order[k]; and the largest number of neighbors, which exceeds room when the table is incomplete.
+        table of sorted indices, padded with the number of atoms; order, such that sorted atom k is atom
+            order[k]; and the largest number of neighbors, which exceeds room if the table is incomplete.
     """
     atoms = len(positions)
     components = np.ascontiguousarray(positions.T, np.float64)
@@ -348,9 +348,9 @@ _using = threading.Lock()
 
 
 def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
-    """Memory for a table, aligned so that a CPU backend needs no copy; again that of one nobody holds.
+    """Return aligned memory for a table, which XLA need not copy on a CPU; unused memory is used again.
 
-    Of a million atoms it is half a gigabyte, and memory that a process gets anew takes longer than a search.
+    For a million atoms the table takes half a gigabyte, and allocating new memory takes longer than a search.
     """
     size = 4 * room * atoms + 64
     with _using:
@@ -364,8 +364,9 @@ def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
 
 
 def free_extent(cell: Cell, low: float, high: float) -> float:
-    """What the bins along a free axis span, from the first to the last of the atoms; 0 where one bin has all.
+    """Return the extent of the atoms along a free axis; 0 if a single bin contains all atoms.
 
-    The direction is that of the axis itself, orthogonal to the periodic ones where the lattice vectors are.
+    The extent is measured along the axis, which is orthogonal to the periodic axes if the lattice vectors
+    are.
     """
     return float(high - low) if cell.orthorhombic or not any(cell.pbc) else 0.0

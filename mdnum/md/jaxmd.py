@@ -29,7 +29,7 @@ Format = Literal["dense", "sparse", "ordered-sparse"]
 
 
 def _dual(cell: Float[Array, "3 3"], periodic: tuple[int, ...]) -> Float[Array, "3 axes"]:
-    """Columns that turn a vector into its fractional coordinates along the periodic axes alone."""
+    """Return the matrix that maps a vector to its fractional coordinates along the periodic axes only."""
     if len(periodic) == 3:
         a, b, c = cell
         dual = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
@@ -41,24 +41,24 @@ def _dual(cell: Float[Array, "3 3"], periodic: tuple[int, ...]) -> Float[Array, 
 def displacement(
     cell: Float[Array | np.ndarray, "3 3"], pbc: tuple[bool, bool, bool] = (True, True, True)
 ) -> Displacement:
-    """Minimum-image displacement in real coordinates, in the form every jax-md energy function takes.
+    """Return a minimum-image displacement function in real coordinates, for jax-md energy functions.
 
-    The image is chosen by rounding fractional coordinates and subtracted as whole lattice vectors, so a
-    pair that needs no image keeps the exact difference of its coordinates, positions may leave the box, and
-    derivatives with respect to the cell (stress by strain) are those of the chosen image.
+    The image is chosen by rounding fractional coordinates, and integer multiples of lattice vectors are
+    subtracted. If no image is needed, the displacement is the exact difference of the coordinates. Positions
+    may lie outside the box, and derivatives with respect to the cell (stress) are those of the chosen image.
 
     Args:
         cell: lattice vectors as rows, length; orthorhombic or triclinic.
-        pbc: which axes are periodic; the others are free and their rows are ignored.
+        pbc: flags of the periodic axes; the rows of the other axes are ignored.
 
     Returns:
-        `fn(Ra, Rb, cell=None, perturbation=None) -> Ra - Rb`, (3,) arrays. `cell=` replaces the cell of the
-        call, also under jit and grad; `perturbation=` is jax-md's linear map of the result. Other keywords
-        are ignored, because jax-md hands every function all of them.
+        `fn(Ra, Rb, cell=None, perturbation=None) -> Ra - Rb`, (3,) arrays. `cell=` replaces the given cell,
+            also inside jit and grad; `perturbation=` is jax-md's linear map of the result. Other keywords are
+            ignored, because jax-md passes all keywords to every function.
 
     Error:
-        the minimum image is the nearest one only below half the smallest perpendicular width; builders here
-        refuse a longer list. jax-md's own spaces ignore the question (no flag).
+        the minimum image is the nearest image only for distances below half the smallest perpendicular width;
+            the list builders of this module reject a larger radius. jax-md's own spaces do not check it.
     """
     periodic = tuple(axis for axis in range(3) if pbc[axis])
     base = jnp.asarray(cell)
@@ -91,7 +91,7 @@ def neighbor_vectors(
     cell: Float[Array, "3 3"],
     pbc: tuple[bool, bool, bool],
 ) -> Float[Array, "atoms slots 3"]:
-    """Minimum-image vectors from each atom to its listed neighbors; padded slots hold some finite vector."""
+    """Return minimum-image vectors from each atom to its neighbors; vectors of padding slots are finite."""
     toward = displacement(cell, pbc)
     others = positions[jnp.where(idx < positions.shape[0], idx, 0)]
     return jax.vmap(lambda here, there: jax.vmap(lambda point: toward(point, here))(there))(positions, others)
@@ -105,20 +105,20 @@ _ROOM = 1.25
 
 
 def standard_promotion() -> AbstractContextManager[None]:
-    """The dtype rules that jax-md's code needs: it mixes widths everywhere, even while it is imported."""
+    """Enable the dtype promotion that jax-md needs, since it mixes dtypes even when it is imported."""
     return jax.numpy_dtype_promotion("standard")
 
 
 @contextmanager
 def _quiet_scatter() -> Iterator[None]:
-    """jax-md scatters int64 indices into int32 arrays, and jax warns of it at every trace."""
+    """Suppress a warning of jax: jax-md scatters int64 indices into int32 arrays at every trace."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "scatter inputs have incompatible types", FutureWarning)
         yield
 
 
 def upstream() -> ModuleType:
-    """The package jax_md, imported at the first call, which takes seconds."""
+    """Return the package jax_md; the first call imports it, which takes seconds."""
     with standard_promotion():
         import jax_md
         import jax_md.custom_partition
@@ -129,10 +129,10 @@ def upstream() -> ModuleType:
 
 
 def scalar(value: float | np.ndarray) -> Float[Array, ""]:
-    """A number in the only form that jax-md keeps in float64.
+    """Convert a number to a float64 jax array, the only form that jax-md does not round to float32.
 
-    jax_md.util.maybe_downcast turns Python floats, numpy floats and numpy arrays into float32 even under
-    x64; only a jax float64 array survives. Use this for every sigma, epsilon, r_onset and r_cutoff.
+    jax_md.util.maybe_downcast converts Python floats, numpy floats and numpy arrays to float32 even if x64 is
+    enabled, but not float64 jax arrays. Use this function for every sigma, epsilon, r_onset and r_cutoff.
     """
     return jnp.asarray(value, jnp.float64)
 
@@ -151,17 +151,18 @@ def as_neighbor_list(
     self_edges: bool = False,
     code: Any = 0,
 ) -> NeighborList:
-    """jax-md's NeighborList around a list that somebody else built, so that any jax-md energy runs on it.
+    """Make a jax-md NeighborList from a list built by another program, for use with jax-md energies.
 
-    Works inside jit as well; padding stays where it is.
+    The function also works inside jit; the positions of padding do not change.
 
     Args:
-        idx_dense: neighbors of each atom, both directions, padded with the number of atoms. Entries that
-            name the atom itself become padding: jax-md's EAM would count them as density at r = 0.
+        idx_dense: neighbors of each atom, in both directions, padded with the number of atoms. Entries of an
+            atom as its own neighbor become padding, because jax-md's EAM would add their density at r = 0.
         reference_position: positions at which the list was built, length.
-        format: dense (atoms, slots); sparse (2, atoms slots), both ways; ordered-sparse, each pair once.
-        self_edges: list each atom as its own neighbor, as jax-md does where its `mask_self` is false.
-        code: of the list's error, as if it had overflowed.
+        format: dense (atoms, slots); sparse (2, atoms slots), with both directions; ordered-sparse, with each
+            pair once.
+        self_edges: list each atom as its own neighbor, as jax-md does if its `mask_self` is false.
+        code: error code of the list, for example as after an overflow.
     """
     if format not in _FORMATS:
         raise InputError(f"unknown neighbor list format {format!r}; known are {', '.join(_FORMATS)}")
@@ -189,7 +190,7 @@ def listed(
     format: Format,
     code: Any = 0,
 ) -> NeighborList:
-    """As `as_neighbor_list`, of entries that are in the format already."""
+    """Make a NeighborList like `as_neighbor_list`, from entries that already have the format."""
     partition = upstream().partition
     return partition.NeighborList(
         idx=idx,
@@ -207,10 +208,11 @@ def listed(
 def multi_image(
     neighbor: NeighborList, x: Float[Array, "atoms 3"], cell: Float[Array, "3 3"], box: Float[Array, "3 3"]
 ) -> Any:
-    """The list with the integer shifts of nearest images, as jax_md.custom_partition makes it.
+    """Return the list with integer shifts of nearest images, in the form of jax_md.custom_partition.
 
     Args:
-        x: positions, length. cell: lattice vectors as rows, length. box: as the energy function takes it.
+        x: positions, length. cell: lattice vectors as rows, length. box: the box in the form that the energy
+            function accepts.
     """
     kind: Any = upstream().custom_partition.NeighborListMultiImage
     n, dense = x.shape[0], neighbor.format is upstream().partition.Dense
@@ -228,16 +230,16 @@ def multi_image(
 class PairSearch:
     """jax-md's own neighbor search for one cell, for repeated calls with new positions.
 
-    It is handed fractional coordinates folded into [0, 1) and the perpendicular widths as its box: a
-    position outside the box silently drops pairs in jax-md, and its triangular-box path flags good boxes as
-    malformed. Overflow is read after every search, outside jit, and answered with a larger list.
+    jax-md receives fractional coordinates wrapped into [0, 1) and the perpendicular widths as its box,
+    because it loses pairs of positions outside the box without an error, and rejects some valid triclinic
+    boxes. The overflow flag is read after every search, outside jit; after an overflow, the list is enlarged.
 
     Args:
         cell: lattice vectors as rows, length.
         r_list: search radius, length (cutoff plus skin).
 
     Raises:
-        InputError: r_list is over half the smallest perpendicular width, where one image is not enough.
+        InputError: r_list exceeds half the smallest perpendicular width, so that one image is not sufficient.
     """
 
     def __init__(
@@ -263,7 +265,7 @@ class PairSearch:
         self._update = jax.jit(lambda folded, previous: previous.update(folded))
 
     def _frame(self, fractional: np.ndarray) -> None:
-        """A frame [0, 1) around the atoms along free axes, with room to move."""
+        """Return a frame [0, 1) around the atoms along free axes, with a margin for their motion."""
         low, high = fractional.min(axis=0), fractional.max(axis=0)
         self._low = np.where(self.pbc, 0.0, low - self.r_list)
         self._span = np.where(self.pbc, 1.0, high - low + 2 * self.r_list)
@@ -299,11 +301,11 @@ class PairSearch:
         return functions.allocate(jnp.asarray(folded))
 
     def __call__(self, positions: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "atoms slots"]:
-        """Neighbors within r_list of each atom: rows sorted, padded with the number of atoms to the longest.
+        """Return the neighbors within r_list of each atom, as sorted rows padded with the number of atoms.
 
         Raises:
             NumericalError: a position is not finite.
-            CapacityError: jax-md reports an overflow even in a list allocated for these positions.
+            CapacityError: jax-md reports an overflow even for a list that was allocated for these positions.
         """
         positions = np.asarray(positions, np.float64)
         if not np.isfinite(positions).all():

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Int
 
 
 class Columns:
-    """A table: equally long columns, the fields of a frozen dataclass in their order, an array first.
+    """Base class of tables: the fields of a frozen dataclass are columns of equal length, first an array.
 
-    What is no array stands for all rows: a word, or None for a column that is not known.
+    A field that is not an array applies to all rows: a text, or None for an unknown column.
     """
 
     def __len__(self) -> int:
@@ -28,14 +28,14 @@ class Columns:
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
     def to_pandas(self) -> Any:
-        """A DataFrame of the columns that are known; needs pandas."""
+        """Return a DataFrame of the known columns; needs pandas."""
         from pandas import DataFrame
 
         return DataFrame({name: column for name, column in vars(self).items() if column is not None})
 
     @classmethod
     def none(cls) -> Any:
-        """No row of any column; before the parts that are joined, where there may be none."""
+        """Return a table without rows."""
         kinds = {"Int": np.int64, "Bool": bool, "Float": np.float64}
         types = [(one.name, kinds.get(str(one.type).partition("[")[0])) for one in fields(cast(Any, cls))]
         return cls(**{name: np.zeros(0, kind) for name, kind in types if kind})
@@ -50,7 +50,7 @@ class Columns:
 
 @dataclass(frozen=True)
 class Members(Columns):
-    """The pairs inside at one frame, sorted by (i, j, rank), each once."""
+    """The pairs inside the cutoff at one frame, sorted by (i, j, rank), each once."""
 
     i: Int[
         np.ndarray, "pairs"
@@ -63,10 +63,10 @@ class Members(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class FlipTable(Columns):
-    """A row per decision on a pair that differs from the one before, sorted by (step or frame, i, j, rank).
+    """Table with one row per flip, sorted by (step or frame, i, j, rank).
 
-    A run's decisions are those that its program acted on, one of each pair at each step; those of a
-    trajectory, or of anybody's positions, follow from where atoms are at each frame.
+    For a run, the decisions are those on which the program acted, for each pair at each step. For a
+    trajectory or other given positions, they are derived from the positions at each frame.
     """
 
     i: Int[np.ndarray, "flips"]  # the pair, as in `Members`
@@ -94,6 +94,6 @@ class FlipTable(Columns):
     by_box: Float[np.ndarray, "flips"] | Any = None
 
     def columns(self, rule: int = 0) -> dict[str, Any]:
-        """What is known, by the names of flips.parquet; all rows are of one rule."""
+        """Return the known columns by their names in flips.parquet; all rows are from one rule."""
         known = {name: column for name, column in vars(self).items() if column is not None}
         return {"rule": np.broadcast_to(np.int32(rule), len(self)), **known}

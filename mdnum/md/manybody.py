@@ -32,23 +32,23 @@ _UNKNOWN = Smoothness(-1, float("nan"), float("nan"))
 class ManyBody(eqx.Module):
     """A potential whose energy is not a sum over pairs.
 
-    Decisions are made outside: the list given holds the pairs that count, and an entry replaced by the
-    number of atoms is a pair that does not. Every potential also tests r < r_cut itself, so that a list with
-    a skin gives the same energy.
+    Decisions are made before the energy is evaluated: the list contains the pairs that are inside, and an
+    entry equal to the number of atoms is padding. Every potential also tests r < r_cut itself, so that a list
+    with a skin gives the same energy.
 
     Attributes:
         pbc: which axes are periodic.
-        name: as in a system file.
-        format: the neighbor list format that energy takes; "any" before it was tried.
-        smoothness: at r_cut.
-        sources: papers of the form and its constants.
+        name: name in a system file.
+        format: neighbor list format that `energy` accepts; "any" before the trial calls.
+        smoothness: smoothness of the energy at r_cut.
+        sources: references for the functional form and its constants.
         r_cut: longest interaction radius, length; a field, or computed from the constants.
-        trusts_list: whether the energy takes a listed pair wherever it is near r_cut, so that a decision that
-            is imposed has its effect.
-        labeled: whether atoms are told apart by their place in the structure (species or charges that the
-            function holds), so that it is called in the order of the structure.
+        trusts_list: whether the energy includes every listed pair near r_cut, so that imposed decisions take
+            effect.
+        labeled: whether the function distinguishes atoms by their index in the structure (stored species or
+            charges), so that it must be called with atoms in the order of the structure.
         self_edges: whether each atom is listed as its own neighbor.
-        compare: what inside means.
+        compare: comparison that defines "inside".
     """
 
     pbc: tuple[bool, bool, bool] = eqx.field(static=True, kw_only=True, default=(True, True, True))
@@ -64,11 +64,12 @@ class ManyBody(eqx.Module):
     def energy(
         self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
     ) -> Float[Array, ""]:
-        """Potential energy; differentiable with respect to positions and cell.
+        """Return the potential energy, which is differentiable with respect to positions and cell.
 
         Args:
-            positions: length; they need not lie in the cell.
-            neighbor: a list in this potential's format, both directions, no atom its own neighbor.
+            positions: positions, length; they may be outside the cell.
+            neighbor: a list in the format of this potential, with both directions, and no atom as its own
+                neighbor.
             cell: lattice vectors as rows, length.
         """
         raise NotImplementedError(f"{type(self).__name__} defines no energy")
@@ -80,23 +81,23 @@ class ManyBody(eqx.Module):
         cell: Float[Array, "3 3"],
         deformation: Float[Array, "3 3"],
     ) -> Float[Array, ""]:
-        """The energy of positions and lattice vectors, as rows, times a deformation near 1."""
+        """Return the energy after a deformation near 1 of positions and lattice vectors (rows)."""
         return self.energy(positions @ deformation, neighbor, cell @ deformation)
 
     def forces(
         self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
     ) -> Float[Array, "atoms 3"]:
-        """Minus the gradient of the energy, energy/length."""
+        """Return the forces: minus the gradient of the energy, energy/length."""
         return -jax.grad(self.energy)(positions, neighbor, cell)
 
     def evaluate(
         self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
     ) -> tuple[Float[Array, ""], Float[Array, "atoms 3"], Float[Array, "3 3"]]:
-        """Energy, forces and stress in one pass.
+        """Return energy, forces and stress, computed in one pass.
 
         Returns:
             energy; forces (atoms, 3); stress (3, 3), energy/length³ in ASE's sign: (1/V) dE/d(strain),
-            positive where the cell wants to shrink. It means something only for a cell with a volume.
+            positive if the cell tends to shrink. It is meaningful only for a cell with a volume.
         """
         identity = jnp.eye(3, dtype=positions.dtype)
 
@@ -111,13 +112,13 @@ class ManyBody(eqx.Module):
 
 
 def leaves_by_path(potential: Any) -> dict[str, Any]:
-    """The arrays of a potential by their paths, such as "pair.values"."""
+    """Return the arrays of a potential by their paths, such as "pair.values"."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(potential)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
 def quantities_of(potential: Any) -> dict[str, Any]:
-    """The parameters of a many-body potential: its arrays and its constants, by name."""
+    """Return the parameters of a many-body potential by name: its arrays and its constants."""
     found = {name: leaf for name, leaf in leaves_by_path(potential).items() if eqx.is_inexact_array(leaf)}
     for field in fields(potential):
         value = getattr(potential, field.name)
@@ -128,7 +129,7 @@ def quantities_of(potential: Any) -> dict[str, Any]:
 
 
 def with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
-    """The potential with other parameters; also inside jit."""
+    """Return the potential with other parameters; also inside jit."""
     names, tree = list(leaves_by_path(potential)), jax.tree.structure(potential)
     leaves = [values.get(name, leaf) for name, leaf in zip(names, jax.tree.leaves(potential), strict=True)]
     whole = jax.tree.unflatten(tree, leaves)

@@ -1,4 +1,4 @@
-"""Verlet skin lists: when they are rebuilt, who builds them, and what they hold."""
+"""Verlet lists with a skin: rules for rebuilding them, their builders, and their content."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class RebuildRule:
 
     @property
     def safe(self) -> bool:
-        """Whether a list is never used once its skin is spent."""
+        """True if a list is always rebuilt before its skin is used up."""
         return self.check and self.every == 1 and self.delay <= 1
 
 
 @dataclass(frozen=True)
 class PairTable:
-    """The pairs of one list, both directions, as the force loop reads them."""
+    """The pairs of one list, in both directions, in the layout of the force loop."""
 
     # neighbor of each slot and atom, in sorted labels, padded with the number of atoms, shape (slots, atoms);
     # where the search left it, on the host or on a device
@@ -87,8 +87,8 @@ class PairTable:
     ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
         """Labels i < j of the pairs whose packed decision is yes, each once, in the order of the table.
 
-        Where a pair has several decisions, one channel behind the other, i has the number of atoms added for
-        each channel before.
+        If a pair has decisions in several channels, i is increased by the number of atoms for each previous
+        channel.
         """
         slots, columns = set_bits(bits)
         channel, slots = np.divmod(slots, self.slots)
@@ -97,7 +97,7 @@ class PairTable:
         return (i + channel * len(self.order))[keep], j[keep]
 
     def listed(self, channels: int = 1) -> tuple[Int[np.ndarray, "pairs"], ...]:
-        """Sorted places of both atoms of every pair, once for each channel, and labels as of `decided`."""
+        """Return sorted indices of both atoms of every pair, per channel, and labels as in `decided`."""
         slots, first = np.nonzero(self.index < len(self.order))
         second = self.index[slots, first]
         i, j = self.order[first], self.order[second]
@@ -107,7 +107,7 @@ class PairTable:
         return first, second, i + np.repeat(np.arange(channels), once.sum()) * len(self.order), j
 
     def unsorted(self) -> Int[np.ndarray, "atoms slots"]:
-        """Neighbors in the user's labels, one row per atom, padded with the number of atoms."""
+        """Return neighbors in the labels of the user, one row per atom, padded with the number of atoms."""
         atoms = self.index.shape[1]
         labels = np.append(self.order, atoms).astype(np.int32)
         out = np.empty((atoms, self.slots), np.int32)
@@ -143,7 +143,7 @@ class HostBuilder:
 
 @dataclass(frozen=True)
 class JaxMdBuilder:
-    """jax-md's partition.neighbor_list, through an adaptor that avoids its pitfalls."""
+    """List builder that uses jax-md's partition.neighbor_list and avoids its pitfalls."""
 
     name: str = "jax-md"
 
@@ -199,10 +199,10 @@ class VerletList:
     slots: int = field(default=0)  # room per atom; 0 lets the density decide
 
     def build(self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell) -> PairTable:
-        """The pairs within r_cut + skin of wrapped positions; capacity grows until they fit.
+        """Return the pairs within r_cut + skin of wrapped positions; the capacity is increased as needed.
 
         Raises:
-            CapacityError: an atom would have every other atom as a neighbor and more.
+            CapacityError: an atom would need more slots than there are other atoms.
         """
         r_list = self.r_cut + self.rule.skin
         atoms = len(positions)
@@ -238,10 +238,11 @@ class VerletList:
         return max(SLOTS, int(np.ceil(slots / SLOTS)) * SLOTS)
 
     def consumed(self, positions, cell: Cell, reference, reference_cell: Cell) -> float:
-        """Share of the skin that motion and box strain have used since the build; above 1 is too late.
+        """Return the fraction of the skin that motion and strain have used; above 1, pairs may be missing.
 
         Args:
-            positions, cell: now; reference, reference_cell: at the build. Wrapped positions, length.
+            positions, cell: present state. reference, reference_cell: state when the list was built.
+                Positions are wrapped, length.
         """
         carried = np.asarray(reference) @ reference_cell.deformation(cell)
         moved = displacement(cell, carried, positions)
