@@ -344,7 +344,7 @@ def dense_pairs(
     pbc: tuple[bool, bool, bool],
     r_list: float,
 ) -> Int[np.ndarray, "atoms slots"]:
-    """Neighbors within r_list found by jax-md; as PairSearch, whose last few compiled searches are kept."""
+    """Return neighbors within r_list found by jax-md; a few compiled `PairSearch` objects are kept."""
     rows = np.ascontiguousarray(cell, np.float64)
     return _kept_search(rows.tobytes(), pbc, float(r_list))(np.asarray(positions))
 

@@ -32,8 +32,9 @@ class RebuildRule:
 
     @property
     def first_allowed(self) -> int:
-        """Age at which a list can first be rebuilt; a build there is `dangerous` in LAMMPS's sense,
-        because an earlier one may have been due."""
+        """Smallest age at which a list can be rebuilt.
+
+        A rebuild at this age is `dangerous` in the sense of LAMMPS: it may have been due earlier."""
         return max(self.every, self.delay)
 
     @property
@@ -85,7 +86,7 @@ class PairTable:
     def decided(
         self, bits: UInt8[np.ndarray, "words atoms"]
     ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Labels i < j of the pairs whose packed decision is yes, each once, in the order of the table.
+        """Return labels i < j of the pairs whose packed decision is true, each once, in table order.
 
         If a pair has decisions in several channels, i is increased by the number of atoms for each previous
         channel.
@@ -127,7 +128,7 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Index table in sorted labels, order, and the largest neighbor count (above slots: incomplete)."""
+        """Return index table in sorted labels, order, and largest neighbor count (incomplete if > slots)."""
         ...
 
 

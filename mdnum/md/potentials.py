@@ -1,4 +1,4 @@
-"""Pair potentials in closed form: energy and slope as functions of r²."""
+"""Pair potentials: energy and slope as functions of r²."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ else:
 
 
 def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> Num[Array, "..."]:
-    """The entries of given pair types (None: only one); types come from the list, in range."""
+    """Return the entries of given pair types (None: there is only one type); indices are not checked."""
     return leaf[0] if types is None else leaf.at[types].get(mode="promise_in_bounds")
 
 
 class PairPotential(eqx.Module):
-    """A bare pair potential; a field is a parameter with one entry per pair type, but for `shared`.
+    """Base class of pair potentials without a cutoff; fields are parameters with an entry per pair type.
 
     Example:
         >>> class Inverse(mdnum.PairPotential):
@@ -58,16 +58,16 @@ class PairPotential(eqx.Module):
 
     @abstractmethod
     def evaluate(self, r2: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Energy u and du/d(r²) at squared distances, parameters broadcast against r2."""
+        """Return energy u and du/d(r²) at squared distances; parameters are broadcast against r2."""
 
     def reference(
         self, r: Float[np.ndarray, "pairs"], **constants: Any
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """u(r) and u'(r) by numpy: the judge of `evaluate`, its slope the derivative of its energy.
+        """Return u(r) and u'(r), computed by numpy as a reference for `evaluate`.
 
         Args:
             r: distances, length.
-            constants: of the pair; shared parameters are its own.
+            constants: parameters of the pair; shared parameters come from the potential.
         """
         made = self.typed.with_leaves(jax.tree.map(lambda one: jnp.asarray([one]), constants))
         along = np.ones(len(r))
@@ -75,7 +75,7 @@ class PairPotential(eqx.Module):
         return np.asarray(energy), np.asarray(slope)
 
     def of(self, types: Integer[Array, "..."] | None) -> PairPotential:
-        """The parameters of given pair types; types None means that there is only one."""
+        """Return the parameters of given pair types; None if there is only one type."""
         own, shared = self.typed.split()
         return eqx.combine(jax.tree.map(lambda leaf: of_type(leaf, types), own), shared)
 
@@ -85,7 +85,7 @@ class PairPotential(eqx.Module):
         return self
 
     def split(self) -> tuple[Any, Any]:
-        """Two copies: one with only the per-pair-type parameters, one with only the shared; others None."""
+        """Return two copies: with only the per-pair-type and only the shared parameters; others are None."""
         return self, jax.tree.map(lambda _: None, self)
 
     @property
@@ -94,7 +94,7 @@ class PairPotential(eqx.Module):
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def with_leaves(self, leaves: Mapping[str, Any]) -> PairPotential:
-        """The same potential form with other parameters."""
+        """Return the same potential with other parameters."""
         return replace(self, **leaves)
 
     def constants(self, kind: int) -> dict[str, Any]:
@@ -167,7 +167,7 @@ class SoftSphere(PairPotential):
 
 
 class PairFunction(PairPotential):
-    """A pair energy `u(r, **parameters)` or `u(r2, **parameters)` that a person wrote; its slope is jax's.
+    """User-defined pair energy `u(r, **parameters)` or `u(r2, **parameters)`; jax computes its derivative.
 
     Example:
         >>> def morse(r, depth, alpha, r0):
@@ -180,16 +180,17 @@ class PairFunction(PairPotential):
         >>> PairFunction(mixed, sigma={"Na": 1.2, "Cl": 1.8})
 
     Args:
-        function: of jax operations, elementwise in its first argument, whose name says whether that is the
-            distance, `r` (length), or its square, `r2`. An argument `species` that is not given is the
-            atomic numbers of both atoms, as two floats.
-        parameters: by name, a number for all pairs or one for each pair of species, {"Ni-P": 0.2, ...}: these
-            have an entry per pair type. One for each species, {"Ni": 2.2, "P": 1.9}: the function receives
-            those of both atoms, as a tuple. Or arrays, lists, dictionaries or modules of arrays, as the
-            weights of a network: these are shared by all pairs. A list of numbers is an array.
+        function: a function made of jax operations, elementwise in its first argument, whose name determines
+            whether it is the distance, `r` (length), or its square, `r2`. If an argument `species` is not
+            given, its value is the atomic numbers of both atoms, as two floats.
+        parameters: values by name. A number, or a number for each pair of species ({"Ni-P": 0.2, ...}),
+            becomes a parameter with one entry per pair type. For a number per species ({"Ni": 2.2, "P": 1.9})
+            the function receives the values of both atoms, as a tuple. Arrays, lists, dictionaries and
+            modules of arrays, such as the weights of a network, are shared by all pairs. A list of numbers is
+            converted to an array.
 
     Raises:
-        InputError: the first argument is neither, or the parameters are not those of the function.
+        InputError: the first argument is neither r nor r2, or the parameters do not match the function.
     """
 
     function: Callable[..., Any] = eqx.field(static=True)
@@ -233,7 +234,7 @@ class PairFunction(PairPotential):
         return energy, slope * (0.5 / r)
 
     def energy(self, r2: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Energy at squared distances, the first value of `evaluate`."""
+        """Return the energy at squared distances, the first value of `evaluate`."""
         parameters = self.typed.leaves | self.shared
         return self.function(r2 if self._of_square else jnp.sqrt(r2), **parameters)
 
@@ -272,14 +273,14 @@ class PairFunction(PairPotential):
 
 
 def _is_by_type(value: Any) -> bool:
-    """Whether a parameter is a number, or one for each pair of species; all else is shared."""
+    """True if a parameter is a number, or a number for each pair of species; other values are shared."""
     if isinstance(value, Mapping):
         return bool(value) and all(isinstance(key, str) and "-" in key for key in value)
     return isinstance(value, int | float | np.generic) or (eqx.is_array_like(value) and np.ndim(value) == 0)
 
 
 def _is_by_species(value: Any) -> bool:
-    """Whether a parameter is a number for each species, by chemical symbols."""
+    """True if a parameter is a number for each species, by chemical symbols."""
     return (
         isinstance(value, Mapping)
         and bool(value)
@@ -299,7 +300,7 @@ for _potential in (LennardJones, Morse, SoftSphere):
 
 
 class SumPotential(PairPotential):
-    """The potentials of terms that share a decision; energies and slopes are tuples, one for each term."""
+    """Potentials of terms that share a decision; energies and slopes are tuples with one entry per term."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     parts: tuple[PairPotential, ...]
@@ -335,7 +336,7 @@ class Together(Cutoff):
         return zip(self.ends, (AtCutoff(at.r_cut, *own) for own in rest), strict=True)
 
     def cut(self, r2, u, w, at, weights=None):
-        """As of every cutoff, summed; weights: a factor for each term, None for 1."""
+        """Return the sum over the terms of `Cutoff.cut`; weights: a factor for each term, None for 1."""
         rows = zip(self._each(at), u, w, strict=True)
         made: list[Any] = [end.cut(r2, energy, slope, own) for (end, own), energy, slope in rows]
         for k, weight in enumerate(weights or ()):
@@ -361,7 +362,7 @@ class CutPotential(eqx.Module):
 
     @classmethod
     def of_terms(cls, terms: Mapping[str, CutPotential]) -> CutPotential:
-        """The sum of terms that have the same radii, by name."""
+        """Make the sum of terms that have the same radii, by name."""
         parts = list(terms.values())
         _, bare, ends, onsets, weights = zip(*(one.rows[0] for one in parts), strict=True)
         weights = weights if any(one.weights for one in parts) else ()
@@ -369,7 +370,7 @@ class CutPotential(eqx.Module):
 
     @property
     def parts(self) -> tuple[CutPotential, ...]:
-        """The channels of decisions; this potential is the only one."""
+        """Channels of decisions: only this potential."""
         return (self,)
 
     @property
@@ -385,7 +386,7 @@ class CutPotential(eqx.Module):
 
     @property
     def terms(self) -> dict[str, CutPotential]:
-        """Its terms by name, each with its weights; of a plain potential itself, without a name."""
+        """Terms by name, each with its weights; a single potential is one term without a name."""
         return {
             name: CutPotential(part, end, self.r_cut, onset, () if weight is None else (weight,))
             for name, part, end, onset, weight in self.rows
@@ -402,18 +403,18 @@ class CutPotential(eqx.Module):
         return replace(self, potential=self.potential.typed)
 
     def at_cutoff(self) -> AtCutoff:
-        """The bare potential at r_cut, per pair type."""
+        """Return the bare potential at r_cut, per pair type."""
         energy, w = self.potential.evaluate(self.r_cut * self.r_cut)
         return AtCutoff(self.r_cut, self.r_onset, energy, jax.tree.map(lambda w: 2 * self.r_cut * w, w))
 
     def evaluate(self, r2, types, at: AtCutoff, *weights):
-        """Energy and denergy/d(r²) of pairs inside the cutoff.
+        """Return energy and denergy/d(r²) of pairs inside the cutoff.
 
         Args:
             r2: squared distances.
             types: pair type of each pair, or None where there is only one.
-            at: `at_cutoff()`, made once outside the loop.
-            weights: of terms that have some, one tuple of the factors of each pair.
+            at: result of `at_cutoff()`, computed once outside the loop.
+            weights: for terms with weights, a tuple of the factors of each pair.
         """
         u, w = self.potential.of(types).evaluate(r2)
         here = jax.tree.map(lambda leaf: of_type(leaf, types), at)
@@ -426,24 +427,24 @@ class CutPotential(eqx.Module):
         return np.array(made).swapaxes(0, 1)
 
     def astype(self, dtype) -> CutPotential:
-        """Parameters as jax arrays of the given dtype."""
+        """Return the potential with parameters as jax arrays of the given dtype."""
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), self)
 
 
 class Channels(eqx.Module):
-    """A sum of cut potentials with different radii: a decision of every pair for each.
+    """Sum of cut potentials with different radii, with one decision per pair for each radius.
 
-    The kind of a decision is the pair type, plus the number of pair types for each channel before its own.
+    The kind of a decision is the pair type plus the number of pair types in all previous channels.
     """
 
     parts: tuple[CutPotential, ...]
 
     @classmethod
     def of_terms(cls, terms: Mapping[str, CutPotential], *, apart: bool = False) -> CutPotential | Channels:
-        """The sum of terms by name, those with the same radii in one channel; or each in its own, `apart`.
+        """Make the sum of terms by name; terms with equal radii share a channel, unless `apart`.
 
         Raises:
-            InputError: a name that is no part of a key.
+            InputError: a name cannot be used in a key.
         """
         for name in terms:
             if not name.replace("_", "").replace("-", "").isalnum():
@@ -477,7 +478,7 @@ class Channels(eqx.Module):
 
     @property
     def r_cut(self) -> Float[Array, "kinds"]:
-        """The cutoff of each kind of decision, length."""
+        """Cutoff radius of each kind of decision, length."""
         return jnp.concatenate([part.r_cut for part in self.parts])
 
     def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
@@ -493,12 +494,12 @@ class Channels(eqx.Module):
 def each_term(
     model: CutPotential | Channels, change: Callable[[CutPotential], CutPotential]
 ) -> CutPotential | Channels:
-    """The model with every term changed by a function; outside jit."""
+    """Return the model after a function was applied to every term; outside jit."""
     made = {name: change(term) for name, term in model.terms.items()}
     return made[""] if "" in made else Channels.of_terms(made)
 
 
 def pair_type(first, second, species: int):
-    """Index of an unordered pair of species, counted along the rows of the upper triangle."""
+    """Return the index of an unordered pair of species, row by row in the upper triangle."""
     low, high = np.minimum(first, second), np.maximum(first, second)
     return low * species - low * (low - 1) // 2 + (high - low)

@@ -1,4 +1,4 @@
-"""Potentials of tetrahedral semiconductors: Stillinger and Weber's, and Tersoff's."""
+"""Stillinger-Weber and Tersoff potentials of tetrahedral semiconductors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _UNIT = 2.0**24
 class StillingerWeber(ManyBody):
     """Two- and three-body potential for tetrahedral semiconductors.
 
-    Smooth at its cutoff to every order: a flip changes neither energy nor force.
+    All derivatives are continuous at the cutoff: a flip changes neither the energy nor the forces.
 
     Source: Stillinger and Weber, Phys. Rev. B 31, 5262 (1985), eqs. 2.3 to 2.7; checked against a plain
     numpy evaluation of those equations (tests/support/oracles_manybody.py).
@@ -77,9 +77,9 @@ _LARGEST_EXPONENT = 69.0776
 class Tersoff(ManyBody):
     """Bond-order potential for one element; the constants default to silicon, set Si(C), "T3".
 
-    Energy and force go to zero at r_cut = R + D, the slope of the force does not: smooth to first order.
-    Where the crossing atom is a bond's only third neighbor the bond order starts as (r_cut - r)^(2n), so
-    for n < 1 the force is continuous but infinitely steep there (dilute silicon; not the crystal).
+    Energy and force go to zero at r_cut = R + D, but the derivative of the force jumps there. If the crossing
+    atom is the only other neighbor of a bond, the bond order varies as (r_cut - r)^(2n); for n < 1 the force
+    is then continuous with an infinite derivative (in dilute silicon, not in the crystal).
 
     Source: Tersoff, Phys. Rev. B 38, 9902 (1988), eqs. 1 to 3 and table I, in LAMMPS's notation; checked
     against ase.calculators.tersoff and a plain numpy evaluation (tests/support/oracles_manybody.py).
@@ -120,7 +120,7 @@ class Tersoff(ManyBody):
         return self.R + self.D
 
     def taper(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """1 up to R - D, 0 from R + D on, a quarter sine squared between (0 at the end to the last bit)."""
+        """Return the taper: 1 up to R - D, 0 beyond R + D, and a sine between (exactly 0 at the end)."""
         # (1 - sin(pi x / 2)) / 2 with x = (r - R) / D, in the form that does not cancel where it vanishes
         inward = jnp.clip((self.r_cut - r) / (2 * self.D), 0.0, 1.0)
         return jnp.sin(0.5 * np.pi * inward) ** 2
@@ -175,10 +175,10 @@ _SETS: dict[str, tuple[Any, dict[str, dict[str, Any]]]] = {
 def named(
     kind: str, parameters: str = "Si", pbc: tuple[bool, bool, bool] = (True, True, True)
 ) -> StillingerWeber | Tersoff:
-    """A potential of this name, "stillinger-weber" or "tersoff", with a named set of constants.
+    """Return the potential "stillinger-weber" or "tersoff" with a named set of constants.
 
     Raises:
-        InputError: no such set.
+        InputError: there is no such set.
     """
     made, sets = _SETS[kind]
     if parameters not in sets:

@@ -1,8 +1,8 @@
-"""Constant temperature by scaling all velocities alike: Nosé-Hoover chains and stochastic velocity rescaling.
+"""Thermostats that multiply all velocities by one factor: Nosé-Hoover chains and stochastic rescaling.
 
-A total momentum of zero stays zero, and how many degrees of freedom are left then decides the temperature
-(`Integrator.freedom`). Extra states are float64 whatever the dtype of positions and velocities. Velocities
-are scaled in float64, too: a factor near one that is rounded to float32 is wrong for all atoms alike.
+If the total momentum is zero, it stays zero; the number of degrees of freedom, which determines the
+temperature, is then smaller (`Integrator.freedom`). Extra states are always float64. Velocities are scaled in
+float64, too, because rounding a factor near one to float32 would cause the same relative error for all atoms.
 """
 
 from __future__ import annotations
@@ -29,19 +29,20 @@ class Chain(NamedTuple):
 
     @classmethod
     def at_rest(cls, links: int) -> Chain:
-        """The state of the chain before the first step."""
+        """Return the state of the chain before the first step."""
         return cls(jnp.zeros(links), jnp.zeros(links))
 
     def act(
         self, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
     ) -> tuple[Number, Chain]:
-        """The factor for the velocities and the new chain, after the chain has acted for a time.
+        """Return the factor for the velocities, and the chain, after the chain has acted for a time.
 
-        Each of three steps goes from the last link to the first, scales, and goes back (Tuckerman et al.,
-        J. Phys. A 39, 5629, 2006, the operator L_NHC); error O(time⁵).
+        Each of three substeps updates the links from last to first, scales the velocities, and updates the
+        links in reverse order (Tuckerman et al., J. Phys. A 39, 5629, 2006, the operator L_NHC); error
+        O(time⁵).
 
         Args:
-            kinetic: energy of what the chain holds, with its degrees of freedom; or of the box.
+            kinetic: kinetic energy of the atoms or the box, with the number of degrees of freedom.
             time: float64.
         """
         rate, way, scale = list(self.rate), list(self.way), jnp.ones(())
@@ -66,13 +67,13 @@ class Chain(NamedTuple):
         return scale, Chain(jnp.stack(rate), jnp.stack(way))
 
     def energy(self, freedom: int, kT: Number, relaxation: Number) -> Number:
-        """Energy of all links (eq. 2.8 of Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635)."""
+        """Return the energy of all links (eq. 2.8 of Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635)."""
         shares = jnp.ones(len(self.rate)).at[0].set(freedom)
         return kT * jnp.sum(shares * (0.5 * jnp.square(relaxation * self.rate) + self.way))
 
 
 class NoseHooverChain(Integrator):
-    """Canonical sampling with Nosé-Hoover chains: velocity Verlet between two half-steps of the chain.
+    """Canonical ensemble by Nosé-Hoover chains: velocity Verlet between two half-steps of the chain.
 
     Deterministic and time-reversible. Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635 (1992), integrated
     as in Tuckerman et al., J. Phys. A 39, 5629 (2006). A stiff system at low temperature may not be ergodic.
@@ -82,7 +83,7 @@ class NoseHooverChain(Integrator):
         ...                  dynamics={"relaxation": 0.2})
 
     Attributes:
-        kT: energy. relaxation: internal time, the thermostat's period over 2π. chain: links.
+        kT: energy. relaxation: period of the thermostat divided by 2π, internal time. chain: number of links.
     """
 
     name = "nose-hoover"
@@ -114,13 +115,13 @@ class NoseHooverChain(Integrator):
 def rescaled(
     key: Array, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
 ) -> Number:
-    """The factor for the velocities after an exact stochastic step of their kinetic energy.
+    """Return the factor for the velocities after an exact stochastic step of their kinetic energy.
 
-    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007), eqs. A7 and A8. Velocities that are all
-    zero stay so.
+    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007), eqs. A7 and A8. If all velocities are zero,
+    they stay zero.
 
     Args:
-        key: of this step alone. time: how long the thermostat acts.
+        key: random key of this step. time: time during which the thermostat acts.
     """
     for_one, for_others = jax.random.split(key)
     first = jax.random.normal(for_one, (), jnp.float64)
@@ -135,18 +136,18 @@ def rescaled(
 
 
 class CSVR(Integrator):
-    """Canonical sampling by stochastic velocity rescaling: velocity Verlet, then a random scale factor.
+    """Canonical ensemble by stochastic velocity rescaling: velocity Verlet, then a random scale factor.
 
-    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). Noise comes from a counter-based key folded
-    with the step, so two runs can share it and a resumed run continues it. Conserved is the effective energy
-    (their eq. 15): the total less the heat.
+    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). The noise is a function of the random key
+    and the step, so that two runs can have the same noise and a resumed run continues it. The effective
+    energy (their eq. 15), the total energy minus the heat, is conserved.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="csvr",
         ...                  dynamics={"relaxation": 0.1})
 
     Attributes:
-        kT: energy. relaxation: internal time, of the kinetic energy. key: random key.
+        kT: energy. relaxation: relaxation time of the kinetic energy, internal time. key: random key.
     """
 
     name = "csvr"
