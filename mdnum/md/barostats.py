@@ -1,11 +1,11 @@
-"""Constant pressure and temperature: Martyna-Tobias-Klein's barostat and stochastic cell rescaling.
+"""Constant pressure and temperature: the Martyna-Tobias-Klein barostat and stochastic cell rescaling.
 
-Both deform the box by its volume alone (`box = "isotropic"`) or in all six ways that do not rotate it
-("full"): rates and strains are numbers times the unit matrix, or symmetric matrices. The pressure is
-(2 K + virial) / 3 V with the kinetic energy K of the moment, as a tensor Π / V, Π = Σ m v ⊗ v + Σ r ⊗ F. Both
-sample volumes as exp(-(U + p V) / k_B T) dV, shapes of the full box evenly (dh / det(h)², det(h) = V). Where
-the total momentum is zero the center of mass has no share in the pressure, and the ideal gas has the mean
-volume N k_B T / p; else (N + 1) k_B T / p.
+Both barostats change only the volume of the box (`box = "isotropic"`), or all six parameters of its shape
+without a rotation ("full"). Rates and strains are numbers times the unit matrix, or symmetric matrices. The
+pressure is (2 K + virial) / 3 V with the instantaneous kinetic energy K; the pressure tensor is Π / V, Π = Σ
+m v ⊗ v + Σ r ⊗ F. Volumes are sampled with the weight exp(-(U + p V) / k_B T) dV, and full boxes h with the
+measure dh / det(h)², det(h) = V. If the total momentum is zero, the center of mass does not contribute to the
+pressure, and the mean volume of an ideal gas is N k_B T / p; otherwise it is (N + 1) k_B T / p.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ _TERMS = 14
 
 
 def growth(a: Rate) -> Rate:
-    """(exp(a) - 1) / a = Σ aᵏ / (k + 1)! of a number or (3, 3) matrix with norm up to 0.5.
+    """Return (exp(a) - 1) / a = Σ aᵏ / (k + 1)! for a number or (3, 3) matrix with norm up to 0.5.
 
-    For matrices, the characteristic polynomial is used: differentiable where eigenvalues agree.
+    For matrices, the characteristic polynomial is used, so that equal eigenvalues do not prevent
+    differentiation.
     """
     if a.ndim == 0:
         total = jnp.zeros(())
@@ -47,39 +48,39 @@ def growth(a: Rate) -> Rate:
 
 
 def invariants(a: Float[Array, "3 3"], square: Float[Array, "3 3"]) -> tuple[Number, Number, Number]:
-    """Coefficients of a³ = first a² - second a + third, of a matrix and its square."""
+    """Return the coefficients of a³ = first a² - second a + third, from a matrix and its square."""
     first = jnp.trace(a)
     second = 0.5 * (first**2 - jnp.trace(square))
     return first, second, a[0] @ jnp.cross(a[1], a[2])
 
 
 def times(a: Rate, b: Rate) -> Rate:
-    """The product of two rates, both numbers or both matrices."""
+    """Return the product of two rates, both numbers or both matrices."""
     return a @ b if a.ndim else a * b
 
 
 def exponential(a: Rate) -> Rate:
-    """exp(a) of a rate a of norm up to 0.5; exactly one where a is zero."""
+    """Return exp(a) for a rate a with norm up to 0.5; exactly one if a is zero."""
     return unit(a) + times(a, growth(a))
 
 
 def unit(a: Rate) -> Rate:
-    """The unit rate: the number one or the unit matrix."""
+    """Return the unit rate: the number one or the unit matrix."""
     return jnp.eye(3) if a.ndim else jnp.ones(())
 
 
 def trace(a: Rate) -> Number:
-    """The trace of the matrix (3, 3) that a rate is."""
+    """Return the trace of a rate as a (3, 3) matrix."""
     return jnp.trace(a) if a.ndim else 3 * a
 
 
 def matrix(a: Rate) -> Float[Array, "3 3"]:
-    """The rate as a matrix of shape (3, 3)."""
+    """Return the rate as a matrix of shape (3, 3)."""
     return a if a.ndim else a * jnp.eye(3)
 
 
 def acted(x: Vector, a: Rate) -> Vector:
-    """Product of vectors (as rows) and a rate, in float64."""
+    """Return the product of vectors (as rows) and a rate, in float64."""
     x = x.astype(jnp.float64)
     return transformed(x, a) if a.ndim else x * a
 
@@ -131,7 +132,7 @@ class Barostat(Integrator):
 
 
 def volume(cell: Cell) -> Number:
-    """Volume of a box, inside jit."""
+    """Return the volume of a box, inside jit."""
     a = cell.matrix
     if cell.orthorhombic:
         return jnp.abs(a[0, 0] * a[1, 1] * a[2, 2])
@@ -139,7 +140,7 @@ def volume(cell: Cell) -> Number:
 
 
 class BoxState(NamedTuple):
-    """The extra state that the integrator `MTK` carries."""
+    """Extra state of the integrator `MTK`."""
 
     rate: Rate  # of the box, one over time
     atoms: Chain  # thermostats of the atoms
@@ -148,20 +149,20 @@ class BoxState(NamedTuple):
 
 
 class MTK(Barostat):
-    """The isothermal-isobaric ensemble, deterministic and time-reversible.
+    """Deterministic, time-reversible sampling of the isothermal-isobaric ensemble.
 
-    Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), in the splitting of Tuckerman et al., J. Phys. A
-    39, 5629 (2006), eq. 38 and following: chains of the box and of the atoms, a kick of the box by its excess
-    pressure, a kick of the atoms, the drift in the box that grows, and back. The box has the inertia
-    (N_f + 3) k_B T τ_p² (a third of it where it is full) and one or six degrees of freedom. All of the drift
-    is exact: x' = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
+    Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), with the operator splitting of Tuckerman et al.,
+    J. Phys. A 39, 5629 (2006), eq. 38 ff.: thermostat chains of box and atoms, kick of the box by its excess
+    pressure, kick of the atoms, drift in the changing box, and the same operators in reverse order. The
+    inertia of the box is (N_f + 3) k_B T τ_p² (a third of this for a full box), and it has one or six degrees
+    of freedom. The drift is exact: x' = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
         ...                  integrator="mtk", dynamics={"relaxation": 0.2, "pressure_relaxation": 2.0})
 
     Attributes:
-        chain: links of each chain. box: "isotropic" or "full".
+        chain: number of links of each chain. box: "isotropic" or "full".
     """
 
     name = "mtk"
@@ -187,7 +188,7 @@ class MTK(Barostat):
         return v, extra._replace(rate=extra.rate * slowed, atoms=atoms, chain=chain)
 
     def _own(self, extra, masses):
-        """Kinetic energy of the box, and its degrees of freedom."""
+        """Return the kinetic energy of the box, and its degrees of freedom."""
         return 0.5 * self.inertia(masses) * jnp.sum(jnp.square(extra.rate)), 6 if self.anisotropic else 1
 
     def _pushed(self, v, extra, at, time):
@@ -199,7 +200,7 @@ class MTK(Barostat):
         return extra._replace(rate=extra.rate + time * share * push / self.inertia(at.masses))
 
     def _kicked(self, v, extra, at, time):
-        """Velocities after forces, and the friction of a growing box, have acted."""
+        """Return velocities after the forces, and the friction caused by the rate of the box, have acted."""
         rate = extra.rate
         slow = -time * (rate + trace(rate) / self.freedom(at.masses) * unit(rate))
         kick = acted(at.acceleration, time * growth(slow))
@@ -233,7 +234,7 @@ class MTK(Barostat):
 
 
 class Move(NamedTuple):
-    """The extra state of `CellRescaling`: the last move of the box and its effect."""
+    """Extra state of `CellRescaling`: the last move of the box and its effect."""
 
     strain: Rate  # logarithm of the deformation
     # root: of the volume before; step: of that root; force: on it, and excess: along the other directions,
@@ -246,14 +247,15 @@ class Move(NamedTuple):
 
 
 class CellRescaling(Barostat):
-    """The isothermal-isobaric ensemble by a box of first order in time: stochastic cell rescaling, with CSVR.
+    """Isothermal-isobaric ensemble by stochastic cell rescaling (first order in time), with CSVR.
 
-    Bernetti, Bussi, J. Chem. Phys. 153, 114107 (2020): the square root of the volume, whose noise does not
-    depend on it, takes an Euler step by the forces at hand, in the middle of a drift whose velocities shrink
-    as the box grows (their sec. II C). Of a full box (del Tatto, Raiteri, Bernetti, Bussi, Appl. Sci. 12,
-    1139, 2022) the traceless strain takes one too, with the noise of the geometric mean of both volumes. Each
-    move of the box has a reverse with a known probability, so that the total less heat and work is an
-    effective energy: it is conserved but for the error of the time step.
+    Bernetti, Bussi, J. Chem. Phys. 153, 114107 (2020): in the middle of the drift, the square root of the
+    volume, whose noise is independent of the volume, takes an Euler step with the present forces; velocities
+    are scaled inversely to the box (their sec. II C). In a full box (del Tatto, Raiteri, Bernetti, Bussi,
+    Appl. Sci. 12, 1139, 2022) the traceless strain also takes an Euler step, whose noise is computed from the
+    geometric mean of both volumes. The probabilities of each move and its reverse are known, so that the
+    total energy minus heat and work is an effective energy, which is conserved except for the error of the
+    time step.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -261,8 +263,8 @@ class CellRescaling(Barostat):
         ...                      "relaxation": 0.1, "pressure_relaxation": 1.0, "compressibility": 2.0})
 
     Attributes:
-        compressibility: length³/energy; only its ratio to pressure_relaxation matters, which is a rate of the
-            box and not of the ensemble. key: random key. box: "isotropic" or "full".
+        compressibility: length³/energy; its ratio to pressure_relaxation determines how fast the box changes,
+            but does not affect the ensemble. key: random key. box: "isotropic" or "full".
     """
 
     name = "cell-rescaling"
@@ -276,13 +278,14 @@ class CellRescaling(Barostat):
 
     @property
     def _mobility(self):
-        """Mobility of the square root of the volume."""
+        """Return the mobility of the square root of the volume."""
         return self.compressibility / (4 * self.pressure_relaxation)
 
     def _forces(self, v, at):
-        """Root of the volume, the force on it, and the excess along traceless directions (see `Move`).
+        """Return the root of the volume, the force on it, and the traceless part of the excess (see `Move`).
 
-        They are derivatives of k_B T ln of the density of that root, V^(1/2) exp(-(U + K + p V) / k_B T).
+        The forces are derivatives of k_B T times the logarithm of the density of this root, V^(1/2) exp(-(U +
+        K + p V) / k_B T).
         """
         root, excess = jnp.sqrt(volume(at.cell)), self.excess(v, at)
         part = trace(excess) / 3

@@ -1,9 +1,9 @@
-"""Integrators: what happens between one force evaluation and the next, and the one step that is made of it.
+"""Integrators: the update between two force evaluations, and the common step that uses it.
 
-A step is: forces at x_s, the second half of the step before (`finish`) to the full-step v_s, then the first
-half of the next (`begin`) to x_{s+1}. The state between steps is (x_{s+1}, v between the halves, extra), so
-a list that is used up is replaced before its forces are asked for, and a rollout can stop and resume at that
-point without evaluating anything twice.
+A step evaluates the forces at x_s, completes the previous step (`finish`), which gives the full-step velocity
+v_s, and makes the first half of the next step (`begin`), which gives x_{s+1}. The state between steps is
+(x_{s+1}, half-step velocity, extra). A neighbor list that is used up is therefore replaced before its forces
+are evaluated, and a rollout can stop and resume between steps without evaluating forces twice.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ Order = Int[Array, "atoms"]
 
 
 def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Array, "*rest atoms"]:
-    """Convert an array over a list's atoms from sorted order to the user's order."""
+    """Convert an array over atoms from the sorted order of a list to the order of the user."""
     return jnp.zeros_like(a).at[..., order].set(a)
 
 
 class ByAtom(NamedTuple):
-    """Array of an extra state whose last axis runs over atoms, sorted together with them."""
+    """Array in an extra state whose last axis is over atoms, and which is sorted together with them."""
 
     value: Array
 
 
 def by_atom(change: Callable[[Array], Array], extra: Any) -> Any:
-    """An extra state with a function applied to its per-atom arrays."""
+    """Apply a function to the per-atom arrays of an extra state."""
 
     def one(part: Any) -> Any:
         return ByAtom(change(part.value)) if isinstance(part, ByAtom) else part
@@ -64,7 +64,7 @@ _INSIDE = {
 
 
 def converted(field: Field[Any], value: Any, units: Units, *, back: bool = False) -> Any:
-    """A number of a file for a field of an integrator; the other way round with `back`."""
+    """Convert a number of a file to the unit of a field of an integrator, or back if `back` is true."""
     if (unit := field.metadata.get("unit")) not in _INSIDE:
         return value
     *ways, factor = _INSIDE[unit]
@@ -81,7 +81,7 @@ def quantity(
 
 
 class AtStep(NamedTuple):
-    """What an integrator may know of the step whose forces have just been evaluated; atoms sorted."""
+    """Data of a step whose forces have just been evaluated, for an integrator; atoms are sorted."""
 
     acceleration: Vector  # force/mass, in the dtype of the state
     virial: Number  # sum over pairs of r_ij · F_ij, energy, float64
@@ -96,15 +96,16 @@ class AtStep(NamedTuple):
 class Integrator(eqx.Module):
     """Base class: update of positions and velocities between force evaluations.
 
-    A system file has its fields as keys, but not those that are keywords only; `quantity` says which are no
-    pure numbers. A static field takes the value in the file as it is.
+    The fields, except keyword-only fields, are keys of a system file. A field with a unit is declared by
+    `quantity`. The value of a static field is not converted.
 
     Example:
         >>> class NoseHoover(mdnum.Integrator): ...  # examples/thermostat.py is a whole one
 
     Attributes:
         timestep: internal time.
-        constraints: degrees of freedom that the start has taken out for good; a simulation sets it.
+        constraints: number of degrees of freedom that the starting state removes permanently; set by a
+            simulation.
     """
 
     name: ClassVar[str]
@@ -128,7 +129,7 @@ class Integrator(eqx.Module):
 
     @classmethod
     def of_file(cls, table: Mapping[str, Any], units: Units) -> Integrator:
-        """The integrator that a table of a system file describes."""
+        """Make the integrator that a table of a system file describes."""
         made = {}
         for key, field in cls.keys().items():
             if (value := table.get(key)) is None:
@@ -140,56 +141,57 @@ class Integrator(eqx.Module):
 
     @property
     def random(self) -> Any:
-        """Its random key, an array; None without noise. eqx.tree_at may have something else in its place."""
+        """Random key, an array; None without noise. Inside eqx.tree_at it may be another object."""
         field = self.keys().get("seed")
         return None if field is None else getattr(self, field.name)
 
     def number(self, key: str, units: Units) -> float:
-        """Number of a field by its key, in the units of a system file."""
+        """Return the number of a field by its key, in the units of a system file."""
         field = self.keys()[key]
         return converted(field, float(getattr(self, field.name)), units, back=True)
 
     def with_number(self, key: str, value: Any, units: Units) -> Integrator:
-        """The integrator with another number for a key, without recompilation."""
+        """Return the integrator with another number for a key, without recompilation."""
         field = self.keys()[key]
         # of a numpy number: a Python one would make another compiled program (a weak type)
         inner = jnp.asarray(np.float64(converted(field, value, units)))
         return eqx.tree_at(lambda one: getattr(one, field.name), self, inner)
 
     def init(self, x: Vector, v: Vector, masses: Masses) -> Any:
-        """The extra state at the start: any pytree of arrays of numbers, those of atoms as `ByAtom`.
+        """Return the initial extra state: any pytree of numerical arrays; arrays over atoms are `ByAtom`.
 
         Args:
-            x, v: wrapped positions and velocities of step 0, user's order.
+            x, v: wrapped positions and velocities of step 0, in the order of the user.
         """
         return ()
 
     @abstractmethod
     def finish(self, v: Vector, extra: Any, at: AtStep, time: Number) -> tuple[Vector, Any]:
-        """Full-step velocities and the extra state then.
+        """Return full-step velocities and the extra state.
 
         Args:
-            v, extra: sorted velocities and the extra state, as `begin` and `deform` left them.
-            at: the step that they led to.
-            time: half a time step, in the dtype of v; 0 at step 0, which starts from full-step velocities.
+            v, extra: sorted velocities and extra state, as returned by `begin` and `deform`.
+            at: data of the present step.
+            time: half a time step, in the dtype of v; 0 at step 0, where the velocities are already full-step
+                velocities.
         """
 
     @abstractmethod
     def begin(self, x: Vector, v: Vector, extra: Any, at: AtStep) -> tuple[Vector, Vector, Any, Number]:
-        """Positions, velocities and extra state before the next force evaluation, and the heat taken up.
+        """Return positions, velocities, extra state for the next force evaluation, and the absorbed heat.
 
         Args:
             x, v: sorted positions and full-step velocities.
         """
 
     def deform(self, v: Vector, extra: Any, at: AtStep) -> tuple[Float[Array, "3 3"], Vector, Any]:
-        """How the box deforms on the way to the next force evaluation, after `begin`; by default not at all.
+        """Return the deformation of the box before the next force evaluation; by default none.
 
-        Lattice vectors and positions, as rows, are multiplied by what it returns: an integrator that has
-        positions move relative to the box adds that in `begin`.
+        The method is called after `begin`. Lattice vectors and positions, as rows, are multiplied by the
+        deformation; motion relative to the box belongs in `begin`.
 
         Args:
-            v, extra: sorted velocities and the extra state, as `begin` left them.
+            v, extra: sorted velocities and extra state, as returned by `begin`.
 
         Returns:
             the deformation, shape (3, 3), float64; velocities and extra state.
@@ -202,31 +204,31 @@ class Integrator(eqx.Module):
         return type(self).deform is not Integrator.deform
 
     def check(self, cell: Cell) -> None:
-        """Refuse a box or a word that it cannot work with, with an `InputError`; called once, on the host."""
+        """Raise `InputError` for an unsupported box or option; called once, on the host."""
 
     def freedom(self, masses: Float[Any, "atoms"]) -> int:
         """Degrees of freedom: three for each atom, less three where the total momentum was set to zero."""
         return max(3 * masses.shape[0] - self.constraints, 1)
 
     def kinetic(self, v: Vector, masses: Masses) -> Number:
-        """Kinetic energy of all atoms."""
+        """Return the kinetic energy of all atoms."""
         speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
         return 0.5 * jnp.sum(masses * speed2)
 
     @property
     def anisotropic(self) -> bool:
-        """Whether the integrator needs the virial tensor, which costs a sixth of a pair's work."""
+        """True if the integrator needs the virial tensor, which takes a sixth more time per pair."""
         return False
 
     @property
     def keeps_angles(self) -> bool:
-        """Whether `deform` returns a diagonal matrix, so that a box along x, y and z stays so."""
+        """True if `deform` returns diagonal matrices, so that an orthorhombic box stays orthorhombic."""
         return False
 
     def exchanged(self, extra: Any, at: AtStep) -> tuple[Number | float, Number | float]:
-        """Energy that the atoms owe to the extra state so far: heat of its thermostat, and work of its box.
+        """Return the energy transferred to the atoms so far: heat of the thermostat, and work of the box.
 
-        Potential and kinetic energy less both, and less the heat that `begin` returns, is conserved.
+        Potential plus kinetic energy, minus both terms and minus the heat returned by `begin`, is conserved.
         """
         return 0.0, 0.0
 
@@ -260,12 +262,13 @@ def one_step(
     *,
     wrap: bool = True,
 ) -> StepEnd:
-    """One step of molecular dynamics, from its forces to the positions of the next.
+    """Make one step of molecular dynamics, from its forces to the positions of the next step.
 
     Args:
         cell: the box, float64. masses: float64. made: the `Forces` at x.
-        x, v, extra: wrapped positions, and what `begin` left; at step 0 the start.
-        wrap: False for a derivative that knows no box, in which wrapping is a translation.
+        x, v, extra: wrapped positions, and velocities and extra state as returned by `begin`; at step 0, the
+            starting state.
+        wrap: False for derivatives without a box, for which wrapping is a translation.
     """
     dtype = x.dtype
     acceleration = made.force.astype(dtype) / masses.astype(dtype)
@@ -288,14 +291,14 @@ def one_step(
 
 
 class KickDrift(Integrator):
-    """A kick by the forces, then what does not know them: what most derivatives are written out for.
+    """Base class of integrators that consist of a kick by the forces and a drift independent of them.
 
     Example:
         >>> isinstance(mdnum.build("argon/langevin-500").integrator, mdnum.KickDrift)
         True
 
     Raises:
-        TypeError: a subclass has another kick, half step, extra state or box, which those would not see.
+        TypeError: a subclass overrides kick, half step, extra state or box, which derivatives would ignore.
     """
 
     def __init_subclass__(cls, **options: Any):
@@ -307,7 +310,7 @@ class KickDrift(Integrator):
             )
 
     def kick(self, v: Vector, time: Number, acceleration: Vector) -> Vector:
-        """Velocities after an acceleration has acted for a time."""
+        """Return velocities after an acceleration has acted for a time."""
         return v + time * acceleration
 
     def finish(self, v, extra, at, time):
@@ -322,11 +325,11 @@ class KickDrift(Integrator):
     def drift(
         self, x: Vector, v: Vector, masses: Masses, step: Step, order: Order
     ) -> tuple[Vector, Vector, Number]:
-        """As `begin`, after the kick; linear in x and v."""
+        """Advance as in `begin`, after the kick; linear in x and v."""
 
 
 def without_kick(integrator: Integrator) -> str | None:
-    """Why a derivative that is written out for a kick and a drift is not that of an integrator; else None."""
+    """Return why derivatives for a kick and a drift do not apply to an integrator; None if they do."""
     if type(integrator) in (VelocityVerlet, Langevin):
         return None
     if isinstance(integrator, KickDrift) and _is_linear(integrator):
@@ -352,7 +355,7 @@ def check_one_box(integrator: Integrator, what: str) -> None:
 
 
 def _is_linear(integrator: KickDrift) -> bool:
-    """Whether the drift has the same derivative (positions, velocities) at two places."""
+    """True if the drift has the same derivative (by positions and velocities) at two states."""
     x, v, dx, dv = jax.random.normal(jax.random.key(0), (4, 3, 4), jnp.float64)
     zero, order = jnp.zeros((), jnp.int64), jnp.arange(4)
 
@@ -379,8 +382,8 @@ class VelocityVerlet(KickDrift):
 class Langevin(KickDrift):
     """BAOAB (Leimkuhler & Matthews 2013): drift, exact Ornstein-Uhlenbeck step, drift.
 
-    Noise comes from a counter-based key folded with the step, so two runs can share it and a resumed run
-    continues it.
+    The noise is a function of the random key and the step, so that two runs can have the same noise and a
+    resumed run continues it.
 
     Example:
         >>> cut = mdnum.Cut("switched", 8.5)

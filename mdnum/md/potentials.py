@@ -322,7 +322,7 @@ class SumPotential(PairPotential):
 
 
 class Together(Cutoff):
-    """Terms that share a decision, each with its own end; onsets, energies and slopes are tuples."""
+    """Cutoffs of terms that share a decision; onsets, energies and slopes are tuples with one entry each."""
 
     def __init__(self, ends: tuple[Cutoff, ...]):
         self.ends = ends
@@ -348,7 +348,7 @@ class Together(Cutoff):
 
 
 class CutPotential(eqx.Module):
-    """A pair potential with its cutoff, or terms that share a decision: what the force loop evaluates."""
+    """A pair potential with its cutoff, or several terms that share a decision, for the force loop."""
 
     potential: PairPotential  # bare potential, parameters per pair type
     cutoff: Cutoff = eqx.field(static=True)  # how it ends
@@ -375,7 +375,7 @@ class CutPotential(eqx.Module):
 
     @property
     def rows(self) -> list[tuple[str, PairPotential, Cutoff, Any, Any]]:
-        """Of each term its name ("" of a plain potential), bare potential, end, onset and weights or None."""
+        """Name ("" for a single term), bare potential, cutoff, onset and weights or None of each term."""
         # eqx.tree_at looks at a tree whose empty tuples are leaves
         weights = self.weights if isinstance(self.weights, tuple) else ()
         if not isinstance(self.potential, SumPotential) or not isinstance(self.cutoff, Together):
@@ -421,7 +421,7 @@ class CutPotential(eqx.Module):
         return self.cutoff.cut(r2, u, w, here, *weights)
 
     def jumps(self) -> Float[np.ndarray, "2 terms types"]:
-        """Energy jump and radial force jump of a pair of weights 1 that enters, per term and pair type."""
+        """Return energy and radial force jump of an entering pair with weight 1, per term and pair type."""
         # in numpy: to jax each operation on these few numbers is a program to compile
         made = self.cutoff.jumps(jax.tree.map(np.asarray, self).at_cutoff())
         return np.array(made).swapaxes(0, 1)
