@@ -121,7 +121,7 @@ class Barostat(Integrator):
             raise InputError(message, where="dynamics.kind", remedy="Use nose-hoover, csvr or langevin")
 
     def excess(self, v: Vector, at: AtStep) -> Rate:
-        """Π - p V: twice the kinetic energy and the virial along each direction, less the pressure's."""
+        """Return Π - p V: kinetic and virial contributions by direction, minus those of the set pressure."""
         given = self.pressure * volume(at.cell)
         if not self.anisotropic:
             return (2 * self.kinetic(v, at.masses) + at.virial) / 3 - given
@@ -192,7 +192,7 @@ class MTK(Barostat):
         return 0.5 * self.inertia(masses) * jnp.sum(jnp.square(extra.rate)), 6 if self.anisotropic else 1
 
     def _pushed(self, v, extra, at, time):
-        """The rate of the box after its excess pressure and the atoms' kinetic energy have acted on it."""
+        """Return the rate of the box after the action of the excess pressure and the kinetic energy."""
         heat = 2 * self.kinetic(v, at.masses) / self.freedom(at.masses)
         push = self.excess(v, at) + heat * unit(extra.rate)
         # of an isotropic box the three directions together

@@ -207,7 +207,7 @@ class Integrator(eqx.Module):
         """Raise `InputError` for an unsupported box or option; called once, on the host."""
 
     def freedom(self, masses: Float[Any, "atoms"]) -> int:
-        """Degrees of freedom: three for each atom, less three where the total momentum was set to zero."""
+        """Return the degrees of freedom: three per atom, minus three if the total momentum is zero."""
         return max(3 * masses.shape[0] - self.constraints, 1)
 
     def kinetic(self, v: Vector, masses: Masses) -> Number:

@@ -1,10 +1,10 @@
-"""Sums over the neighbors of every atom in one compiled loop, for CPUs: what XLA calls instead of its own.
+"""Sums over the neighbors of every atom in one compiled loop, which XLA calls on a CPU.
 
-A function of one pair is traced by jax, and its operations are written down again in LLVM's language, on
-vectors of eight atoms. The numbers of an atom lie side by side, so that a neighbor is a load or two, and
-eight slots are summed in registers; XLA's loop over the same list gathers and computes in passes of their
-own. Nothing is contracted or reordered: of the same numbers the sums have the same bits on every processor.
-XLA reaches the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
+jax traces a function of one pair, and its operations are written as LLVM text for vectors of eight atoms. The
+data of an atom are contiguous, so that loading a neighbor takes one or two instructions, and eight slots are
+summed in registers; XLA's own loop gathers and computes in separate passes. No operation is contracted or
+reordered: equal input gives the same bits on every processor. XLA calls the loop through its foreign-function
+interface (xla/ffi/api/c_api.h, version 0.3).
 """
 
 from __future__ import annotations
@@ -89,23 +89,23 @@ def over_pairs(
     """Sum a function of pairs over the slots of every atom; inside jit, on a CPU.
 
     Args:
-        pair: of scalars: the atom's columns, its neighbor's, the pair's type (None where there is only one),
-            and the bit of each of the flags. Returns the terms to add and, with `margins`, the margin. May
-            close over numbers, and arrays with one for each type. In a slot of padding, which it need not
-            be asked for, the neighbor's columns are NaN and its terms must be 0.
+        pair: a function of scalars: the columns of the atom, those of its neighbor, the pair type (None if
+            there is only one), and the bit of each flag. It returns the terms to add and, with `margins`, the
+            margin. It may close over numbers, and over arrays with one entry per type. In padding slots, for
+            which it need not be called, the columns of the neighbor are NaN and the terms must be 0.
         columns: float64 numbers of each atom, in the order of the tables.
         tables: the list.
-        flags: bits of every slot, packed as decisions.
-        margins: ">" or ">=": how the margin of a pair that is decided to be inside compares with 0.
-        inverses: whether several quotients by powers of one number become products with its inverse, since a
-            processor divides slowly.
-        potential: whose operation is named if it is not known (`left_out`).
+        flags: bits of every slot, packed like decisions.
+        margins: ">" or ">=": comparison of the margin with 0 that holds for pairs inside.
+        inverses: whether several quotients by powers of one number are replaced by products with its inverse,
+            because divisions are slow.
+        potential: name under which an unsupported operation is reported (`left_out`).
 
     Returns:
-        None where the function has an operation that does not become one of vectors.
+        None if the function has an operation without a vector form.
 
-    Error: a rounding error for each operation (with `inverses` one more for each power of the inverse), for
-    elementary functions as in `numerics.elementary`; sums one after the other.
+    Error: one rounding error per operation (with `inverses` one more for each power of the inverse), and the
+    bounds of `numerics.elementary` for elementary functions; sums are sequential.
     """
     atoms, words = columns.shape[1], tables.index.shape[0]
     try:
@@ -132,7 +132,7 @@ def over_pairs(
 
 
 def left_out(potential: Any) -> str | None:
-    """jax's name of the operation that kept a potential out of the loop in this process; None for none."""
+    """Return jax's name of the operation for which a potential cannot use the loop; None if there is none."""
     return _LEFT_OUT.get(jax.tree.structure(potential))
 
 
@@ -144,14 +144,14 @@ class _NotKnown(Exception):
 
 
 class _Value(NamedTuple):
-    """What differs from pair to pair, by its name in the loop: a vector of numbers, or of decisions."""
+    """A value that differs between pairs, with its name in the loop: a vector of numbers or decisions."""
 
     name: str
     kind: str = "VEC"
 
 
 class _Written(NamedTuple):
-    """A loop's source, the numbers it is given, and how many terms it adds."""
+    """Source of a loop, its numerical arguments, and the number of terms that it adds."""
 
     loop: str
     constants: Array
@@ -194,14 +194,14 @@ _SHAPES = ("broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient")
 
 
 def _number(value: Any, kind: str = "VEC") -> str:
-    """A constant in LLVM's language, the same for all atoms of a vector."""
+    """Return a constant as LLVM text, the same for all atoms of a vector."""
     if kind != "VEC":
         return f"ALL[{'i1' if kind == 'BOOL' else 'i64'} {int(value)}]"
     return f"ALL[double 0x{struct.unpack('>Q', struct.pack('>d', float(value)))[0]:016X}]"
 
 
 def _whole_power(equation: Any, inputs: list[Any]) -> int:
-    """The exponent of a power that is made of products; 0 of anything else."""
+    """Return the exponent of a power that is computed by products; 0 for anything else."""
     name, y = equation.primitive.name, inputs[-1]
     if name in ("square", "integer_pow"):
         return equation.params.get("y", 2)
@@ -213,11 +213,11 @@ def _whole_power(equation: Any, inputs: list[Any]) -> int:
 def _written(
     pair: _Pair, columns: int, flags: int, margins: str | None, types: bool, inverses: bool
 ) -> _Written:
-    """The loop over eight slots of the atoms of a block, as a function `word`.
+    """Return the loop over eight slots of the atoms of a block, as a function `word`.
 
-    It is given how many atoms there are, the constants, how many atoms lie from one slot to the next, and
-    where rows begin: the atoms' own columns, flags, sums, decisions, types and neighbors of the first slot,
-    nearest margins so far, and the table of all atoms' numbers, one atom after the other.
+    Its arguments are the number of atoms, the constants, the distance in atoms from one slot to the next, and
+    the addresses of rows: the columns of the atoms, flags, sums, decisions, types and neighbors of the first
+    slot, nearest margins so far, and the table with the data of all atoms, one atom after the other.
     """
     number, truth = jax.ShapeDtypeStruct((), np.float64), jax.ShapeDtypeStruct((), np.bool_)
     kind = jax.ShapeDtypeStruct((), np.uint8) if types else None
@@ -425,7 +425,7 @@ def _written(
 def _divide_once(
     lines: list[str], quotients: Sequence[tuple[int, str, str]], powers: dict[str, tuple[str, int]]
 ) -> None:
-    """Make products of quotients by powers of one number, where there are several; see `_written`."""
+    """Replace several quotients by powers of one number by products with its inverse; see `_written`."""
     divisors = [powers.get(divisor, (divisor, 1)) for _, _, divisor in quotients]
     uses, known = Counter(base for base, _ in divisors), dict.fromkeys((base for base, _ in divisors), 0)
     for (place, dividend, _), (base, n) in zip(quotients, divisors, strict=True):
@@ -441,7 +441,7 @@ def _divide_once(
 
 
 def _same(single: str, value: str, name: str, kind: str) -> str:
-    """A vector with the same value in every lane."""
+    """Return a vector with the same value in every lane."""
     return (
         f"{name}.first = insertelement {kind} poison, {single} {value}, i64 0\n  "
         f"{name} = shufflevector {kind} {name}.first, {kind} poison, <WIDE x i32> zeroinitializer"
@@ -458,7 +458,7 @@ def _of_width(text: str, wide: int) -> str:
 
 
 def _listed(rows: int, margins: bool) -> list[str]:
-    """Whether any of a vector's atoms has a neighbor in eight slots; until then, decisions are no."""
+    """Test whether any atom of a vector has a neighbor in eight slots; initially all decisions are false."""
     lines = []
     for k in range(8):
         lines += [
@@ -483,7 +483,7 @@ def _listed(rows: int, margins: bool) -> list[str]:
 
 
 def _others(wide: int, columns: int, rows: int) -> list[str]:
-    """Numbers of the neighbors in a slot: loaded one neighbor after the other, four at a time, and turned."""
+    """Load the data of the neighbors in a slot, four numbers per load, and transpose them."""
     parts = -(-columns // 4)
     lines = [
         f"%at.WIDE = getelementptr i32, ptr %r{rows - 3}, i64 %from.WIDE",
@@ -586,7 +586,7 @@ define i64 @called(i64 %frame) {{
 
 @cache
 def _registered(source: str, cpu: str = "") -> str:
-    """The name by which XLA knows the loop of a source, for this processor or another by LLVM's name."""
+    """Register the loop of a source with XLA, for this or a named LLVM processor, and return its name."""
     name = f"mdnum_pairs_{cpu}{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     features = "" if cpu else llvm.get_host_cpu_features().flatten()
     machine = llvm.Target.from_default_triple().create_target_machine(
@@ -617,7 +617,7 @@ def _filled(out_at, n, value):
 
 @njit
 def _interleaved(columns_at, columns, atoms, table_at, apart):
-    """Numbers of one atom after the other, and those of an atom behind the last, which padding names."""
+    """Return the data of one atom after the other, and of one more atom, to which padding refers."""
     of = carray(pointer(columns_at), (columns * atoms,), np.float64)
     table = carray(pointer(table_at), ((atoms + 1) * apart,), np.float64)
     for k in range(atoms):
@@ -694,7 +694,7 @@ def _leave(job):
 
 
 def _help(job):
-    """The task that a helping thread runs."""
+    """Task of a helping thread."""
     _work(job)
     _leave(job)
     return 0
@@ -722,10 +722,10 @@ def _helped(job, frame, helpers, task):
 
 
 def _over_blocks(frame, word, task):
-    """Every block of atoms, as `over_pairs` asks for it; 0 for no error.
+    """Process all blocks of atoms for `over_pairs`; return 0 (no error).
 
     Args:
-        frame: address of XLA's frame of the call. word, task: of the loop over a word, and of `_help`.
+        frame: address of XLA's call frame. word, task: addresses of the loop over a word, and of `_help`.
     """
     if not asked_to_run(frame):
         return 0
@@ -756,7 +756,7 @@ def _over_blocks(frame, word, task):
 
 @cache
 def _driver() -> tuple[int, int]:
-    """Addresses of the loop over a list and of what helps it; compiled once after an installation."""
+    """Return the addresses of the driver and of its helper task; compiled once after an installation."""
     made = [
         cfunc(types.intp(*[types.intp] * count), function)
         for function, count in ((_over_blocks, 3), (_help, 1))

@@ -1,10 +1,10 @@
-"""The fast path: pair forces by gathers over a full list.
+"""Pair forces by gathers over a full neighbor list.
 
-Every pair is evaluated from both ends, so no result is scattered: each atom sums its own neighbors in a
-fixed order. In double precision on a CPU that is one compiled loop (`md.kernel`). Elsewhere XLA evaluates a
-group of slots for all atoms at once, which leaves its decisions as bits; temporaries never exceed a few
-arrays of four numbers per atom, which stay in the cache. The same expression over the whole (slots, atoms)
-array takes twice the time at 4,000 atoms and ten times at 32,000.
+Every pair is evaluated once for each of its atoms, so that there are no scattered writes: each atom sums over
+its neighbors in a fixed order. In double precision on a CPU, one compiled loop does this (`md.kernel`).
+Otherwise XLA evaluates a group of slots for all atoms at once and packs the decisions into bits; the
+temporary arrays have at most a few times four numbers per atom and stay in the cache. The same expression
+over the whole (slots, atoms) array takes twice as long at 4,000 atoms and ten times as long at 32,000.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class PairForce(eqx.Module):
 
     @classmethod
     def create(cls, model: Any, cell: Cell, decider: PairDecider, policy, reduction) -> PairForce:
-        """Parameters and box in the dtypes of the policy."""
+        """Make the force with parameters and box in the dtypes of the policy."""
         return cls(
             model.astype(policy.dtype("force")),
             cell.astype(np.float64),
@@ -95,12 +95,12 @@ class PairForce(eqx.Module):
         return self.policy.dtype("force").itemsize == 2
 
     def _in_force_dtype(self, x: Any) -> Float[Array, "..."]:
-        """A number as the force's dtype holds it; XLA would widen sixteen bits again without rounding."""
+        """Round a number to the dtype of the force; XLA would compute in a wider format than sixteen bits."""
         x = x.astype(self.policy.dtype("force"))
         return fence(x, self.zero) if self._short else x
 
     def judge(self, positions: Float[Array, "3 atoms"]) -> SlotJudge:
-        """The pair decider at these positions."""
+        """Return the pair decider at these positions."""
         return SlotJudge(self.decider, self.thresholds, self.cell, self.zero, positions)
 
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
@@ -117,11 +117,11 @@ class PairForce(eqx.Module):
 
     @property
     def _inside(self) -> str:
-        """Comparison of the margin with 0 for a pair inside the cutoff."""
+        """The comparison of the margin with 0 that holds for a pair inside the cutoff."""
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
     def _geometry(self, own, other, types):
-        """Displacement, its square, decision and margin of a pair in double precision."""
+        """Return displacement, squared distance, decision and margin of a pair in double precision."""
         d = self.cell.minimum_image(*(b - a for a, b in zip(own, other, strict=True)))
         r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
         quantity = jnp.sqrt(r2) if self.decider.space == "r" else r2
@@ -139,15 +139,16 @@ class PairForce(eqx.Module):
         given: UInt8[Array, "words atoms"] | None = None,
         where: UInt8[Array, "words atoms"] | None = None,
     ) -> Forces:
-        """Forces at sorted, wrapped positions.
+        """Return the forces at sorted, wrapped positions.
 
         Args:
             positions: shape (3, atoms), length, in the order of the tables.
             tables: the list.
             decisions, tensor: whether to return these too; forces have the same bits either way.
-            given: decisions to act on instead of the list's own (packed as those returned). The ones returned
-                are its own all the same, so that the two can be compared.
-            where: act on those given only at the slots whose bit is set here, and on its own elsewhere.
+            given: imposed decisions, packed like those returned. The returned decisions are always those of
+                the positions, so that both can be compared.
+            where: slots (as bits) in which decisions are imposed; in the other slots the own decisions are
+                used.
         """
         if self.in_one_loop(tables):
             made = _in_one_loop(self, positions, tables, given, where, decisions=decisions, tensor=tensor)
@@ -156,14 +157,14 @@ class PairForce(eqx.Module):
         return self.in_blocks(positions, tables, given, where, decisions=decisions, tensor=tensor)
 
     def in_one_loop(self, tables: Tables) -> bool:
-        """Whether `kernel.over_pairs` may sum over the list: double precision, few types of pairs, a CPU."""
+        """True if `kernel.over_pairs` can sum over the list: double precision, few pair types, on a CPU."""
         roles = ("force", "decision", "accumulate")
         wide = {self.policy.geometry, *map(self.policy.dtype, roles)} == {np.dtype(np.float64)}
         few = tables.types is None or self.model.pair_types <= _FEW_TYPES
         return wide and few and self.reduction == Sequential() and foreign.known()
 
     def _terms(self, tensor: bool) -> Callable[..., tuple[Float[Array, "..."], ...]]:
-        """Contributions of a pair to force, energy and virial, from its displacement, square and decision.
+        """Return contributions of a pair to force, energy and virial, from displacement, square and decision.
 
         Args:
             tensor: whether the virial has six components, in Voigt's order.
@@ -197,7 +198,7 @@ class PairForce(eqx.Module):
         decisions: bool,
         tensor: bool = False,
     ) -> Forces:
-        """As a call, in any precision, order and on any device."""
+        """Return the forces like `__call__`, in any precision and order and on any device."""
         judge, terms_of = self.judge(positions), self._terms(tensor)
         geometry, accumulate = self.policy.geometry, self.policy.dtype("accumulate")
         same = self.policy.dtype("decision") == geometry
@@ -236,14 +237,14 @@ class PairForce(eqx.Module):
 class ChannelForce(PairForce):
     """Forces of terms with different radii, evaluated one after the other over the same list.
 
-    Their decisions lie one behind the other along the words.
+    The decisions of the terms are concatenated along the axis of words.
     """
 
     model: Channels  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @property
     def parts(self) -> list[PairForce]:
-        """The pair force of each channel."""
+        """Pair forces of the channels."""
         thresholds = self.thresholds.reshape(len(self.model.parts), -1)
         rest = self.cell, self.zero
         return [
@@ -283,17 +284,17 @@ def _joined(parts: Sequence[Any]) -> Decisions:
 
 
 def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...]]:
-    """What multiplies each term's energy, as `CutPotential.evaluate` takes it; nothing without weights.
+    """Return the factors of the energies of all terms, for `CutPotential.evaluate`; none without weights.
 
     Args:
-        products: of the weights of both atoms, of the terms that have some.
+        products: products of the weights of both atoms, for terms with weights.
     """
     each = iter(products)
     return [tuple(None if one is None else next(each) for one in model.weights)] if model.weights else []
 
 
 def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) -> Forces:
-    """Forces from the sums of `PairForce._terms`, which count every pair at both its ends."""
+    """Return forces from sums of `PairForce._terms`, which count every pair once for each of its atoms."""
     fx, fy, fz, energy, *virial = sums
     half = jnp.asarray(0.5, energy.dtype)
     summed = [-jnp.sum(half * one, dtype=jnp.float64) for one in virial]
@@ -303,7 +304,7 @@ def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) 
 
 @eqx.filter_custom_jvp
 def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, decisions: bool, tensor: bool):
-    """As `PairForce.in_blocks` in one compiled loop; None where that is not known."""
+    """Compute the result of `PairForce.in_blocks` in one compiled loop; None if this is not possible."""
     terms_of = force._terms(tensor)
 
     def pair(own, other, types, *bits):
@@ -340,13 +341,13 @@ def _in_one_loop_jvp(primals, tangents, *, decisions: bool, tensor: bool):
 def imposed(
     inside: Bool[Array, "4 atoms"], given: UInt8[Array, "atoms"], where: UInt8[Array, "atoms"] | None
 ) -> Bool[Array, "4 atoms"]:
-    """The decisions that a group acts on: those given, where there are some, and else its own.
+    """Return the decisions on which a group acts: the imposed decisions, if there are any, or its own.
 
     A mask made of what is given alone lets the compiler work out distances twice, and one made slot by slot
     (`unpacked`) does not mend all of it: a step of 864 atoms takes 2.2 and 1.3 times a plain one, and 1.2 so.
 
     Args:
-        where: the slots in which the given ones count; None for all.
+        where: slots in which decisions are imposed; None for all.
     """
     shift = jnp.arange(GROUP, dtype=jnp.uint8)[:, None]
     other = inside ^ ((given[None, :] >> shift) & jnp.uint8(1) == 1)
@@ -354,7 +355,7 @@ def imposed(
 
 
 class Guarded(eqx.Module):
-    """A cut potential whose functions `how` changes: rounded after every operation, or reproducible."""
+    """A cut potential with modified arithmetic (`how`): rounded after every operation, or reproducible."""
 
     model: CutPotential
     zero: Int[Array, ""]
@@ -395,7 +396,7 @@ class ManyBodyForce(eqx.Module):
 
     @classmethod
     def create(cls, potential, cell: Cell, decider: PairDecider, policy: PrecisionPolicy) -> ManyBodyForce:
-        """The box as jax arrays, and the parameters in the force's dtype."""
+        """Make the force with the box as jax arrays, and parameters in the dtype of the force."""
         zero, dtype = zero_bits(policy.dtype("decision")), policy.dtype("force")
         if dtype != np.float64:
             potential = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, potential)
@@ -415,7 +416,7 @@ class ManyBodyForce(eqx.Module):
         given: UInt8[Array, "words atoms"] | None = None,
         where: UInt8[Array, "words atoms"] | None = None,
     ) -> Forces:
-        """Forces at wrapped positions; as PairForce, the whole energy counted on the first atom."""
+        """Return forces at wrapped positions, like `PairForce`; the first atom has the whole energy."""
         made = self.decide(positions, tables)
         bits = made.bits if given is None else given
         if given is not None and where is not None:
@@ -432,7 +433,7 @@ class ManyBodyForce(eqx.Module):
     def neighbors(
         self, positions: Float[Array, "3 atoms"], tables: Tables, bits: UInt8[Array, "words atoms"]
     ) -> Any:
-        """The list that the energy function receives: the pairs that are decided to be inside, no others."""
+        """Return the list for the energy function: only the pairs that are decided to be inside."""
         from mdnum.md import jaxmd
 
         own, atoms = self.potential, positions.shape[1]
@@ -464,7 +465,7 @@ class ManyBodyForce(eqx.Module):
         return self.policy.dtype("force")
 
     def placed(self, x: Float[Array, "atoms 3"], tables: Tables) -> Float[Array, "atoms 3"]:
-        """Sorted positions in the order in which the energy function knows its atoms."""
+        """Return sorted positions in the order of atoms that the energy function expects."""
         # an energy that takes all atoms for alike sees the table's sorted order
         return jnp.zeros_like(x).at[tables.order].set(x) if self.potential.labeled else x
 
@@ -476,7 +477,7 @@ class ManyBodyForce(eqx.Module):
         return lambda x, matrix, by: own.deformed(self.placed(x, tables), neighbor, matrix, by)
 
     def _differentiate(self, positions, tables: Tables, bits):
-        """Energy and its derivatives with respect to positions and strain."""
+        """Return the energy and its derivatives with respect to positions and strain."""
         neighbor = self.neighbors(lax.stop_gradient(positions), tables, bits)
         energy_of, matrix = self.energy_of(tables, neighbor), self.cell.matrix.astype(self.dtype)
         unit = jnp.eye(3, dtype=self.dtype)
@@ -505,8 +506,8 @@ class MdState(NamedTuple):
 class PairDynamics(eqx.Module):
     """Dynamics on a fixed list of pairs with imposed decisions.
 
-    For replays (one run handed the decisions of another) and for gradients at fixed decisions. A rollout
-    does the same in its compiled epochs, where the decisions are the list's own.
+    The class is used for replays, with the decisions of another run, and for gradients at fixed decisions. A
+    rollout makes the same steps in compiled epochs, with its own decisions.
     """
 
     force: PairForce  # the pair force
@@ -515,7 +516,7 @@ class PairDynamics(eqx.Module):
     tables: Tables  # the list
 
     def margins(self, state: MdState) -> Float[Array, "groups 4 atoms"]:
-        """Threshold minus quantity of every slot, positive inside; -inf for padding."""
+        """Return threshold minus quantity of every slot, positive inside; -inf for padding."""
         judge = self.force.judge(state.x)
         index, types = self.tables.groups()
 
