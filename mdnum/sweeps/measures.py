@@ -105,6 +105,8 @@ class Measure:
             further argument, "" if it was not given.
         sources: files that it depends on in addition to those of every point, as `points.digest` takes them:
             a stored value is valid as long as these files are unchanged.
+        check: function of the simulation, the number of steps and the argument, called before any run;
+            raises InputError for an argument that does not exist.
     """
 
     name: str
@@ -116,6 +118,7 @@ class Measure:
     world: Literal["md", "ball"] = "md"
     takes: str = ""
     sources: tuple[str, ...] = ()
+    check: Callable[..., Any] | None = None
 
     @property
     def digest(self) -> str:
@@ -408,7 +411,10 @@ def _named(word: str) -> Measure:
     found = MEASURES[name]
     if argument and not found.takes:
         raise InputError(f"--measure {word}: {name} takes no argument", remedy=f"Give {name}")
-    return replace(found, name=word, of=partial(found.of, argument=argument)) if found.takes else found
+    if not found.takes:
+        return found
+    check = found.check and partial(found.check, argument=argument)
+    return replace(found, name=word, of=partial(found.of, argument=argument), check=check)
 
 
 def _of_file(word: str) -> Measure:

@@ -131,6 +131,10 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
     table = "integrator" if world == "ball" else "dynamics"
     own_steps = getattr(loaded.spec, table).steps if filed else loaded.steps
     steps = own_steps if question.steps is None else question.steps
+    if checks := [measure.check for measure in measures if measure.check is not None]:
+        simulation = build(loaded) if filed else loaded
+        for check in checks:
+            check(simulation, steps)
     framed = any(measure.needs == "frames" for measure in measures)
     every = (question.save_every or max(1, steps // _FRAMES)) if framed else 0
     pace = float(own[f"{table}.timestep"])

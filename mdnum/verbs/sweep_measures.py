@@ -17,13 +17,18 @@ _FORKS, _GRADIENTS = ("forks/**/*.py",), ("forks/**/*.py", "gradients/**/*.py")
 _LOSS = "LOSS/PARAMETER"
 
 
+def _twin(simulation: Any, steps: int, argument: str) -> Any:
+    from mdnum.forks.choices import parse, twin_of
+
+    return twin_of(parse(argument or "start", "md"), simulation)
+
+
 def _pair(run: Sample, argument: str) -> Any:
     """The run and its twin, followed until they split: by default one coordinate starts an ulp away."""
     from mdnum.forks import fork
-    from mdnum.forks.choices import parse, twin_of
 
     if ("fork", argument) not in run.made:
-        twin = twin_of(parse(argument or "start", "md"), run.simulation)
+        twin = _twin(run.simulation, run.summary["steps"], argument)
         made = fork(twin, run.summary["steps"], counterfactual=False, repeats=0)
         run.made["fork", argument] = made
     return run.made["fork", argument]
@@ -53,24 +58,32 @@ def separation(run: Sample, argument: str) -> Value:
     return Value(float(grown.rate / found.twin.a.timestep))
 
 
-def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
-    """The diagnosis of a gradient as `grad` makes it, and the full name of the parameter."""
-    from mdnum.gradients import Problem, parameters
-    from mdnum.gradients.diagnose import diagnose
+def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
+    """The loss and the full name of the parameter that LOSS/PARAMETER names."""
+    from mdnum.gradients import parameters
     from mdnum.gradients.losses import parse
 
     word, slash, parameter = argument.rpartition("/")
     if not slash:
         remedy = "Write gradient=potential/sigma"
         raise InputError(f"{argument!r} is not of the form {_LOSS}", remedy=remedy)
+    name, *others = parameters.resolve(simulation, [parameter])
+    if others or np.ndim(parameters.value(simulation, name)):
+        raise InputError(f"{parameter} has several values", remedy="Name one of them")
+    return parse(word, simulation, steps), name
+
+
+def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
+    """The diagnosis of a gradient as `grad` makes it, and the full name of the parameter."""
+    from mdnum.gradients import Problem
+    from mdnum.gradients.diagnose import diagnose
+
     if argument not in run.made:
         steps = int(run.summary["steps"])
-        name, *others = parameters.resolve(run.simulation, [parameter])
-        if others or np.ndim(parameters.value(run.simulation, name)):
-            raise InputError(f"{parameter} has several values", remedy="Name one of them")
-        problem = Problem(run.simulation, parse(word, run.simulation, steps), steps)
+        loss, name = _asked(run.simulation, steps, argument)
         parts, methods = ("agreement", "trust"), ("event-aware", "symmetric")
-        run.made[argument] = diagnose(problem, (name,), parts=parts, methods=methods), name
+        found = diagnose(Problem(run.simulation, loss, steps), (name,), parts=parts, methods=methods)
+        run.made[argument] = found, name
     return run.made[argument]
 
 
@@ -100,5 +113,10 @@ for _name, _unit, _title, _of in (
     ("gradient", "", "derivative of a loss with respect to a parameter", gradient),
     ("horizon", "time", "time up to which that derivative is trusted", horizon),
 ):
-    _takes, _sources = ("CHOICE", _FORKS) if _of in (fork, split, separation) else (_LOSS, _GRADIENTS)
-    MEASURES.add(_name, Measure(_name, _unit, _title, _of, "simulation", takes=_takes, sources=_sources))
+    _takes, _sources, _check = (
+        ("CHOICE", _FORKS, _twin) if _of in (fork, split, separation) else (_LOSS, _GRADIENTS, _asked)
+    )
+    MEASURES.add(
+        _name,
+        Measure(_name, _unit, _title, _of, "simulation", takes=_takes, sources=_sources, check=_check),
+    )

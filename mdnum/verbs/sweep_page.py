@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.section import Code, Page, Plot, Section, Series, Table, table_of
+from mdnum.report.section import Code, Page, Plot, Section, Series, table_of
 from mdnum.report.words import listed, number
 from mdnum.sweeps.advice import FREE
 from mdnum.sweeps.design import label
@@ -18,11 +18,15 @@ from mdnum.units import named
 from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("sweep.py"))
+#: Most rows of a table, points of a plot, and values of a choice in a sentence: 10,000 settings have a page.
+_ROWS, _POINTS, _VALUES = 500, 300, 20
 
 
-def _shown(name: str) -> str:
-    """A measure's name without the folder of its file."""
-    return Path(name).name if ".py:" in name else name
+def _shown(view: View, name: str) -> str:
+    """A measure's name without the folder of its file, or with as much of it as tells it from the others."""
+    parts, others = Path(name).parts, [one["name"] for one in view.summary["measures"] if one["name"] != name]
+    ends = ["/".join(parts[-k:]) for k in range(1, len(parts))] if ".py:" in name else []
+    return next((end for end in ends if not any(one.endswith(f"/{end}") for one in others)), name)
 
 
 def _unit(view: View, name: str) -> str:
@@ -35,12 +39,9 @@ def _moved(view: View) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {axis["key"]: [] for axis in view.summary["axes"]}
     physical = {one["name"] for one in view.summary["measures"] if one["physical"]}
     for row in view.summary["differences"]:
-        if (
-            row["moves"] == "yes"
-            and row["measure"] in physical
-            and row["measure"] not in found[row["choice"]]
-        ):
-            found[row["choice"]].append(row["measure"])
+        measures, shown = found[row["choice"]], _shown(view, row["measure"])
+        if row["moves"] == "yes" and row["measure"] in physical and shown not in measures:
+            measures.append(shown)
     return found
 
 
@@ -81,19 +82,23 @@ def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
     for name in dict.fromkeys(one["measure"] for one in s["missing"]):
         mine = [one for one in s["missing"] if one["measure"] == name]
         values = {"settings": len(mine), "all": s["settings"], "why": mine[0]["why"][:400]}
-        yield TEXTS.finding("MEASURE_MISSING", measure=_shown(name), **values)
+        yield TEXTS.finding("MEASURE_MISSING", measure=_shown(view, name), **values)
     for key in FREE:
         if moved.get(key):
             yield TEXTS.finding("FREE_CHOICE_MOVES", key=key, measures=listed(moved[key]))
     for advice in s["advice"]:
         if advice["converged"] is False and advice["choice"] not in FREE:
-            worst = advice["settings"][1]["worst"]
+            worst = _shown(view, advice["settings"][1]["worst"])
             values = {"key": advice["choice"], "end": advice["end"], "next": advice["settings"][1]["value"]}
             yield TEXTS.finding("NOT_CONVERGED", section="What to use", measure=worst, **values)
     if (joint := s["joint"]) is not None and joint["inside"] is False:
         values: Any = {name: _keyed(view, joint[name]) for name in ("setting", "end")}
-        yield TEXTS.finding("JOINT_OUTSIDE", section="What to use", measure=_shown(joint["worst"]), **values)
-    unknown = sorted({row["measure"] for row in s["differences"] if row["moves"] == "undecided"})
+        yield TEXTS.finding(
+            "JOINT_OUTSIDE", section="What to use", measure=_shown(view, joint["worst"]), **values
+        )
+    unknown = sorted(
+        {_shown(view, row["measure"]) for row in s["differences"] if row["moves"] == "undecided"}
+    )
     if unknown:
         yield TEXTS.finding("NO_ERROR", measures=listed(unknown))
 
@@ -108,7 +113,7 @@ def _advised(view: View, advice: Mapping[str, Any]) -> str:
     if undecided is not None and undecided["more"]:
         more = max(1, int(np.ceil(seeds * (undecided["more"] - 1))))
         return TEXTS("use_undecided", key=key, best=best, value=undecided["value"], more=more,
-                     measure=undecided["worst"])  # fmt: skip
+                     measure=_shown(view, undecided["worst"]))  # fmt: skip
     if best == end:
         return TEXTS("use_end", key=key, end=end)
     return TEXTS("use", key=key, best=best, end=end)
@@ -124,7 +129,7 @@ def _together(view: View) -> list[str]:
         return [TEXTS("together", **values)]
     more = int(np.ceil(len(view.summary["seeds"]) * (joint["more"] - 1))) if joint["more"] else 0
     name = "together_undecided" if more > 0 else "together_unknown"
-    return [TEXTS(name, measure=_shown(joint["worst"]), more=max(1, more), **values)]
+    return [TEXTS(name, measure=_shown(view, joint["worst"]), more=max(1, more), **values)]
 
 
 def _keyed(view: View, setting: Sequence[str]) -> str:
@@ -147,36 +152,53 @@ def page(view: View, verdict: Verdict) -> Page:
 
 def _sections(view: View) -> Iterator[Section]:
     s = view.summary
-    yield Section("What moves what", [TEXTS("differences"), _differences(view)], terminal=True)
+    yield Section("What moves what", [TEXTS("differences"), *_differences(view)], terminal=True)
     if s["advice"]:
         told = TEXTS("settings", **_tolerances(view)) if s["tolerances"] else TEXTS("settings_none")
-        yield Section("What to use", [told, _settings(view)], terminal=True)
+        yield Section("What to use", [told, *_settings(view)], terminal=True)
     for axis in s["axes"]:
         yield Section(axis["key"], list(_plots(view, axis)))
-    yield Section("Every setting", [TEXTS("estimates"), _estimates(view)])
+    yield Section("Every setting", [TEXTS("estimates"), *_estimates(view)])
     if s["failed"]:
-        rows = [{**one, "settings": "; ".join(one["settings"])} for one in s["failed"]]
-        parts = [table_of(rows, {"points": "points", "settings": "settings", "why": "why"})]
-        yield Section("Points that failed", parts)
+        rows = [{**one, "settings": _several(one["settings"], "; ")} for one in s["failed"]]
+        columns = {"points": "points", "settings": "settings", "why": "why"}
+        yield Section("Points that failed", _most(rows, columns, "points.parquet"))
     yield Section(
         "Methods", [_methods(view), Code("methods.bib", TEXTS.entries["references"]["bib"].strip())]
     )
 
 
-def _differences(view: View) -> Table:
+def _most(
+    rows: Sequence[Any], columns: Mapping[str, str], stored: str, bad: Callable[[Any], Any] | None = None
+) -> list[Any]:
+    """A table of the first rows, with the place of all rows if there are more."""
+    more = [TEXTS("more_rows", shown=_ROWS, all=len(rows), stored=stored)] if len(rows) > _ROWS else []
+    return [*more, table_of(rows[:_ROWS], columns, bad=bad)]
+
+
+def _several(words: Sequence[str], separator: str = ", ") -> str:
+    """Words in a line; of many, the first and the last with their number."""
+    if len(words) <= _VALUES:
+        return separator.join(words)
+    return TEXTS("many_values", first=separator.join(words[:3]), last=words[-1], n=len(words))
+
+
+def _differences(view: View) -> list[Any]:
     rows = []
     ranked = sorted(view.summary["differences"], key=lambda row: -abs(row["sigmas"] or 0.0))
     for row in ranked:
-        unit = _unit(view, row["measure"])
+        unit, shown = _unit(view, row["measure"]), _shown(view, row["measure"])
         rows.append({
-            "measure": f"{row['measure']} ({unit})" if unit else row["measure"],
+            "measure": f"{shown} ({unit})" if unit else shown,
             "choice": f"{row['choice']} = {row['setting']}",
             "difference": row["value"], "error": row["error"],
             "in errors": row["sigmas"], "chance": row["chance"], "moves": row["moves"],
             "would have seen": row["detectable"],
         })  # fmt: skip
     names = ("measure", "choice", "difference", "error", "in errors", "chance", "moves", "would have seen")
-    return table_of(rows, {name: name for name in names}, bad=lambda row: row["moves"] == "yes")
+    return _most(
+        rows, {name: name for name in names}, "differences.parquet", lambda row: row["moves"] == "yes"
+    )
 
 
 def _tolerances(view: View) -> dict[str, str]:
@@ -187,7 +209,7 @@ def _tolerances(view: View) -> dict[str, str]:
     return {"tolerances": listed(told)}
 
 
-def _settings(view: View) -> Table:
+def _settings(view: View) -> list[Any]:
     rows = []
     for advice in view.summary["advice"]:
         for one in advice["settings"]:
@@ -198,13 +220,11 @@ def _settings(view: View) -> Table:
                 inside = "taken as converged"
             use = "use" * (one["value"] == advice["best"])
             rows.append({"choice": advice["choice"], "value": str(one["value"]), "within": inside,
-                         "by": one["worst"] or "", "": use})  # fmt: skip
+                         "by": _shown(view, one["worst"] or ""), "": use})  # fmt: skip
     if (joint := view.summary["joint"]) is not None:
         inside = {True: "yes", False: "no", None: "not decided"}[joint["inside"]]
-        setting = _keyed(view, joint["setting"])
-        rows.append(
-            {"choice": "together", "value": setting, "within": inside, "by": joint["worst"] or "", "": ""}
-        )
+        rows.append({"choice": "together", "value": _keyed(view, joint["setting"]), "within": inside,
+                     "by": _shown(view, joint["worst"] or ""), "": ""})  # fmt: skip
     columns = {
         "choice": "choice",
         "value": "value",
@@ -212,7 +232,7 @@ def _settings(view: View) -> Table:
         "kept out by": "by",
         "": "",
     }
-    return table_of(rows, columns)
+    return _most(rows, columns, "summary.json")
 
 
 def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
@@ -234,6 +254,7 @@ def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
         x = [value for value in values if label(value) in rows]
         if len(x) < 2:
             continue
+        x = [x[k] for k in np.unique(np.linspace(0, len(x) - 1, min(len(x), _POINTS)).astype(int))]
         y = np.array([rows[label(value)]["value"] for value in x], float)
         error = np.array([rows[label(value)]["error"] or np.nan for value in x], float)
         at = np.array(x, float)
@@ -242,7 +263,7 @@ def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
             Series("one standard error", at, y - error, "line", "muted", dashed=True),
             Series("", at, y + error, "line", "muted", dashed=True),
         ]
-        unit, shown = _unit(view, measure["name"]), _shown(measure["name"])
+        unit, shown = _unit(view, measure["name"]), _shown(view, measure["name"])
         # the name of a file: that of a measure may have "=" and "/"
         name = re.sub(r"[^A-Za-z0-9_]+", "-", f"{axis['key']}-{shown}")
         yield Plot(
@@ -252,20 +273,21 @@ def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
         )  # fmt: skip
 
 
-def _estimates(view: View) -> Table:
+def _estimates(view: View) -> list[Any]:
     keys = [axis["key"] for axis in view.summary["axes"]]
     rows = [
-        {**dict(zip(keys, one["setting"], strict=True)), "measure": one["measure"], "mean": one["value"],
-         "error": one["error"], "runs": one["runs"], "effective samples": one["effective"]}
+        {**dict(zip(keys, one["setting"], strict=True)), "measure": _shown(view, one["measure"]),
+         "mean": one["value"], "error": one["error"], "runs": one["runs"],
+         "effective samples": one["effective"]}
         for one in view.summary["estimates"]
     ]  # fmt: skip
     names = [*keys, "measure", "mean", "error", "runs", "effective samples"]
-    return table_of(rows, {name: name for name in names})
+    return _most(rows, {name: name for name in names}, "estimates.parquet")
 
 
 def _methods(view: View) -> str:
     s = view.summary
-    axes = "; ".join(f"{axis['key']}: {', '.join(map(label, axis['values']))}" for axis in s["axes"])
+    axes = "; ".join(f"{axis['key']}: {_several([*map(label, axis['values'])])}" for axis in s["axes"])
     return TEXTS(
         "methods", name=view.name, axes=axes, seeds=len(s["seeds"]), steps=s["steps"], design=s["design"]
     )

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
+from time import sleep
 from typing import Any
 
 import numpy as np
@@ -14,7 +18,9 @@ import mdnum
 from mdnum.errors import InputError
 from mdnum.sweeps.measures import chosen
 from mdnum.sweeps.plan import Question, planned
+from mdnum.sweeps.points import gone
 from mdnum.verbs import sweep_worker
+from mdnum.verbs.sweep_page import TEXTS
 
 
 @pytest.fixture(scope="module")
@@ -165,9 +171,43 @@ def test_recommended_values_are_run_together(tolerance, inside, tmp_path):
     assert ("JOINT_OUTSIDE" in [one.code for one in made.findings]) is not inside
 
 
+@pytest.mark.nightly
+def test_a_sweep_that_control_c_stopped_goes_on(tmp_path):
+    """Nothing is computed twice, and the claim of the point that was stopped is gone."""
+    options = [
+        "--over", "dynamics.timestep=0.002,0.003,0.004,0.006", "--seeds", "4", "--steps", "4000",
+        "--measure", "energy", "--workers", "1", "--points-in", str(tmp_path / "points"),
+    ]  # fmt: skip
+    command = [sys.executable, "-m", "mdnum", "sweep", "argon/crystal-108", *options, "--out"]
+    stored, claims = tmp_path / "points" / "workspace", tmp_path / "points" / "claims"
+    # as from a terminal, whatever this process does with the signal
+    first = subprocess.Popen(
+        [*command, str(tmp_path / "one")], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    while not (len([*stored.glob("*/point.json")]) >= 2 and [*claims.glob("*")]):
+        assert first.poll() is None
+        sleep(0.02)
+    first.send_signal(signal.SIGINT)
+    _, told = first.communicate(timeout=60)
+    assert first.returncode in (130, -signal.SIGINT)
+    assert TEXTS.entries["command"]["again"] in " ".join(told.split())
+    before = {file: file.stat().st_mtime_ns for file in stored.glob("*/point.json")}
+    assert 2 <= len(before) < 16 and not [claim for claim in claims.glob("*") if not gone(claim)]
+    subprocess.run([*command, str(tmp_path / "two")], check=True, capture_output=True)
+    summary = json.loads((tmp_path / "two" / "summary.json").read_text())
+    assert summary["found"] == len(before) and summary["computed"] == 16 - len(before)
+    after = {file: file.stat().st_mtime_ns for file in stored.glob("*/point.json")}
+    assert len(after) == 16 and before.items() <= after.items() and not [*claims.glob("*")]
+    assert not [*stored.glob(".*")]
+
+
 def test_what_cannot_be_swept_is_refused(simulation):
     refused: Any = (
         ({"cutoff.radios": [1.0]}, {}), ({}, {}), ({"neighbors.skin": [0.1]}, {"measure": "enthalpy"}),
+        ({"neighbors.skin": [0.1]}, {"measure": "energy,gradient=potental/sigma"}),
+        ({"neighbors.skin": [0.1]}, {"measure": "horizon=potential/sygma"}),
+        ({"neighbors.skin": [0.1]}, {"measure": "fork=ordre"}),
         ({"neighbors.skin": [0.1]}, {"on": "nowhere"}), ({"neighbors.skin": [0.1]}, {"seeds": []}),
     )  # fmt: skip
     for over, more in refused:
