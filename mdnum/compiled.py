@@ -15,7 +15,7 @@ if numba.config.DISABLE_JIT:  # pyright: ignore
         remedy="Unset NUMBA_DISABLE_JIT",
     )
 
-#: What the command line says of a process that could not keep everything.
+#: Note of the command line for a process that could not store all compiled functions.
 NOT_KEPT = (
     "what was compiled cannot be kept, so that every command compiles it again: neither the installation nor "
     "a cache folder can be written. Set XDG_CACHE_HOME or NUMBA_CACHE_DIR to a folder that can be written."

@@ -13,7 +13,7 @@ from typing import TypeVar
 from mdnum.errors import InputError
 
 T = TypeVar("T")
-#: Seconds past a deadline after which a call in progress is interrupted.
+#: Seconds after the deadline at which a call in progress is interrupted.
 GRACE = 10.0
 
 

@@ -32,7 +32,7 @@ def shipped_systems() -> list[str]:
     return sorted(path.relative_to(root).with_suffix("").as_posix() for path in root.glob("*/*.toml"))
 
 
-#: What every document of an answer has, besides `schema` and `kind`.
+#: Keys of every document of a result, in addition to `schema` and `kind`.
 HEAD = ("status", "seconds", "headline", "verdict", "findings")
 
 

@@ -51,7 +51,7 @@ LJ = Units("lj", "σ", "ε", "m", "τ", "ε/k", "ε/σ³", 1.0, 1.0, 1.0)
 BALL = Units("ball", "m", "m²/s²", "", "s", "", "", 1.0, 1.0, 1.0)
 
 _QUANTITIES = re.compile("length|energy|mass|time|temperature|pressure|decision|loss|parameter")
-#: In text, where the names of units come in when it is written.
+#: Placeholders in texts, which are replaced by the names of units when the text is written.
 ENERGY, LENGTH = "{units.energy}", "{units.length}"
 FORCE = f"{ENERGY}/{LENGTH}"
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mdnum.ranges import DTYPES, smallest
 
-#: Roles that a tolerance has to do with, by what it is a tolerance of.
+#: Roles whose precision affects a tolerance, by the quantity of the tolerance.
 _ROLES = {
     "sum": ("decision", "accumulate", "state", "arithmetic"),
     "relative": ("decision",),

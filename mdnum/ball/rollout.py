@@ -173,7 +173,7 @@ def simulate(
     return BallRun(world=world, steps=steps, balls=balls, **{"history": None, **whole}, contacts=contacts)
 
 
-#: Shape of a step's counts, by the structure of a world and the number of balls.
+#: Shape of the counts of a step, by the structure of a world and the number of balls.
 _COUNTS: dict[tuple[Any, int], tuple[int, ...]] = {}
 
 

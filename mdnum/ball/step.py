@@ -102,7 +102,7 @@ class Moved(NamedTuple):
     record: BallRecord
 
 
-#: Acceleration from height, velocity and the contact decision.
+#: Function that returns the acceleration from height, velocity and contact decision.
 Pull = Callable[[Balls, Balls, Touching], Balls]
 
 

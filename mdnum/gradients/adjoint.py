@@ -36,9 +36,9 @@ from mdnum.md.pairforce import ChannelForce, Forces, ManyBodyForce, PairForce, f
 from mdnum.md.potentials import Channels, of_type
 from mdnum.rollout.epoch import over_rows
 
-#: What a reverse pass can be asked for beyond positions: the parameters of the potential, a common factor of
-#: all distances, the forces themselves (for the derivatives by the integrator's numbers), weights of atoms;
-#: and a strain of all distances, which a box that moves needs.
+#: Gradients that a reverse pass can compute in addition to those with respect to positions: the parameters of
+#: the potential, a common factor of all distances, the forces themselves (for derivatives with respect to
+#: numbers of the integrator), weights of atoms, and a strain of all distances, which a changing box needs.
 MODEL, SCALE, FORCE, WEIGHT, STRAIN = "model", "scale", "force", "weight", "strain"
 ALL = frozenset((MODEL, SCALE, FORCE, WEIGHT))
 

@@ -32,7 +32,7 @@ from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 from mdnum.md.pairforce import PairForce
 from mdnum.systems.simulation import Simulation
 
-#: Widths of the kernel, each half of the one before.
+#: Widths of the kernel, each half of the previous width.
 WIDTHS = 5
 
 

@@ -57,7 +57,7 @@ class BallMethod(Method):
         return replace(made, depends={name: one.depends for name, one in use.items()})
 
 
-#: Methods by the names that system files give them; names take the options of the classes.
+#: Methods by their names in system files; a name may be followed by options of the class.
 BALL_METHODS: Registry[BallMethod] = Registry("gradient", "mdnum.ball_gradient_methods", BallMethod)
 for _name, _class in {
     "unrolled": "ball:ThroughIterations", "frozen": "ball:Frozen", "implicit": "ball_contacts:Implicit",

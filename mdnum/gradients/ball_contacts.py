@@ -21,13 +21,13 @@ from mdnum.gradients.ball import BallMethod, Use, used
 from mdnum.gradients.problem import Gradient
 from mdnum.numerics.saltation import carry, grazing
 
-#: Beyond this condition number a derivative of the fixed point means nothing in float64.
+#: Condition number above which a derivative of the fixed point is meaningless in float64.
 LIMIT = 1e12
-#: Steps that the soft floor of an impact must act for.
+#: Smallest number of steps during which the soft floor of an impact must act.
 _RESOLVED = 10
-#: Parameters of how a projection is solved, not of what it stands for.
+#: Parameters of the solver of a projection, which do not affect its exact solution.
 _SOLVER = ("k", "alpha", "tol", "enter")
-#: Which derivative that is of a spring, sharp or soft.
+#: Kind of derivative for a sharp and a soft spring.
 _SPRING = (
     "the derivative of the steps: a spring's force does not jump at a contact, so its time moves no "
     "tangent (the saltation matrix is 1)"

@@ -31,7 +31,7 @@ from mdnum.systems.simulation import Simulation
 if TYPE_CHECKING:
     from mdnum.gradients.tape import TapeStretch
 
-#: Crossings of one step that there is room for at least, as a power of two.
+#: Smallest capacity for the crossings of one step, as a power of two.
 _ROOM_BITS = 6
 
 

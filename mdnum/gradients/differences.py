@@ -34,20 +34,21 @@ from mdnum.numerics.roles import FIXED_POINT
 from mdnum.rollout.engine import FAILURES, Engine, unwrapped
 from mdnum.systems.simulation import Simulation
 
-#: The widest step that is tried, and the spacing of the values that the noise is estimated from in rounding
-#: errors of the parameter, as shares of it.
+#: Largest step, and spacing of the values from which the noise is estimated (in rounding errors of the
+#: parameter), relative to the parameter.
 _WIDEST, _SPACING = 1e-4, 64.0
-#: Relative rounding of a fixed-point integer state: an impulse is rounded to a share of its unit.
+#: Relative rounding error of a fixed-point state: an impulse is rounded to a fraction of its unit.
 _FIXED_POINT = 2.0**-30
-#: About the number of runs it takes to choose a step: for the noise, and for one or two steps.
+#: Approximate number of runs needed to choose a step: for the noise, and for one or two steps.
 _CHOOSING = 15
-#: Estimates of the noise by neighboring orders that are within this factor are believed.
+#: Estimates of the noise from neighboring orders are accepted if they agree within this factor.
 _AGREE = 4.0
-#: What a step is shrunk to at most at a time: a first truncation may be anything.
+#: Smallest factor by which a step is reduced at a time, because the first truncation error may be arbitrary.
 _MOST_SHRINK = 1e-3
-#: How often the spacing is widened where all values are the same; values of which a noise is estimated.
+#: Number of times that the spacing is increased if all values are equal; number of values for a noise
+#: estimate.
 _WIDENINGS, _POINTS = 4, 7
-#: How often a step is changed.
+#: Largest number of changes of a step.
 _TRIES = 4
 
 

@@ -429,7 +429,7 @@ def _kinetic(frame: LossFrame, around: LossContext) -> Float[Array, ""]:
     return 0.5 * jnp.sum(around.masses * speed2)
 
 
-#: Losses by the names that the command line gives them.
+#: Losses by their names on the command line.
 LOSSES: Registry[Loss] = Registry("loss", "mdnum.losses", Loss)
 for _loss in (
     MeanSquaredDisplacement, VelocityAutocorrelation, EinsteinDiffusion, GreenKuboDiffusion,

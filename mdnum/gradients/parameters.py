@@ -25,7 +25,7 @@ from mdnum.systems.simulation import Simulation
 
 __all__ = ["by", "is_weight", "unit", "value", "with_values"]
 
-#: Numbers of a system file that have no derivative, and why.
+#: Numbers of a system file without a derivative, and the reason.
 _INTEGERS = {
     "dynamics.seed": "it is the number of a noise, not a quantity",
     "dynamics.steps": "it is a whole number",

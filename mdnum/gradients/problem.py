@@ -20,12 +20,12 @@ from mdnum.md.pairforce import PairForce
 from mdnum.registry import Registry
 from mdnum.systems.simulation import Simulation
 
-#: Called with the steps done, all steps, and the name of the phase.
+#: Function that is called with the number of steps done, the total number, and the name of the phase.
 Progress = Callable[[int, int, str], None]
-#: What a method differentiates: the steps with decisions held fixed, the flow with the times of its flips,
-#: values between shifted runs, an average over runs or states, another program.
+#: Object that a method differentiates: steps at fixed decisions, the flow with shifted event times, values
+#: between shifted runs, an average over runs or states, or another program.
 Kind = Literal["steps", "flow", "values", "average", "other program"]
-#: Parameters by name, each of the shape of its value in the simulation.
+#: Parameters by name; each has the shape of its value in the simulation.
 Values = Mapping[str, Any]
 
 
@@ -182,7 +182,7 @@ class Method:
         return Gradient(self.name, self.description, value, gradient, notes or {}, details or {}, self.kind)
 
 
-#: Methods by the names that the command line gives them, in the order of tables.
+#: Methods by their names on the command line, in the order of tables.
 METHODS: Registry[Method] = Registry("method", "mdnum.gradient_methods", Method)
 for _name, _class in {
     "symmetric": "recorded:Symmetric", "forward": "recorded:Forward", "unrolled": "unrolled:Unrolled",
@@ -194,7 +194,7 @@ for _name, _class in {
     "boundary": "averages:BoundaryTerm",
 }.items():  # fmt: skip
     METHODS.add(_name, f"mdnum.gradients.{_class}")
-#: Names of what reverse mode keeps of its forward pass, which its method decides by the memory there is.
+#: Names of the data that a reverse pass stores from its forward pass, chosen by the available memory.
 _SPELLINGS = {"epochs": "unrolled", "recursive": "unrolled"}
 
 

@@ -38,15 +38,17 @@ from mdnum.systems.simulation import Simulation
 
 #: Default guard of event-aware gradients, as a share of the rms radial speed of a pair.
 GUARD = 1e-3
-#: Tangents that are carried at once; each costs a force evaluation a step, a reverse pass about three.
+#: Largest number of simultaneous tangents; a step of each costs one force evaluation, a step of a reverse
+#: pass about three.
 MOST = 64
 _SINGLE_FRAMES = (
     "the loss looks at energy or virial in single frames, and these jump with a flip: that has a slope in an "
     "average over frames at equal times alone"
 )
-#: Crossings of the largest weight that are named in the details.
+#: Number of crossings with the largest weights that are listed in the details.
 _NAMED = 10
-#: Called with every stretch of the reverse pass, last first, and what was carried at its steps.
+#: Function that is called with every stretch of the reverse pass, last first, and the gradients with respect
+#: to its states.
 Watch = Callable[[TapeStretch, AdjointCarry], None]
 
 

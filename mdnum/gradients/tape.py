@@ -31,9 +31,9 @@ from mdnum.rollout.epoch import over_rows
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.simulation import Simulation
 
-#: Bytes of recorded stretches that a tape keeps.
+#: Largest number of bytes of recorded stretches in a tape.
 KEPT = 2**29
-#: States of which a reversed run remembers a fingerprint, so that one that goes astray is found where it did.
+#: Number of states whose digests a reversed run stores, so that the step at which it fails can be found.
 _FINGERPRINTS = 256
 
 
@@ -103,7 +103,7 @@ class TapeStretch:
         return self.cell_before if row < 0 else Cell.create(self.cell[row], cell.pbc)
 
 
-#: Columns of a record that a tape keeps.
+#: Columns of a record that are stored in a tape.
 _COLUMNS = ("x", "v", "images", "bits", "potential", "virial", "cell", "inputs")
 
 

@@ -37,10 +37,10 @@ from mdnum.md.neighbors import PairTable, check_radius
 from mdnum.rollout.engine import first_state
 from mdnum.rollout.flips import fingerprint_of_bits
 
-#: Steps of a chunk, at most.
+#: Largest number of steps of a chunk.
 CHUNK = 16
-#: Bytes that the reverse function of a chunk may keep by a rough count, and what it keeps for each slot of a
-#: list and step by that count.
+#: Approximate limit on the bytes that the reverse function of a chunk stores, and the estimated bytes per
+#: slot of a list and step.
 _CHUNK_BYTES, _PER_SLOT = 2**28, 256
 
 
@@ -361,7 +361,7 @@ class Unrolled(Method):
         return self.result(float(value), gradient, notes, details)
 
 
-#: A digest of the state, and one of the pairs inside, by step, whatever the order of atoms and lists.
+#: Digests of the state and of the pairs inside, by step, independent of the order of atoms and lists.
 Marks = dict[int, tuple[bytes, tuple[int, int]]]
 
 

@@ -24,7 +24,8 @@ from mdnum.md.integrators import AtStep, Integrator, Number, Vector, quantity
 from mdnum.md.thermostats import Chain, rescaled
 
 Rate = Float[Array, "..."]  # a number, or a symmetric matrix (3, 3), float64
-#: Terms of the series below, whose error is less than a rounding up to an argument of 0.5.
+#: Number of terms of the series below, whose truncation error is less than a rounding error for arguments up
+#: to 0.5.
 _TERMS = 14
 
 

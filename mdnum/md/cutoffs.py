@@ -130,7 +130,7 @@ class Cutoff(ABC):
         return hash((type(self), *vars(self).values()))
 
 
-#: Derivatives of the energy by r² that `check` examines, by order.
+#: Derivatives of the energy with respect to r² that `check` examines, by order.
 _DERIVATIVES = ("energy", "slope", *(f"derivative {order} by r²" for order in range(2, 7)))
 _ORDERS = len(_DERIVATIVES) - 1
 
@@ -209,7 +209,7 @@ def _ends(made: Cutoff, power: int) -> bool:
     return ends
 
 
-#: Every cutoff by its name; a package adds one by an entry point of this group.
+#: All cutoffs by name; a package can add one by an entry point of this group.
 CUTOFFS: Registry[Cutoff] = Registry("cutoff", "mdnum.cutoffs", kind=Cutoff, check=check)
 
 

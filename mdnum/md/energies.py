@@ -26,9 +26,9 @@ from mdnum.md.manybody import ManyBody
 
 _LISTS = ("neighbor", "neighbors", "nbrs", "nlist", "neighbor_list", "nbr_list")
 _GRAPHS = ("graph", "graphs", "graphs_tuple", "batch")
-#: Keywords by which a function can learn the box and its strain.
+#: Keyword arguments through which a function may receive the box and its strain.
 KEYWORDS = ("cell", "box", "perturbation")
-#: Units of length in Å and of energy in eV that a function may be written in.
+#: Supported units of functions: length in Å and energy in eV.
 LENGTHS: Mapping[str, float] = {"Å": 1.0, "angstrom": 1.0, "nm": units.nm, "bohr": units.Bohr}
 ENERGIES: Mapping[str, float] = {
     "eV": 1.0, "meV": 1e-3, "kcal/mol": units.kcal / units.mol, "kJ/mol": units.kJ / units.mol,

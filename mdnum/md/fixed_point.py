@@ -42,7 +42,7 @@ from mdnum.md.potentials import CutPotential, of_type
 from mdnum.numerics import Threshold
 from mdnum.numerics.exact import fence, normal_quantile, reproducible, squared_norm, zero_bits
 
-#: Listed distances are below 2^30 spacings: three of their squares fit a 64-bit integer.
+#: Distances in a list are below 2^30 spacings, so that the sum of three squares fits a 64-bit integer.
 REACH_BITS = 30
 # beyond all their squares, and with one of them subtracted still a 64-bit integer
 _NOWHERE = 2**62

@@ -31,7 +31,7 @@ def known() -> bool:
     return version == VERSION and jax.default_backend() == "cpu" and np.intp().itemsize == 8
 
 
-#: What XLA calls must outlive every program.
+#: Objects that XLA calls, which must exist as long as any program.
 ALIVE: list[Any] = []
 
 

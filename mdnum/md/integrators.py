@@ -53,7 +53,8 @@ def by_atom(change: Callable[[Array], Array], extra: Any) -> Any:
     return jax.tree.map(one, extra, is_leaf=lambda part: isinstance(part, ByAtom))
 
 
-#: How a number of a file becomes one inside mdnum, by its unit; how it comes back; the factor of the units.
+#: For each unit: conversion of a number in a file to internal units, the inverse conversion, and the factor
+#: of the units.
 _INSIDE = {
     "time": (mul, truediv, "time_factor"),
     "rate": (truediv, mul, "time_factor"),
@@ -109,9 +110,10 @@ class Integrator(eqx.Module):
     """
 
     name: ClassVar[str]
-    #: Whether a total momentum of zero stays zero.
+    #: Whether the integrator conserves a total momentum of zero.
     keeps_momentum: ClassVar[bool] = True
-    #: Steps after which the loop hands its state to the host, where the extra state needs that.
+    #: Number of steps after which the loop must return its state to the host, if the extra state requires
+    #: this.
     pause: ClassVar[Any] = None
     timestep: Float[Array, ""] = quantity("time")
     constraints: int = eqx.field(static=True, kw_only=True, default=0)
@@ -410,7 +412,7 @@ class Langevin(KickDrift):
         return x + half * kicked, kicked, heat
 
 
-#: Integrators by the name that system files give them.
+#: All integrators, by their names in system files.
 INTEGRATORS: Registry[Integrator] = Registry("integrator", "mdnum.integrators", kind=Integrator)
 for _scheme in (VelocityVerlet, Langevin):
     INTEGRATORS.add(_scheme.name, _scheme)

@@ -189,7 +189,7 @@ _LINES = {
     **{(name, "VEC"): f"call VEC @llvm.{of}.vWIDEf64(VEC {{}})" for name, of in _INTRINSICS.items()},
 }
 _COMPARISONS = {">": "ogt", ">=": "oge"}
-#: Of an array of one number they change nothing.
+#: Operations that do not change an array with one element.
 _SHAPES = ("broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient")
 
 

@@ -25,7 +25,7 @@ class Smoothness:
     force_jump: float  # largest jump of a force at one crossing, energy/length
 
 
-#: Nothing is promised.
+#: Smoothness about which nothing is known.
 _UNKNOWN = Smoothness(-1, float("nan"), float("nan"))
 
 

@@ -162,7 +162,7 @@ class JaxMdBuilder:
         return table, np.arange(atoms), occupancy
 
 
-#: Every way to search for neighbors, by its name; a package adds one by an entry point of this group.
+#: All neighbor searches by name; a package can add one by an entry point of this group.
 BUILDERS: Registry[ListBuilder] = Registry("list builder", "mdnum.builders")
 BUILDERS.add("host", HostBuilder())
 BUILDERS.add("jax-md", JaxMdBuilder())

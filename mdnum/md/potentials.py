@@ -28,8 +28,8 @@ from mdnum.registry import Registry
 if TYPE_CHECKING:
     PerType = Any
 else:
-    #: A constant of a pair potential: as a person gives it one number, or one for each pair of species; in a
-    #: simulation an array with one entry per pair type.
+    #: A parameter of a pair potential: in input, a number or a number for each pair of species; in a
+    #: simulation, an array with one entry per pair type.
     PerType = Float[Array, "types"] | float | int | Mapping[str, float]
 
 
@@ -51,9 +51,9 @@ class PairPotential(eqx.Module):
     """
 
     name: ClassVar[str]
-    #: Parameters that all pairs share, as the weights of a network: any pytree of arrays.
+    #: Parameters shared by all pairs, such as the weights of a network: any pytree of arrays.
     shared: ClassVar[Any] = ()
-    #: Parameters with one entry per species, by name; a pair has those of both its species.
+    #: Parameters with one entry per species, by name; for a pair, the values of both species are used.
     by_species: ClassVar[Any] = ()
 
     @abstractmethod
@@ -292,8 +292,8 @@ def _name_of(function: Callable[..., Any]) -> str:
     return getattr(function, "__name__", None) or type(function).__name__
 
 
-#: Every pair potential by its name; a package adds one by an entry point of this group. Its fields are the
-#: constants of a pair, as system files give them.
+#: All pair potentials by name; a package can add one by an entry point of this group. The fields of a class
+#: are the parameters of a pair, as in system files.
 POTENTIALS: Registry[PairPotential] = Registry("potential", "mdnum.potentials", kind=PairPotential)
 for _potential in (LennardJones, Morse, SoftSphere):
     POTENTIALS.add(_potential.name, _potential)

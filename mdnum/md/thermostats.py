@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from mdnum.md.integrators import Integrator, Number, quantity
 
-#: Weights of three steps of second order that make one of fourth (Yoshida, Phys. Lett. A 150, 262, 1990).
+#: Weights of three second-order steps that form a fourth-order step (Yoshida, Phys. Lett. A 150, 262, 1990).
 _FIRST = 1 / (2 - 2 ** (1 / 3))
 _WEIGHTS = (_FIRST, 1 - 2 * _FIRST, _FIRST)
 

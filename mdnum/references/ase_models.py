@@ -53,7 +53,7 @@ from mdnum.references.independent import (
 from mdnum.systems import System, build
 from mdnum.systems.simulation import Simulation
 
-#: Labels of the judges of a pair function, and of an energy function, that a person wrote.
+#: Labels of the reference calculations for a user-defined pair function and energy function.
 ITSELF, ENERGY = (
     "the function itself on ASE's neighbor list",
     "the energy function itself on ASE's neighbor list",

@@ -26,7 +26,8 @@ from mdnum.systems.evaluate import Evaluation
 from mdnum.systems.simulation import Simulation
 from mdnum.systems.structures import with_images
 
-#: What float64 must meet: relative energy of pair and of many-body potentials; forces over their scale.
+#: Tolerances for float64: relative energy of pair and of many-body potentials; forces relative to their
+#: scale.
 ENERGY_PAIR, FORCE, ENERGY_MANY_BODY = 1e-12, 1e-10, 1e-10
 LEPTON = 1e-10  # the same of LAMMPS's, which differentiates symbolically
 NUMPY, LAMMPS = "numpy", "LAMMPS"  # labels of third evaluations

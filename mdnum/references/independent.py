@@ -58,7 +58,8 @@ def edges_of(atoms: Atoms, reach: float) -> Edges:
     return _LAST[key]
 
 
-#: Edges that were asked for last: the two judges of a frame ask for the same, one after the other.
+#: Edges of the last request: the two reference calculations of a frame request the same edges one after the
+#: other.
 _LAST: dict[tuple[bytes | float, ...], Edges] = {}
 
 
@@ -211,7 +212,7 @@ _BARE: dict[type, Callable[..., tuple[ndarray, ndarray]]] = {
 class PairModel(Model):
     """A pair potential with any cutoff for each pair of species, or a sum of several such potentials."""
 
-    #: of each term its forms (see `pair_forms`) and the weights of the atoms, None for 1
+    #: for each term, its forms (see `pair_forms`) and the weights of the atoms, None for 1
     terms: Sequence[tuple[Mapping[tuple[str, str], PairForm], Any]]
 
     @classmethod

@@ -28,7 +28,7 @@ from mdnum.references.independent import ClassicalCalculator
 from mdnum.safe_path import environment, python
 from mdnum.systems.simulation import Simulation
 
-#: jax's operations in the words of lepton, whose step(0) is 1.
+#: Operations of jax as lepton expressions; in lepton, step(0) is 1.
 _WORDS = {
     **{
         name: f"{name}({{}})"
@@ -49,7 +49,7 @@ _WORDS = {
     "eq": "delta({} - {})", "ne": "1 - delta({} - {})", "and": "{} * {}", "or": "max({}, {})",
     "not": "1 - {}", "select_n": "select({0}, {2}, {1})",
 }  # fmt: skip
-#: Numbers that an expression may have written out: lepton holds what is used twice two times.
+#: Largest number of constants in an expression; lepton stores an expression that is used twice two times.
 _LARGEST = 100_000
 
 

@@ -77,7 +77,7 @@ class Scan:
     def __init__(self, steps: int, nearest: int = 0):
         self._most = nearest
         self.total = 0
-        #: Pairs that entered and left at each step.
+        #: Numbers of pairs that entered and left at each step.
         self.entered, self.left = np.zeros(steps, np.int64), np.zeros(steps, np.int64)
         self._alternates = True
         # (outside, inside): stays by their length
@@ -91,7 +91,7 @@ class Scan:
         # numbers of the terms that decide, by name
         self._terms: dict[str, int] = {"": 0}
         self._bits = 32  # of an atom's number
-        #: Rows nearest to their threshold in the order of the table, by column.
+        #: Rows nearest to their thresholds, in table order, by column.
         self.nearest: dict[str, np.ndarray] = {}
 
     def take(self, flips: Flips) -> None:

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from mdnum.report.words import count, number
 
-#: Rows that are there without a script, and on paper.
+#: Number of rows that are shown without a script and on paper.
 STATIC_ROWS = 20
 
 

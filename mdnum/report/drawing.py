@@ -32,21 +32,22 @@ LIGHT, DARK = ({role: colors[k] for role, colors in _THEMES.items()} for k in ra
 # figures are drawn in those of a light page; each is one role's, so it can be replaced in the finished file
 INK, MUTED, GRID, FIRST, SECOND, THIRD, BAD, _ = LIGHT.values()
 
-#: gid of text that stands on lines: it gets a rim in the color of the paper.
+#: gid of text on top of lines, which gets an outline in the background color.
 HALO = "halo"
 _RIM = "paint-order: stroke; stroke: var(--paper); stroke-width: 3px; stroke-linejoin: round;"
 
 FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Liberation Sans", "Helvetica Neue", Arial, sans-serif'
-#: Inches; the page scales it.
+#: Size in inches; the page scales figures.
 WIDTH = 7.2
-#: Points a line is thinned to; longer ones become an envelope of smallest and largest values.
+#: Largest number of points of a line; longer lines are replaced by an envelope of smallest and largest
+#: values.
 POINTS = 600
 _MARKERS = {"first": "o", "second": "s", "third": "^", "bad": "X", "muted": "D", "ink": "o"}
-#: Colors of a region's classes, in order: as a rule all is well, look here, do not.
+#: Colors of the classes of a region, in order: as expected, needs attention, not acceptable.
 _CLASSES = (THIRD, SECOND, BAD, FIRST, MUTED, INK)
-#: Bins across a figure; a screen has not many more pixels there.
+#: Number of bins across a figure, about the number of pixels of a screen.
 BINS = 700
-#: Markers that a figure carries; more of them make a page heavy and nothing clearer.
+#: Largest number of markers in a figure; more of them would only make the page larger.
 MARKS = 1500
 
 

@@ -80,7 +80,7 @@ def brief(page: Page, verdict: Verdict, path: Path, verb: str) -> str:
     return printable(text, json_escape)
 
 
-#: Files beside a page that it links to.
+#: Files in the folder to which a report links.
 _LINKED = (".parquet", ".py", ".json", ".toml", ".extxyz", ".npz", ".traj")
 
 

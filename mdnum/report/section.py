@@ -116,7 +116,7 @@ class Series:
     dashed: bool = False  # for what is expected rather than measured
 
 
-#: Roles of lines that are drawn in order.
+#: Roles of lines, in drawing order.
 ROLES: tuple[Role, ...] = ("first", "second", "third", "bad", "ink", "muted")
 
 
@@ -228,7 +228,7 @@ class Figure:
     height: float = 3.0  # inches, of a width of `figures.WIDTH`
 
 
-#: What a section is made of; text is a paragraph.
+#: Content of a section; a text is a paragraph.
 Part = Any  # str | Table | Browse | Code | Plot | Figure
 
 

@@ -23,7 +23,8 @@ from mdnum.rollout.tracks import Track
 from mdnum.systems import parameters
 from mdnum.systems.simulation import Simulation
 
-#: A loss of the final state: of the simulation, unwrapped positions and velocities per internal time.
+#: Loss of the final state: a function of the simulation, unwrapped positions, and velocities per internal
+#: time.
 Loss = Callable[[Simulation, Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]], float]
 
 

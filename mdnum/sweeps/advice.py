@@ -11,10 +11,10 @@ import numpy as np
 from mdnum.sweeps.design import label
 from mdnum.sweeps.statistics import Within, within
 
-#: Choices that should change no result, and are taken for their speed.
+#: Choices that should affect no result; the fastest value is recommended.
 FREE = ("neighbors.skin", "neighbors.builder")
-#: The end at which an axis is converged: its largest value, its smallest, or none of both where a choice
-#: should change no result.
+#: The end of an axis at which results are converged: its largest value, its smallest value, a given value, or
+#: "any" for a choice that should affect no result.
 _ENDS = {
     "cutoff.radius": "largest", "cutoff.in_sigma": "largest", "dynamics.timestep": "smallest",
     "structure.repeat": "largest", "dynamics.steps": "largest", "tol": "smallest", "timestep": "smallest",

@@ -26,7 +26,7 @@ from mdnum.sweeps.statistics import (
 
 #: Value, error and degrees of freedom of a difference.
 Raw = tuple[float, float, float]
-#: By measure and setting.
+#: Values by measure and setting.
 Means = Mapping[tuple[str, Setting], SeedMean]
 _MOVES = {True: "yes", False: "no", None: "undecided"}
 

@@ -19,9 +19,9 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.systems.toml import scalar
 
-#: Most points of a sweep, and most values of one range.
+#: Largest number of points of a sweep, and of values of one range.
 MOST_POINTS, _MOST_VALUES = 100_000, 10_000
-#: Words for keys that belong together, with the values that they have by default.
+#: Words for groups of keys, with their default values.
 PRECISIONS = ("float64", "float32")
 _ROLES = {"md": ("state", "force"), "ball": ("state", "arithmetic", "decision")}
 _RANGE = re.compile(r"\s*([^:\s]+)\s*:\s*([^:\s]+)\s*:\s*([^:\s]+)\s*")

@@ -30,13 +30,15 @@ from mdnum.reading import whole_text
 from mdnum.safe_path import guard
 from mdnum.systems import toml
 
-#: Times that a task may take its process with it before it counts as failed; the last time it is alone.
+#: Number of times that the process of a task may die before the task counts as failed; the last time the task
+#: runs alone.
 TRIES = 3
-#: Times in a row that an engine may fail without an answer before it is given up.
+#: Number of consecutive failures of an engine without a result after which the sweep ends.
 _IDLE = 10
-#: Tasks that an executor is given at a time, for each worker: a scheduler need not hold all of a sweep.
+#: Number of tasks per worker that are submitted to an executor at a time, so that a scheduler need not hold
+#: all tasks of a sweep.
 _AHEAD = 3
-#: Seconds between looks whether an engine that gives no answer is there.
+#: Seconds between checks whether an engine that returns no results still exists.
 _LOOK = 5.0
 
 

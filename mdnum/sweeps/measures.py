@@ -19,12 +19,12 @@ from mdnum.registry import Registry
 from mdnum.sweeps.points import digest
 from mdnum.systems.code import function
 
-#: Stretches of a run whose scatter is the error of what is no mean over time.
+#: Number of blocks of a run, whose scatter gives the error of quantities that are not time averages.
 _BLOCKS = 8
-#: Bins of g(r), and the share of half the box's width that it reaches to.
+#: Number of bins of g(r), and its range as a share of half the width of the box.
 _BINS, _REACH = 200, 0.98
-#: S(k) reaches to so many times the cube root of the density, which is beyond its first peak (about 7), with
-#: so many reciprocal vectors in a shell.
+#: Range of S(k) in units of the cube root of the density, which includes its first peak (about 7), and number
+#: of reciprocal vectors per shell.
 _WAVES, _VECTORS = 10.0, 300
 
 
@@ -381,7 +381,7 @@ def iterations(run: Sample) -> Value:
     return Value(float(run.series["iterations"][1:].mean()), 0.0, np.inf)
 
 
-#: What is measured where nothing else is requested, by world.
+#: Default measures, by world.
 USUAL: Mapping[str, tuple[str, ...]] = {
     "md": ("energy", "pressure", "temperature", "drift", "flips"),
     "ball": ("final_height", "energy_kept", "bounces"),

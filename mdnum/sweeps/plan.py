@@ -15,9 +15,9 @@ from mdnum.sweeps.measures import USUAL, Measure, chosen
 from mdnum.sweeps.points import address_of, state_point
 from mdnum.systems.toml import flat
 
-#: Frames of a run that positions are measured from.
+#: Number of frames of a run from which positions are measured.
 _FRAMES = 200
-#: The labels of a setting, a value of each axis.
+#: Labels of a setting, one per axis.
 Setting = tuple[str, ...]
 
 

@@ -38,16 +38,16 @@ from mdnum.store.files import disk_errors, write_text
 from mdnum.systems.toml import flat
 
 STATE_POINT, RESULT = "signac_statepoint.json", "point.json"
-#: Seconds between the signs of life of a claim, and without one after which its process counts as gone where
-#: that cannot be told otherwise (on another machine).
+#: Seconds between updates of a claim file, and seconds without an update after which a process on another
+#: machine is assumed to have ended.
 _ALIVE, _GONE = 20.0, 180.0
 _CLAIM = re.compile(r"(?P<address>[0-9a-f]{32})\.(?P<number>\d+)")
-#: What computes points and measures; how they are compared and shown is another matter.
+#: Source files on which the results of points and measures depend; comparison and display do not affect them.
 _COMPUTES = (
     "compiled.py", "vectors.py", "bits.py", "numerics/**/*.py", "md/*.py", "ball/*.py", "systems/*.py",
     "rollout/*.py", "sweeps/measures.py",
 )  # fmt: skip
-#: Packages whose version changes what a point computes.
+#: Packages whose versions affect the results of a point.
 _ARITHMETIC = ("jax", "jaxlib", "numpy", "llvmlite")
 
 

@@ -15,12 +15,13 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-#: Chance of a false "moves" in a whole sweep, and of seeing a difference that is `detectable`.
+#: Probability of a falsely reported change in a whole sweep, and of detecting a difference of the size
+#: `detectable`.
 ALPHA, POWER = 0.05, 0.9
-#: Share of ALPHA that tests use. Correlation times are estimates, too: in 1,200 sweeps 4.8 % had a false
-#: one without it, and 4.1 % with it.
+#: Share of ALPHA that tests use, because correlation times are only estimated: in 1,200 sweeps 4.8 % had a
+#: false change without this factor, and 4.1 % with it.
 _SHARE = 0.8
-#: Chance of taking runs of one seed for correlated where they are not.
+#: Probability that uncorrelated runs of one seed are taken for correlated.
 _CHANCE_OF_SEEDS = 0.002
 K = TypeVar("K")
 Name = tuple[str, ...]

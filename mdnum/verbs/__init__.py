@@ -46,7 +46,7 @@ def _check(module: Any) -> None:
             raise ValueError(f"mdnum or another package has folders of kind {kind!r}")
 
 
-#: Modules by the command that they are of, and what they are about where a command has several.
+#: Modules by command, with the subcommand if a command has several.
 VERBS: Registry[Any] = Registry("verb", "mdnum.verbs", check=_check)
 for _name in (
     "run", "systems", "report", "fork", "sweep", "grad", "flips", "audit", "conform", "check", "doctor",
@@ -59,8 +59,8 @@ VERBS.add("fork map", "mdnum.verbs.fork_map")
 VERBS.add("fork certify", "mdnum.verbs.fork_certify")
 
 
-#: "status" in summary.json of a verb whose time was up: with a verdict on what was examined by then, or
-#: before there was enough for one. Others: complete, and what names another way to end (failed, stopped).
+#: "status" in summary.json if the time limit was reached: after enough tests for a verdict, or before. Other
+#: values are "complete" and the names of other ends ("failed", "stopped").
 PARTIAL, UNDECIDED = "partial", "undecided"
 
 

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from mdnum.systems.build_ball import BallSimulation
     from mdnum.systems.load import BallSystem
 
-#: Balls times steps of which every state is kept, and residuals of stop decisions kept.
+#: Largest number of balls times steps for which every state, and the residuals of stop decisions, are stored.
 _STATES, _RESIDUALS = 20_000_000, 5_000_000
-#: Relative difference from which on two derivatives disagree.
+#: Relative difference above which two derivatives count as different.
 _DISAGREE = 0.01
-#: Variants that a finding names one by one.
+#: Largest number of variants that a finding names individually.
 _NAMED = 4
 
 

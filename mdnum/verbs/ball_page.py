@@ -17,7 +17,7 @@ from mdnum.report.words import number
 from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("ball.toml"))
-#: Rows of a table that the page carries.
+#: Largest number of rows of a table in the report.
 TABLE_ROWS = 5_000
 _REASONS = ("", "none", "tolerance", "cap", "fixed", "not finite", "rest")
 

@@ -17,9 +17,9 @@ from mdnum.systems import ball
 from mdnum.systems.build_ball import BallSimulation, BallVariant
 from mdnum.systems.load import BallSystem
 
-#: Balls whose heights are kept in the folder, and that are compared with the exact motion.
+#: Number of balls whose heights are stored in the folder and compared with the exact motion.
 FOLLOWED = 8
-#: Codes of `Reason`, from what says least to what says most about a step.
+#: Codes of `Reason`, in order of increasing importance for a step.
 _WORST = (Reason.NONE, Reason.FIXED, Reason.TOLERANCE, Reason.REST, Reason.CAP, Reason.NOT_FINITE)
 
 

@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 TEXTS = Texts(__file__)
-#: Roundoff by the name of the precision.
+#: Unit roundoff by name of the precision.
 PRECISIONS = {"float64": DOUBLE, "float32": SINGLE}
-#: Random cases that can be requested.
+#: Largest number of random cases.
 MOST_CASES = 100_000
-#: Times the rounding of float64 below which an error is no sign of float32.
+#: Errors below this multiple of the float64 rounding error are no evidence of float32.
 _SLIGHT = 2.0**16
-#: Areas of a list that is kept and brought up to date.
+#: Areas of tests for a list that is kept and updated.
 _IN_USE = ("motion", "wrapping", "strain", "rule")
 _RETURNS = "(i, j), (i, j, shift), (i, j, shift, distance) or a mapping with i and j: an entry for each pair"
 

@@ -27,7 +27,7 @@ from mdnum.verbs.frame import Keep, Outcome, Verb, View
 __all__ = ["Claim", "Demo", "Plot", "Region", "Series", "Table", "demonstrate", "names", "table"]
 
 TEXTS = Texts(__file__)
-#: Members of a list that are written out; of longer ones, the first and the last.
+#: Largest number of elements of a list that are printed; of longer lists, the first and last are printed.
 _LISTED = 16
 
 

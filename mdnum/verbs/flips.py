@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mdnum.trajectories.tracker import Groups
     from mdnum.trajectories.trajectory import Trajectory
 
-#: Frames within which a flip that is reversed is chatter, unless another number is asked for.
+#: Default number of frames within which a reversed flip counts as chatter.
 WINDOW = 5
 # seconds in units of time, and how far apart in seconds no simulation of atoms has its frames
 _SECONDS = {"fs": 1e-15, "ps": 1e-12, "ns": 1e-9, "μs": 1e-6, "s": 1.0}

@@ -16,15 +16,15 @@ from mdnum.report.words import count, listed, many, number, percent, plain
 from mdnum.verbs import flips_loop
 from mdnum.verbs.flips_shared import TEXTS, FlipsView, average, in_python, repeating, resolution
 
-#: Residues in a map of contacts.
+#: Largest number of residues in a map of contacts.
 SHOWN = 300
-#: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
+#: Share of flips that are undecided, missed or spurious because of the file, above which a warning is given.
 UNDECIDED = 0.02
-#: The same for flips lost between frames, and for those that are reversed at once.
+#: The same share for flips lost between frames, and for flips that are reversed immediately.
 LOST, CHATTER = 0.10, 0.15
-#: Share of contacts without a beginning or an end in the file above which that is view.
+#: Share of contacts whose beginning or end is not in the file above which this is reported.
 CENSORED = 0.5
-#: Fewer flips than this say nothing in shares.
+#: Smallest number of flips for which shares are given.
 FEW = 20
 # shares of flips hidden and made up that are not worth a number
 _HARDLY = 1e-3

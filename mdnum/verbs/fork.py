@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mdnum.systems import BallSystem, System
     from mdnum.systems.simulation import Simulation
 
-#: Screens every choice that there is, where one is asked for.
+#: Word that requests a screening of all choices.
 ALL = "all"
 
 

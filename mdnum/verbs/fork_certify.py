@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 TEXTS = Texts(__file__)
 
-#: Steps of each program, unless others are given: enough for every cause to show.
+#: Default number of steps of each program, sufficient to reveal every cause.
 PROGRAM_STEPS = 200
-#: A share of what double precision gains that counts as nothing, and bits of error that do.
+#: Share of the gain of double precision that counts as none, and the same for bits of error.
 _NOTHING, _NO_BITS = 0.05, 1.0
 _NARROW = ("float16", "bfloat16")
 

@@ -29,9 +29,10 @@ if TYPE_CHECKING:
 TEXTS = Texts(__file__)
 
 _INTERVAL = re.compile(r"^\s*([^=\s]+)\s*=\s*([^:\s]+)\s*:\s*([^:\s]+)\s*$")
-#: Flips that are listed of each kind.
+#: Largest number of listed flips of each kind.
 _LISTED = 10
-#: Jumps that are a smaller share of the range of the loss are shown once more, without its trend: a cubic.
+#: If jumps are smaller than this share of the range of the loss, a second figure shows the loss without its
+#: trend (a cubic).
 _VISIBLE, _TREND = 0.05, 3
 #: Boundaries closer than this share of the interval are numbered in the figure.
 _ROOM = 0.03

@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
     from mdnum.verbs.frame import View
 
-#: r² from which a separation counts as one exponential.
+#: Smallest r² of a fit for which a separation counts as exponential.
 FITS = 0.8
-#: Rows of the table of decisions that the page carries.
+#: Largest number of rows of the table of decisions in the report.
 TABLE_ROWS = 5_000
 SPACES = {"r2": "r²", "r": "r", "height": "minus the height", "residual": "tolerance minus residual"}
-#: A split that is expected is shown up to this multiple of the steps that were followed.
+#: An extrapolated split is shown up to this multiple of the number of steps.
 _BEYOND = 2.0
-#: The longest arrow, in cutoffs.
+#: Length of the longest arrow, in cutoffs.
 _ARROW = 0.5
 
 

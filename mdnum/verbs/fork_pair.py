@@ -19,14 +19,15 @@ if TYPE_CHECKING:
     from mdnum.systems import BallSystem, System
     from mdnum.systems.simulation import Simulation
 
-#: Steps of what makes hundreds of runs, or follows them by hand, unless more are given.
+#: Default number of steps of commands that make hundreds of runs or compute runs in exact arithmetic.
 FEW_STEPS = 500
-#: A tangent is carried for a share of the steps that were followed, but not for fewer nor for more than this:
-#: its step costs as much as six of a run, so it takes a tenth as long as the runs that are compared.
+#: Share of the steps of the runs for which a tangent is propagated, and the smallest and largest number of
+#: these steps. A step of a tangent takes as long as six steps of a run, so that the tangent takes a tenth of
+#: the time of the compared runs.
 _SHARE, _FEWEST, _MOST = 0.25, 400, 2_000
-#: Steps before and after the fork of which the deciding ball's heights are kept.
+#: Number of steps before and after the fork for which the heights of the deciding ball are stored.
 _BEFORE, _AFTER = 40, 80
-#: Columns of separation.parquet by the series that they hold, and those of molecular dynamics alone.
+#: Columns of separation.parquet by the stored series, and those that exist only for molecular dynamics.
 _SERIES = {
     "free": "B", "imposed": "B|A", "back": "A|B", "cross": "cross", "overridden": "overridden",
     "furthest": "furthest", "energy_a": "energy A", "energy_b": "energy B", "energy_imposed": "energy B|A",

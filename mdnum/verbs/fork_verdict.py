@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 TEXTS = Texts(Path(__file__).with_name("fork.py"))
 
-#: Titles of sections that findings name.
+#: Titles of sections to which findings refer.
 DECISION, TWO_BY_TWO, WHAT = (
     "The decision at the fork",
     "Whose decisions, whose arithmetic",

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 V = TypeVar("V", bound=Callable[..., Any])
 _LOGGER = logging.getLogger(__name__)
 
-#: Lines of log.txt for a phase of a run that is followed step by step.
+#: Approximate number of lines in log.txt for a phase that counts its steps.
 STEPWISE = 50
 
 

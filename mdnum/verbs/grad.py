@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
 
 ALL = "all"
-#: What is run where nothing was said about methods, and atoms times steps that are run for differences then.
+#: Default methods, and the largest number of atoms times steps for which differences are among them.
 _QUICK, AFFORDABLE = ("event-aware", "symmetric", "finite-differences"), 6_000_000
-#: Parts of a diagnosis that are always there, and those on request.
+#: Parts of a diagnosis that are always computed, and those computed on request.
 _PARTS, EDGES = ("agreement", "growth", "flips", "trust"), "edges"
 ALSO = ("spectrum", EDGES, "scaling")
-#: Parts that have a table, and its name; parts that the summary has, and what of each it leaves out.
+#: Parts of a diagnosis with a table, and its name; parts in the summary, and the keys that the summary omits.
 _TABLES = {"growth": "growth", "flips": "flip_contributions", "trust": "trust", "scaling": "scaling"}
 _BRIEF, _ROWS = ("growth", "flips", "spectrum", "scaling", "detective"), ("table", "turns", "columns")
-#: Entries of a derivative that summary.json has one by one; the file with those that have more.
+#: Largest number of entries of a derivative that summary.json lists; the file with longer derivatives.
 _FEW, ARRAYS = 6, "gradients.npz"
 _BALL_UNITS = {
     "k": "1/s²", "damping": "1/s", "eps": "m", "tol": "m", "gravity": "m/s²", "h": "s", "y0": "m",

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("grad.py"))
-#: Digits that are shown where nobody knows how many hold.
+#: Number of digits shown if the number of valid digits is unknown.
 _UNKNOWN = 2
-#: Rows of the table of flips that the page carries, and parameters that have a column there.
+#: Largest number of rows of the table of flips in the report, and of parameters with a column in it.
 TABLE_ROWS, _SHOWN = 2_000, 3
 
 
-#: Sentences about growth by its word; of other words by whether there is a rate.
+#: Keys of sentences on growth, by the kind of growth; for other kinds, by whether there is a rate.
 _GROWN = {"forward bounded, gradient not": "growing", "forward not bounded": "unbounded"}
 
 # -- derivatives as text -----------------------------------------------------------------------------

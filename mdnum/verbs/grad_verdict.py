@@ -15,11 +15,12 @@ from mdnum.verbs.frame import View
 from mdnum.verbs.grad_page import TEXTS, by, closeness, digits_note, digits_of, magnitude, slope
 from mdnum.verbs.run import function_findings
 
-#: Share of a derivative above which single flips decide it, and how many of them count as single.
+#: Share of a derivative above which it is regarded as dominated by single flips, and the largest number of
+#: such flips.
 _HEAVY, _SINGLE = 0.2, 3
-#: Share of the weight of all flips above which what the guard leaves out matters.
+#: Share of the weight of all flips above which flips that the guard excludes are reported.
 _LEFT_OUT = 0.01
-#: Relative difference from a closed form within which a derivative is that of the exact motion.
+#: Relative difference from a closed form within which a derivative counts as that of the exact motion.
 _CLOSE = 0.01
 
 

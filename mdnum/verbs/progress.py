@@ -11,9 +11,10 @@ from html import escape
 from pathlib import Path
 from typing import Any, Self, TextIO
 
-#: Called now and then with (done, of how many, {"phase": ..., "unit": ...}); of how many is 0 if not known.
+#: Function that is called occasionally with (done, total, {"phase": ..., "unit": ...}); total is 0 if
+#: unknown.
 Progress = Callable[[int, int, dict[str, Any]], None]
-#: What a verb's keyword `progress` may be: a `Progress`, True, False or None; see `reported`.
+#: Values of the keyword `progress` of a verb: a `Progress`, True, False or None; see `reported`.
 Wanted = Any
 
 _WORDS = {

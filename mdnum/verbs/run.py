@@ -35,22 +35,22 @@ if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
     from mdnum.units import Units
 
-#: Share of flips that must be chatter before it is worth a warning; free flight through the cutoff gives
-#: a few percent at usual time steps.
+#: Share of chatter among flips above which a warning is given; free flight through the cutoff gives a few
+#: percent at usual time steps.
 CHATTER_SHARE = 0.15
-#: Drift over the run, per atom and in units of k_B T, from which on it is worth a warning.
+#: Drift over the run, per atom and in units of k_B T, above which a warning is given.
 DRIFT_SHARE = 0.01
-#: Standard errors that a drift must be away from none.
+#: Number of standard errors by which a drift must differ from zero.
 ERRORS = 2.0
-#: Fluctuation of the conserved energy over the kinetic energy's from which on a time step is too long (where
-#: averages begin to move: docs/time-steps.md), and steps in the fastest vibration (GROMACS reference manual,
-#: "Removing fastest degrees of freedom").
+#: Fluctuation of the conserved energy relative to that of the kinetic energy above which the time step is too
+#: long (averages begin to change there: docs/time-steps.md), and steps per period of the fastest vibration
+#: (GROMACS reference manual, "Removing fastest degrees of freedom").
 FLUCTUATION, STEPS_PER_PERIOD = 0.05, 5.0
-#: A jump of energy at the cutoff, or of force times its radius, that is nothing, in k_B T.
+#: Jump of the energy at the cutoff, or of the force times its radius, that is negligible, in k_B T.
 NO_JUMP = 1e-9
-#: What compiles and keeps what the loop calls.
+#: Statements that compile and cache the functions that the loop calls.
 COMPILE = "from mdnum.md import decide, kernel; kernel._driver(), decide._noting()"
-#: Steps of a run in fixed-point numbers that are made in float64 too.
+#: Number of steps of a fixed-point run that are also made in float64.
 _BESIDE = 2000
 
 

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 TEXTS = Texts(Path(__file__).with_name("run.py"))
 
-#: A flip that is undone within as many steps is chatter.
+#: A flip that is reversed within this number of steps counts as chatter.
 CHATTER_STEPS = 10
-#: Rows of the flip table that the page carries: those nearest to their threshold.
+#: Largest number of rows of the flip table in the report: the flips nearest to their thresholds.
 TABLE_ROWS = 5_000
 _BUSIEST = 10
 _COLUMNS = ("step", "i", "j", "entered", "distance", "margin", "radial_speed", "energy_jump", "bound")

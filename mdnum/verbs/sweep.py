@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from mdnum.systems import System
     from mdnum.systems.simulation import Simulation
 
-#: Points of one setting that a worker is given at a time.
+#: Number of points of one setting per task of a worker.
 _TOGETHER = 8
-#: Seconds between looks at points that another sweep computes.
+#: Seconds between checks of points that another sweep is computing.
 _LOOK = 1.0
 
 

@@ -41,11 +41,11 @@ __all__ = [
     "PARTS", "GradientDiagnosis", "GradientGrowth", "Spectrum", "Trust", "agreement", "detective", "diagnose",
     "edges", "flips", "growth", "spectrum", "trust",
 ]  # fmt: skip
-#: Parts of a diagnosis by their words; `edges` takes some dozens of runs and is asked for by name.
+#: Parts of a diagnosis by name; `edges` needs dozens of runs and must be requested by name.
 PARTS = ("growth", "agreement", "flips", "trust", "spectrum", "detective", "scaling")
-#: Below this number of rounding errors, times what they grew by, two derivatives agree.
+#: Two derivatives agree if they differ by less than this multiple of the amplified rounding error.
 _ROUNDINGS = 1e4
-#: A difference of values is believed within this multiple of its own error estimate.
+#: A finite difference is accepted within this multiple of its own error estimate.
 _ERRORS = 5.0
 
 

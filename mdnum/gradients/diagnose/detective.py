@@ -26,7 +26,7 @@ from mdnum.md.cell import HostCell
 from mdnum.md.decide import GROUP
 from mdnum.numerics.jaxprs import Operation, count_bad, first_not_finite, is_inexact
 
-#: Part of a step by the functions on the way to an operation; the first that is there counts.
+#: Part of a step to which an operation belongs, by the functions that call it; the first match counts.
 _PARTS = (
     ("onto_crossings", "crossings"),
     ("look", "loss"),

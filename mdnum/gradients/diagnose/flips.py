@@ -32,9 +32,9 @@ from mdnum.rollout.program import MdProgram
 from mdnum.systems.simulation import Simulation
 
 SMOOTH, ENTERS, LEAVES = "smooth", "pair enters", "pair leaves"
-#: How far from the parameter a boundary is looked for, as a share of its value.
+#: Distance from the parameter within which a boundary is searched for, as a share of its value.
 REACH = 0.01
-#: First shift where no forecast is to be had, as a share of the parameter, and how it grows.
+#: First shift if no forecast is available, as a share of the parameter, and the factor by which it grows.
 _FIRST, _FACTOR = 1e-12, 8.0
 
 

@@ -36,16 +36,18 @@ from mdnum.numerics.verdicts import growth_rate
 from mdnum.rollout.epoch import over_rows
 from mdnum.systems.simulation import Simulation
 
-#: Time steps that turn a velocity into a length: of the order of the time in which an atom feels its cage.
+#: Number of time steps that converts a velocity to a length: about the time in which an atom encounters its
+#: neighbors.
 CLOCK_STEPS = 30
-#: A run is bounded where no speed is this multiple of the usual one.
+#: A run counts as bounded if no speed exceeds this multiple of the usual speed.
 _WILD = 10.0
 WORDS = ("both bounded", "forward bounded, gradient not", "forward not bounded")
-#: Binary exponents that are told apart; what lies beyond is counted at the ends.
+#: Range of distinguished binary exponents; values beyond are counted at the ends.
 _LOWEST, _HIGHEST = -200, 200
-#: Share of the numbers of a step that may be lost where one scale is said to fit.
+#: Share of the numbers of a step that may be lost if a single scale factor is considered sufficient.
 LOST = 0.01
-#: Beyond this many e-foldings between vectors, the product of triangles is read off its diagonal.
+#: Number of e-foldings between vectors above which only the diagonal of the product of triangular matrices is
+#: used.
 _RANGE = 30.0
 
 

@@ -28,21 +28,22 @@ from mdnum.gradients.tape import Pace, TapeStretch, listed
 from mdnum.md.cell import HostCell
 from mdnum.systems.simulation import Simulation
 
-#: Turning points are listed up to so far from the cutoff, as a share of it; a run whose distances move
-#: further at another time step is another run.
+#: Largest distance of a listed turning point from the cutoff, as a share of the cutoff; if distances change
+#: by more than this at another time step, the runs are not comparable.
 LOOK = 0.02
-#: Rows that share one choice of pairs.
+#: Number of rows that share one choice of pairs.
 _BLOCK = 8
 #: How many times shorter the steps are that tell where pairs turn around, and how far from there the exact
 #: motion may take them, by how far that is from the run's own: a fifteenth of it where the error of flips
 #: goes with the time step, and three times that is allowed for. A crossing adds the more the less deep it is,
 #: without limit: of those within reach what counts is what one adds at this share of the reach.
 FINER, REACH, SHALLOW = 16, 0.2, 0.01
-#: Turning points, in the order of their steps, over which the typical move of a distance is taken.
+#: Number of turning points, in the order of their steps, over which the typical change of a distance is
+#: computed.
 _NEIGHBORS = 20
 
 
-#: Columns of the table of turning points: integers, vectors, and numbers, the last of which come later.
+#: Columns of the table of turning points: integers, vectors and numbers; the last ones are added later.
 _WHOLE, _VECTORS = ("step", "row", "i", "j", "a", "b", "kind"), ("normal", "images")
 _LATER = ("weight", "shift", "finer")
 _NUMBERS = ("gap", "bend", "side", "unseen", "part", "before", "after", *_LATER)
@@ -144,9 +145,10 @@ class Near:
     simulation: Simulation
     pace: Pace  # how often the loss looks
     rows: int = 0  # of the longest stretch
-    #: Tables by the first step of their stretch, last one first.
+    #: Tables by the first step of their stretch, last stretch first.
     _found: dict[int, dict[str, np.ndarray]] = field(default_factory=dict)
-    #: How far the cutoff moves ahead of the pair at each flip, by number; of each stretch, first one first.
+    #: Distance by which the cutoff moves ahead of the pair at each flip, for each stretch, first stretch
+    #: first.
     moved: list[np.ndarray] = field(default_factory=list)
 
     @property

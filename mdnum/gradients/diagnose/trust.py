@@ -39,22 +39,22 @@ from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.simulation import Simulation
 
-#: The parameter by which derivatives at half the time step are twice as large.
+#: Parameter whose derivatives are twice as large at half the time step.
 TIMESTEP = "dynamics.timestep"
-#: Relative difference of two precisions, or of two time steps, above which a derivative is not trusted, and
-#: the share of it that near misses may have. What is trusted has been within 5 % of the exact motion's.
+#: Relative difference between two precisions, or two time steps, above which a derivative is not trusted, and
+#: the limit for near misses relative to it. Trusted derivatives were within 5 % of those of the exact motion.
 TOLERANCE = 2e-2
-#: Horizons that are compared.
+#: Number of horizons that are compared.
 POINTS = 40
 ROUNDING, SCATTER, AMBIGUOUS = "rounding", "standard error", "ambiguous decision"
 STEP, NEAR, FLIPS = "time step", "near miss", "flips left out"
-#: What is not known beside limits that were not examined: whether other starts agree, of a gradient that grew
-#: chaotically; the derivative by parameters of too many entries.
+#: Open questions in addition to limits that were not examined: whether other starting states agree, for a
+#: gradient that grew chaotically; and derivatives with respect to parameters with too many entries.
 STARTS, SKIPPED, NOT_FINITE = "other starts", "parameters of many entries", "finite derivatives"
-#: A gradient that grew this many times more than in proportion to the steps is one of a start among many, and
-#: whether others agree must be examined.
+#: Growth of a gradient, relative to growth in proportion to the number of steps, above which the scatter over
+#: starting states must be examined.
 GROWN = 10.0
-#: Bytes of tangents of one stretch that are looked through.
+#: Largest number of bytes of tangents of one stretch that are examined.
 _MEMORY = 2**30
 TRUSTED, LIMITED, UNDECIDED = "trusted", "limited", "undecided"
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-#: Names of the parts of an answer in mappings and attributes.
+#: Names of the entries of an answer, as keys of a mapping and as attributes.
 NAMES = {
     "i": ("i", "first", "centers", "idx_i", "senders"),
     "j": ("j", "second", "neighbors", "idx_j", "receivers"),

@@ -15,7 +15,7 @@ from pydantic import FiniteFloat, PlainValidator, StrictBool
 from mdnum.plain import beside
 from mdnum.references.oracle import PairSet
 
-#: What a case is about, by the name of its area; in the order in which they are asked and reported.
+#: Descriptions of the areas of test cases, by name, in the order in which they are tested and reported.
 AREAS: Mapping[str, str] = MappingProxyType(beside(__file__)["areas"])
 
 Pbc = tuple[StrictBool, StrictBool, StrictBool]
@@ -39,7 +39,7 @@ def _vectors(value: Any) -> ndarray:
     return rows
 
 
-#: Arrays that JSON gives back: a double's shortest decimal is that double again.
+#: Arrays that JSON restores exactly: the shortest decimal form of a double determines the double.
 Rows = Annotated[ndarray, PlainValidator(_finite)]
 Vectors = Annotated[ndarray, PlainValidator(_vectors)]
 Length = Annotated[FiniteFloat, Ge(0)]

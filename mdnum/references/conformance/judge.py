@@ -22,7 +22,7 @@ Count = Annotated[int, Ge(0)]
 Seconds = Annotated[FiniteFloat, Ge(0)]
 SINGLE, DOUBLE = 2.0**-24, 2.0**-53
 _NAMED = 3  # pairs in a message
-#: Ways to be wrong, by how bad they are: the first make energies wrong without a word.
+#: Kinds of errors, in order of severity: the first ones cause wrong energies without an error message.
 Code = Literal[
     "CRASHED", "MISSING", "EXTRA", "DUPLICATE", "SELF", "RANGE", "ONE_SIDED", "SHIFTS", "DISTANCES",
     "VECTORS", "MALFORMED", "NO_ANSWER", "CHANGED_INPUT", "RAISED",

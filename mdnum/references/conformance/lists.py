@@ -40,7 +40,7 @@ class KeptList(Protocol):
         ...
 
 
-#: What a function, and the calls of a list that is kept, are given, in order.
+#: Arguments of a function, and of the methods of a list that is kept, in order.
 _GIVEN = ("positions", "cell", "pbc", "r_cut")
 _GIVEN_TO_KEPT = {"allocate": (*_GIVEN, "skin"), "update": ("positions", "cell")}
 _WANTED = f"Give a function of ({', '.join(_GIVEN)}) that returns (i, j)"
@@ -110,7 +110,7 @@ class ListLimits:
         yield bool(np.prod(width / reach) > self.roomy), f"no box of more than {self.roomy:.0e} cells"
 
 
-#: ListLimits that are declared by a word, such as "minimum-image".
+#: Limits that can be declared by a word, such as "minimum-image".
 LIMITS = {limit.name.replace("_", "-"): limit.name for limit in fields(ListLimits) if limit.default is False}
 
 
@@ -153,8 +153,8 @@ class PairList:
         return replace(self, **{name: value for name, value in options.items() if value is not None})
 
 
-#: Lists with a name, installed or not; another package adds a `PairList`, a function or a class of lists that
-#: are kept by an entry point "mdnum.neighbor_lists".
+#: Named lists, installed or not. Another package adds a `PairList`, a function, or a class of lists that are
+#: kept, by an entry point "mdnum.neighbor_lists".
 LISTS: Registry[PairList] = Registry("neighbor list", "mdnum.neighbor_lists")
 
 

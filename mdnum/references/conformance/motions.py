@@ -21,17 +21,18 @@ from numpy import ndarray
 
 from mdnum.references.conformance.case import Case, gas, grid, matrix, sequence
 
-#: (name, path, cell, and what follows of `sequence`'s arguments where it is not as usual).
+#: (name, path, cell, and further arguments of `sequence` if they differ from the defaults).
 Script = Iterator[tuple[Any, ...]]
 
 _R, _SKIN, _L = 1.0, 0.3, 6.0
 _MIDDLE = np.array([3.0, 3.0, 3.0])
 HAIR = 2e-3  # what a pair starts beyond the padding and ends inside the cutoff by, in paddings
-#: Of a ladder, in paddings: which of them a list has that shows no pairs of its skin is not known.
+#: Tested values of an unknown padding, in multiples of the given skin, for a list that does not show pairs in
+#: its skin.
 _RUNGS = np.geomspace(0.25, 3.0, 20)
 _BEYOND = int((_RUNGS >= 1).sum())  # of a list that has the padding it is taken to have
 _SHARES = (0.5, 1.0, 0.0, 0.3, 0.7)  # what the atom of a pair that is named first does of the motion
-#: A pair among how many, and how far the others move meanwhile, in paddings.
+#: Number of atoms, and displacement of the other atoms, in paddings.
 _AMONG = ((42, 0.0), (300, 0.0), (300, 0.01), (300, 0.04), (1_200, 0.01))
 _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are spread evenly
 

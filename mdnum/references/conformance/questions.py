@@ -22,7 +22,7 @@ from mdnum.references.conformance.lists import PairList
 from mdnum.references.conformance.motions import motions, movers, sequences
 from mdnum.references.oracle import PairSet, completed, widths
 
-#: (name, positions, cell, pbc, r_cut), of which the last ones may be left out as in `once`.
+#: (name, positions, cell, pbc, r_cut); the last entries may be omitted as in `once`.
 Named = Iterator[tuple[Any, ...]]
 
 SMALL_EDGE, LARGE_EDGE = 17, 47  # atoms along an edge of the lattices: some 5,000 atoms, and 100,000
@@ -224,13 +224,13 @@ def _sphere(count: int) -> ndarray:
 
 # --- cases drawn at random ---
 
-#: Kinds of boxes, and of places of atoms, that a case is named after.
+#: Kinds of boxes and of positions of atoms, used in the names of cases.
 SHAPES = ("cube", "orthorhombic", "skewed", "strongly skewed", "turned", "left-handed")
 SIZES = ("ordinary", "wide", "thin", "two cutoffs", "narrow", "long", "huge")
 PLACES = (
     "inside", "outside", "far outside", "on walls", "clustered", "coincident", "on a grid", "at the cutoff"
 )  # fmt: skip
-#: Lengths of all edges, and of one that is drawn, in cutoffs.
+#: Lengths of all edges, and of a single randomly drawn edge, in cutoffs.
 _EDGES = {"wide": (6.0, 15.0), "narrow": (0.6, 2.0), "huge": (20.0, 45.0)}
 _ONE_EDGE = {"thin": (0.5, 2.2), "long": (30.0, 120.0)}
 

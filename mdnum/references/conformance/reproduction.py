@@ -109,7 +109,7 @@ def _calls(case: Case) -> Iterator[tuple[Still, bool, float]]:
         atoms = count
 
 
-#: What a script is run by: it ends with this process, and has as much memory as when the list was asked.
+#: Code that runs a script: it ends with this process, and has the same memory limit as the original call.
 _RUN = (
     "import runpy, sys; from mdnum.safe_path import guard; guard(int(sys.argv[2])); "
     "runpy.run_path(sys.argv[1], run_name='__main__')"

@@ -33,13 +33,13 @@ from mdnum.references.conformance.judge import Failure
 from mdnum.references.conformance.lists import PairList
 from mdnum.safe_path import environment, guard, python
 
-#: Seconds that an answer may take, for so many atoms at most and for more; and those to import a library.
-#: They are its own processor time: by the clock nothing comes in time on a machine that has other work to do.
+#: Time limits of a call for at most a given number of atoms and for more atoms, and of importing a library,
+#: in seconds of processor time of the process, because elapsed time depends on the load of the machine.
 FEW, CALL, LONG, START = 1000, 45.0, 120.0, 120.0
-#: A process that used less than this share of the time waits for something that does not come; and one that
-#: has had this many times its seconds by the clock is not waited for, whatever else the machine does.
+#: A process that used less than this share of the time is considered to be blocked; a process is ended after
+#: this multiple of the limit in elapsed time.
 _IDLE, _MOST = 0.05, 10.0
-#: Modules, beside Python's own, whose exceptions are about a call that the list made, not about its input.
+#: Modules, in addition to those of Python, whose exceptions concern a call made by the list, not its input.
 _BORROWED = frozenset({"numpy", "scipy", "numba", "pandas", "torch", "jax", "jaxlib", "cupy", "ctypes"})
 
 
