@@ -33,7 +33,8 @@ from mdnum.safe_path import environment, python
 
 Status = Literal["ok", "info", "unsafe"]
 
-#: By test: its name, what was seen by status ("seen" where it is always the same) and what to do if unsafe.
+#: For each test: its name, the observation by status ("seen" if it is the same for all), and the remedy if
+#: unsafe.
 _WORDS: dict[str, Any] = beside(__file__)
 PACKAGES, PEERS = _WORDS["packages"]["needed"], _WORDS["packages"]["peers"]
 DIGEST_CODE, IMPORTS_CODE = _WORDS["digest_code"], _WORDS["imports_code"]
@@ -493,7 +494,7 @@ def second_process(child: Child, here: str, seconds: float) -> DoctorRow:
     return _row("second_process", status, here=here[:12], there=answer[:12] if answer else why)
 
 
-#: What this process tests, in the order in which it is worth reading.
+#: Tests of this process, in the order of the report.
 TESTS = (
     jax_version, flags, devices, float64, crystal, elementwise, functions, reassociation, contraction,
     constant_division, subnormals, numba_works, own_forces,

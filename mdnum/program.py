@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real, UInt64
 
-#: Called now and then with (done, of how many, {"phase": words}).
+#: Function that is called occasionally with (done, total, {"phase": text}).
 Progress = Callable[[int, int, dict[str, Any]], None]
 
 

@@ -26,7 +26,7 @@ from mdnum.errors import InputError, MdnumError
 if TYPE_CHECKING:
     from ase import Atoms
 
-#: Bytes beyond which no system file and no summary is read: nobody wrote that by hand, nor mdnum.
+#: Largest size in bytes of a system file or summary.
 MOST_TEXT = 1 << 28
 # characters of a line of a file of structures
 _LONGEST_LINE = 1 << 24

@@ -24,7 +24,7 @@ from typing import Any, Generic, TypeVar
 from mdnum.errors import InputError
 
 T = TypeVar("T")
-#: Nothing is like a longer word, and to find that out takes minutes.
+#: Longest name for which similar names are suggested; the search takes minutes for longer ones.
 _LONGEST_WORD = 100
 
 

@@ -21,7 +21,7 @@ EIGHT = 8
 SIXTEEN = 16
 # what a processor does in one go is a known operation of LLVM 19 and later
 _COMPRESSES = llvm.llvm_version_info >= (19,) and llvm.get_host_cpu_features().get("avx512f", False)
-#: numba's decorator, typed as Any because it hides the signature.
+#: numba's decorator, with type Any because it hides the signature.
 intrinsic: Any = numba.extending.intrinsic
 
 

@@ -19,23 +19,26 @@ from mdnum.audit.subject import CalculatorSubject, LoadedCalculator, largest
 from mdnum.deadline import Deadline, interrupting
 from mdnum.errors import InputError
 
-#: Tried in this order, and then every other element: argon where anything goes; and a second one beside each.
+#: Elements in the order in which they are tried, followed by all others: argon if the calculator accepts any
+#: element; and a second element for each.
 _FIRST = {"Ar": "Kr", "Cu": "Ni", "Si": "Ge", "C": "Si", "O": "S", "Al": "Cu", "Fe": "Cr", "Na": "K"}
 _LAST_ELEMENT = 95
-#: Calls for building a structure, at most; of them in each direction of a search for the least energy.
+#: Largest number of calls for building a structure, and in each direction of a search for the lowest energy.
 BUILDING_CALLS, _SCALES = 400, 15
 _MOST_ATOMS, _FEWEST_ATOMS = 500, 32
 _SPACING = 3.1  # Å between molecules of water, as in the liquid
 _WATER_EDGES = (4, 5, 6, 8)  # molecules along an edge: some calculators want a box of two cutoffs
-#: Factors on a lattice constant at which a crystal is tried: a calculator may fail where nothing is near.
+#: Factors on the lattice constant of a crystal that are tried, because a calculator may fail if atoms have no
+#: neighbors.
 _DENSITIES = (1.0, 0.85, 0.72, 0.6, 0.5, 1.2)
 _BARELY, _PRESSED = 0.9, 0.6  # a nearest distance above so much of the cutoff is made to be so much of it
 _SLOW = 0.15  # seconds of processor time of a calculation above which the crystal is made no larger
-#: Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie.
+#: Standard deviation of random displacements relative to the nearest distance: in a perfect crystal forces
+#: are zero and distances are equal.
 _RATTLE = 0.02
-#: Distances at which two atoms are asked about, from the farthest inward.
+#: Distances of two atoms that are evaluated, from the largest to the smallest.
 _DISTANCES = FARTHEST * 1.12 ** -np.arange(35.0)
-#: Attributes that name elements, those that do so by atomic numbers, and attributes that hold a model.
+#: Attributes that contain elements, those that contain atomic numbers, and those that contain a model.
 _NAMES = ("elements", "species", "symbols", "atom_types", "chemical_symbols", "type_map", "parameters")
 _NUMBERS = ("atomic_numbers", "z_table", "zs")
 _MODELS = ("model", "models", "potential")

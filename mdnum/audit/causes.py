@@ -26,9 +26,10 @@ def _codes(names: Sequence[str], code: str) -> Iterator[str]:
 
 _ROWS = dict(beside(__file__))
 _GROUPS: dict[str, list[str]] = _ROWS.pop("groups")
-#: What separates causes that look alike, by the name under which a check reports that it has been done.
+#: Tests that distinguish causes with the same symptoms, by the name under which a check reports that the test
+#: was made.
 TESTS: dict[str, str] = _ROWS.pop("tests")
-#: The deepest causes first: a finding goes below the first row that explains it.
+#: Causes in order of precedence: a finding is listed below the first row that explains it.
 CAUSES = {
     code: Cause(
         tuple(_codes(row.get("brings", ()), code)), tuple(row.get("rivals", ())), tuple(row.get("tests", ())),

@@ -23,8 +23,8 @@ _EXTRAPOLATE = np.array([-0.3125, 1.3125, -2.1875, 2.1875])  # half a spacing be
 _DIVISIONS, _NARROWER = 24, 6  # how much each zoom narrows: four of the divisions are kept
 _LEVELS = 10
 _OUTLIER = 4.0  # a mismatch this many times those around it is a suspect
-#: The same of an eighth difference, which may be all rounding: the largest of some hundred is five times the
-#: median.
+#: The same for an eighth difference, which may consist of rounding errors only: the largest of about a
+#: hundred is five times the median.
 _STANDS_OUT = 10.0
 _TOLD = 3.0  # a step so many times what stands out of a scan is also located, wherever it is in its interval
 _EIGHTH = np.array([1.0, -8.0, 28.0, -56.0, 70.0, -56.0, 28.0, -8.0, 1.0])

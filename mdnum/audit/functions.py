@@ -22,19 +22,21 @@ from mdnum.numerics.jaxprs import narrows
 from mdnum.systems.simulation import Simulation
 from mdnum.systems.structures import nearest_distance
 
-#: Intervals of a scan; two breaks closer together than one may be taken for one.
+#: Number of intervals of a scan; two discontinuities in one interval may be taken for one.
 _INTERVALS = 240
-#: How much closer than in the start atoms are taken to come, and how far beyond the cutoff a scan goes on, so
-#: that it finds a break at the cutoff itself.
+#: Range of a scan: factor on the shortest initial distance, and extension beyond the cutoff relative to it,
+#: so that a discontinuity at the cutoff itself is found.
 _CLOSER, _BEYOND = 0.9, 0.02
-#: A derivative at the cutoff below this share of its median in the outer half is rounding; energy, others.
+#: Derivatives at the cutoff below this share of their median over the outer half count as rounding errors;
+#: the first value is for the energy.
 _NOTHING = (1e-12, 1e-9)
-#: Peaks of the force that are examined, and how often each is enlarged, nine times; a pole has at each level
-#: so many times the median around it, and in the end so many times that of the whole range.
+#: Number of peaks of the force that are examined, and number of ninefold magnifications of each; at a pole,
+#: the ratio to the surrounding median at each level, and the final ratio to the median of the whole range.
 _PEAKS, _ZOOMS, _SHARP, _LARGE = 8, 8, 3.0, 1e3
-#: A force differs from the slope of its energy by this share at half of all distances.
+#: Share by which a force differs from the derivative of the energy at half of all distances.
 _WRONG = 1e-4
-#: More wrong intervals than these may be a table's; narrower ones; the change of a constant force, its share.
+#: Number of wrong intervals above which a table is assumed, the width of narrow intervals, and the relative
+#: change of a constant force.
 _FEW, _NARROW, _STRAIGHT = 3, 1e-3, 1e-9
 _ORDERS = ("energy", "force", "curvature", "third derivative")
 

@@ -15,37 +15,39 @@ from scipy.special import stdtrit
 from mdnum.audit.base import CalculatorError, Observed, finding
 from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, no_rounding, rms
 
-#: Å between the points of the line along which noise is measured: a smooth function's fourth difference over
-#: it is below 1e-16 eV for any chemistry, while even single precision tells neighboring points apart.
+#: Spacing (Å) of the points of the line along which noise is measured: the fourth difference of a smooth
+#: function is below 1e-16 eV for any chemistry, but even in single precision neighboring points are distinct.
 _SPACING = 1e-5
 _POINTS, _FEW_POINTS = 25, 9
-#: Of the standard deviation that differences over so many points give, the share of values that it rests on:
-#: neighboring differences share points, so that its square scatters like that of fewer.
+#: Effective number of values, as a share of the points, on which the estimated standard deviation is based:
+#: neighboring differences share points, so that its square scatters like that of fewer values.
 _INDEPENDENT = 0.28
-#: How many times the noise a difference may be, at least: the largest of some hundred forces is compared, and
-#: another order of summation scatters more than moving along a line. And how often a difference of two
-#: answers may be above by chance.
+#: Smallest tolerance as a multiple of the noise, because the largest of about a hundred forces is compared
+#: and another order of summation scatters more than neighboring points; and the probability that a difference
+#: exceeds the tolerance by chance.
 _ALLOWED, _BY_CHANCE = 40.0, 1e-6
 RATTLE = 0.03  # Å by which atoms are moved, so that no distance sits on a threshold by design
 _TRIES, _DRAWS = 5, 8  # structures of which the quietest is taken, and random moves of the size of rounding
 FEW = 8  # atoms below which symmetry may hide the noise
-#: Å between the points of the line along which steps are searched, the wider ones where nothing moves.
+#: Spacings (Å) of the points of the line along which discontinuities caused by rounding are searched; wider
+#: ones are used if no value changes.
 _STEP_SPACINGS = (1e-4, 1.6e-3, 2.5e-2)
 _STEP_POINTS = 17
-#: Places at which a value stays what it was, from which one that moves elsewhere goes in steps; and the share
-#: of the forces that do, from which forces do.
+#: Number of points at which a value must be unchanged for it to count as stepwise, and share of the force
+#: components above which the forces count as stepwise.
 _STAYS, _STAIRS = 3, 0.1
-#: Second differences that are multiples of one number, to within this share of it, are those of a value in
-#: steps; those of a smooth one change little from one to the next.
+#: Second differences that are multiples of one number, within this share of it, belong to a stepwise value;
+#: those of a smooth value change little from one to the next.
 _ALIKE = 1e-3
-#: Of an energy: noise that rounding explains, of doubles and of numbers of single precision.
+#: Noise of the energy that rounding explains, for double and for single precision.
 _QUIET, _QUIET_SINGLE = 1e-11, 1e-6
 _QUIETER = 1e-3  # a line so much quieter than another has no threshold on it; rounding differs by less
-#: Orders of the atoms that are compared with the given one; Å between the points of a line on which two are
-#: compared, and how many: far enough for the terms of a sum to be rounded anew.
+#: Number of orders of atoms that are compared with the given order; spacing (Å) and number of the points at
+#: which two orders are compared, far enough apart for different rounding errors.
 _ORDERS, _ORDER_SPACING, _ORDER_POINTS = 3, 1e-3, 9
-#: Of a difference between two orders: what scatters by more from point to point is no smooth function. Of the
-#: energy and of what the forces are worth over the structure: rounding of a sum is below the second.
+#: Difference between two orders: a scatter from point to point above the first value excludes a smooth
+#: function. Relative to the energy and to the forces times distances in the structure, rounding of a sum is
+#: below the second value.
 _AT_RANDOM, _SUMMED = 0.05, 1e-5
 _MOST_DECIMALS = 9  # that are taken for rounding, at most: a double of more is too near to its own
 _FEWEST = 4  # different answers, 0 aside, from which is judged

@@ -12,8 +12,9 @@ from mdnum.audit.noise import displaced
 from mdnum.audit.structures import Pair, modified
 from mdnum.units import LENGTH
 
-#: Å beyond the cutoff at which two atoms start. A list with a skin s that lets each of them move by all of s
-#: misses the pair where this lies between s and 2 s: with steps below a factor 2 no skin slips through.
+#: Initial distance of two atoms from the cutoff (Å). A list with a skin s that allows each atom to move by s
+#: misses the pair if this distance is between s and 2 s; with factors below 2 between the values, no skin
+#: escapes.
 _BEYOND = tuple(0.15 * 1.5**n for n in range(8))
 _STEPS = 8
 _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked about

@@ -24,8 +24,8 @@ from mdnum.units import METAL, Units
 
 _MOST_SAVED = 20  # a calculator that fails is asked hundreds of times; this many structures are kept
 _ROOM_TEMPERATURE = 300 * METAL.k_B  # eV
-#: Of the root mean square force, of kT, and of the energy itself, which may be one of single precision:
-#: answers to one question that differ by more are no rounding.
+#: Tolerances relative to the root mean square force, to kT, and to the energy itself (which may be in single
+#: precision): results of identical calls that differ by more do not differ by rounding.
 _LARGE, _LARGE_ENERGY, _LARGE_SHARE = 1e-4, 1e-3, 1e-6
 _MOST_AGAIN = 100  # answers that stick out are asked for again, in one audit no more often than this
 _PLAIN = (str, int, float, list, tuple, dict, np.ndarray)  # info with the same repr in a copy

@@ -38,13 +38,13 @@ _TIED = 1e-6  # so near to where two neighbors change places they are tied, leng
 _MOST = 160  # neighbors of the crowded center; radius graphs are cut at 32 by habit, and at 50, 100 or 120
 _FEWEST = 4  # of which a calculator that refuses more is given
 _NEAR, _FAR = 0.5, 0.94  # the crowd is between these fractions of the cutoff
-#: How far to either side of a tie is asked, in the last digit of the largest coordinate in float32: some sort
-#: neighbors by distances that are rounded so.
+#: Displacement to either side of a tie, in ulps of the largest coordinate in float32, because some
+#: calculators sort neighbors by distances in float32.
 _SIDE_OF_TIE = 4.0
 _SURE = 30.0
 _WITHOUT_CUTOFF = 6.0
 _TIES = 160  # neighbors for which ties are tried, by three calls each; of several species, a share
-#: Ties that are tried in any case.
+#: Number of ties that are always tested.
 _HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 150, 200, 250, 256)
 
 

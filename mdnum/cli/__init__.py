@@ -138,7 +138,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     sys.exit(asked.exit_code)
 
 
-#: What was expected, by the name that the parser of options has for it.
+#: Descriptions of expected values, by the names of types in the option parser.
 _EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number", "float_parsing": "a number"}
 
 

@@ -245,7 +245,7 @@ def _smaller(x: Any, y: Any) -> Any:
     return jnp.where((x < y) | (x != x), x, y)
 
 
-#: By jax's name of the operation.
+#: Functions by the names of operations in jax.
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "exp": exp, "expm1": expm1, "logistic": logistic, "tanh": tanh, "log": log, "log1p": log1p, "pow": power,
     "cos": lambda x: cos_sin(x)[0], "sin": lambda x: cos_sin(x)[1], "erf": erf, "erfc": erfc,

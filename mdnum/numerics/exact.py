@@ -80,7 +80,7 @@ def root(x: jax.Array) -> jax.Array:
 
 # what a function that is jitted by itself, as jnp.where is, looks like inside another
 _CALLS = ("jit", "pjit")
-#: Operations that call a program once, by other means than compiling it.
+#: Operations that call a program once, other than by compiling it.
 _CALLED = ("closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call",
            "custom_vjp_call_jaxpr")  # fmt: skip
 Rule = Callable[[Any, list[Any]], Sequence[Any]]

@@ -15,7 +15,7 @@ import numpy as np
 
 from mdnum.numerics.exact import bound, inlined, interpreted
 
-#: Elementwise operations that numpy or scipy calls otherwise than jax.
+#: Elementwise operations with different names in numpy or scipy and in jax.
 _NAMES = {
     "add_any": "add", "sub": "subtract", "mul": "multiply", "div": "true_divide", "neg": "negative",
     "max": "maximum", "min": "minimum", "pow": "power", "atan2": "arctan2", "asin": "arcsin",

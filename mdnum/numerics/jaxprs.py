@@ -13,9 +13,10 @@ import numpy as np
 
 from mdnum.numerics.exact import inlined, interpreted
 
-#: Candidates that are tried before giving up.
+#: Largest number of candidates that are tried.
 _MOST = 12
-#: Digits that a person writes: numbers in single precision with more are weights, or were computed.
+#: Number of digits that a person would write: single-precision numbers with more digits are weights or
+#: computed.
 _DIGITS = 6
 
 

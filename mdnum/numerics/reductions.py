@@ -178,7 +178,7 @@ def _numbered(reduction: Callable[[int], Reduction], default: int) -> Callable[.
     return make
 
 
-#: Every order in which a sum can be made, by name: "exact", "permuted:3" (seed), "blocked:8" (width).
+#: All orders of summation by name: "exact", "permuted:3" (random seed), "blocked:8" (width).
 REDUCTIONS: Registry[Reduction] = Registry("reduction", "mdnum.reductions", kind=Reduction, separator=":")
 REDUCTIONS.add("sequential", lambda: Sequential(), description="left to right, as a loop does")
 REDUCTIONS.add("reversed", lambda: Sequential("reversed"), description="right to left")
@@ -195,7 +195,7 @@ REDUCTIONS.add(
 
 
 parse = REDUCTIONS.parse
-#: The shipped ones, with their defaults.
+#: Built-in orders with their default options.
 BY_NAME = {name: parse(name) for name in REDUCTIONS.shipped}
 
 

@@ -16,9 +16,9 @@ ALL: Mapping[str, np.dtype] = {
     "float16": np.dtype(np.float16),
     "bfloat16": np.dtype(ml_dtypes.bfloat16),
 }
-#: The word of a fixed-point state: doubles that are whole multiples of fixed units.
+#: Name of a fixed-point state: doubles that are integer multiples of fixed units.
 FIXED_POINT = "lattice"
-#: Roles of molecular dynamics that sixteen bits cannot play, and why.
+#: Roles of molecular dynamics for which sixteen bits are not supported, and the reason.
 _TOO_SHORT: Mapping[str, str] = {
     "state": "a step moves an atom by less than the spacing of such coordinates, so nothing would move",
     "decision": "such coordinates are some hundredths of a distance apart, and their grid would decide",

@@ -61,7 +61,8 @@ def neighbor(x, ulps: int, dtype: DTypeLike = np.float64):
     return bits.astype(integer).view(x.dtype)[()]
 
 
-#: Covers the terms of second order, u times as small: u is at most 2^-24 where distances are compared.
+#: Factor for terms of second order, which are smaller by a factor u: u is at most 2^-24 for compared
+#: distances.
 _SECOND_ORDER = 1.001
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from jaxtyping import Bool, Float
 
-#: |n · F-| / (|n| |F-|) at and below which an event counts as grazing.
+#: Value of |n · F-| / (|n| |F-|) at and below which an event counts as grazing.
 GRAZING = 1e-8
 
 

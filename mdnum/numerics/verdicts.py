@@ -21,13 +21,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Shaped
 
-#: Repeats of a pair at most, where nothing was said.
+#: Default for the largest number of repeats.
 REPEATS = 15
-#: Pairs that are added before the next look.
+#: Number of pairs that are added before the next analysis.
 LOOK = 5
-#: How often a word may be wrong: the chance of it where half of the pairs are delayed.
+#: Largest probability of a false verdict if each pair is delayed with probability one half.
 ERROR = 0.05
-#: Repeats at the other displacement that are enough if all of them do the same.
+#: Number of repeats at the other displacement that suffice if all agree with the verdict.
 _ALIKE = 4
 
 
@@ -93,7 +93,7 @@ def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
     return tuple(found)
 
 
-#: Fewer repeats than this can never be clear.
+#: Smallest number of repeats for which a result can be clear.
 FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
 
 
@@ -156,28 +156,30 @@ def count(delays: tuple[Delay, ...], steps: float, most: int) -> Count:
 
 # --- dates, growth and verdict of a pair ----------------------------------------------------------------
 
-#: A code, and the values of its sentence.
+#: Code of a sentence, and its values.
 Reason = tuple[str, dict[str, Any]]
 Word = Literal["same", "no fork", "open", "cause", "accelerated", "bystander", "undecided"]
 
-#: Share of the rows before a growth rate is read off, and blocks that its error comes from; a rate counts
-#: where it is this multiple of its error.
+#: Share of the rows that are omitted before a growth rate is fitted, and number of blocks from which its
+#: error is estimated; the rate must exceed this multiple of its error.
 TRANSIENT, BLOCKS, _SIGNIFICANT = 0.2, 8, 4.0
-#: A slope is fitted to separations between these, as shares of the split tolerance: above rounding's plateau
-#: at the start, below saturation at the end.
+#: Range of separations to which a slope is fitted, as shares of the split tolerance: above the initial
+#: plateau caused by rounding and below saturation.
 _FIT = (1e-12, 0.1)
-#: Fewer rows than this give no growth rate.
+#: Smallest number of rows for a growth rate.
 _FIT_ROWS = 16
-#: A split must have been followed for so many times its steps before "did not split" means anything.
+#: Factor on the step of the split up to which a counterfactual must be known before "did not split" is a
+#: result.
 PATIENCE = 1.2
-#: A counterfactual that grows and would split within so many times the free run's steps is late, not saved.
+#: If the growth of a counterfactual predicts a split within this multiple of the steps of the free run, the
+#: split is only delayed.
 _SAVED = 5.0
-#: A delay of less than one e-folding is no delay: the separation was never as much as e times smaller.
+#: Smallest delay, in e-foldings: with a shorter delay the separation was never smaller by a factor e.
 E_FOLDINGS = 1.0
-#: r² of a fit that counts as growth.
+#: Smallest r² of a fit that counts as growth.
 FITS = 0.5
-#: E-foldings that the later half of a fit must grow by before it predicts anything. What the first steps do
-#: is a power law: its later half grows by 0.7 e-foldings for every e-folding of the time.
+#: Smallest growth in e-foldings over the later half of a fit from which a split is predicted. The initial
+#: growth is a power law, whose later half grows by 0.7 e-foldings for every e-folding of the time.
 _HALF = 3.0
 
 
@@ -481,7 +483,7 @@ Name = Literal["A", "B"]
 What = Literal["decisions", "arithmetic"]
 
 _RUNS: tuple[tuple[Name, Name], ...] = (("A", "A"), ("B", "B"), ("B", "A"), ("A", "B"))
-#: Series of separations by arithmetic, decisions and the run that they are taken from.
+#: Series of separations, by arithmetic, decisions and reference run.
 SERIES: Mapping[tuple[Name, Name, Name], str] = {
     ("B", "A", "A"): "B|A",
     ("B", "A", "B"): "B|A from B",

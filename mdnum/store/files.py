@@ -21,9 +21,9 @@ from mdnum.reading import whole_text
 from mdnum.store.layout import Layout
 from mdnum.version import __version__
 
-#: Folders inside a folder; the folder itself may be a link, for that is the choice of whoever names it.
+#: Folders inside a folder, which must not be links; the folder itself may be one.
 SUBFOLDERS = ("parts", "figures", "structures")
-#: What was run: a system file, or the description of a simulation that was made of objects.
+#: Files that describe the simulation: a system file, or the description of a simulation built from objects.
 SYSTEM_FILE, SIMULATION_FILE = "system.toml", "simulation.json"
 
 _REMEDIES = {
@@ -190,7 +190,7 @@ def _linked(path: Path) -> FolderError:
 # --- manifest.json: what a folder is of, and a digest of every file in it that something is read from -
 
 NAME = "manifest.json"
-#: May be missing.
+#: Digest of a file that may be missing.
 ABSENT = ""
 _INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
 

@@ -10,7 +10,7 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
-#: Types of columns, and what a value of each is in Python; a `word` is one of a few texts.
+#: Types of columns with the corresponding Python types; a `word` is one of a few texts.
 TYPES: Mapping[str, tuple[type, ...]] = MappingProxyType({
     "int32": (int,), "int64": (int,), "float64": (float, int), "bool": (bool,), "string": (str,),
     "word": (str,),

@@ -26,13 +26,14 @@ from mdnum.numerics.jaxprs import first_not_finite, held_numbers, single_numbers
 from mdnum.systems.simulation import Simulation
 from mdnum.systems.trial import SAME, AdmissionError, Trial, named
 
-#: Atoms of a larger structure that are tried.
+#: Number of atoms of a larger structure that are used in the trial.
 _ENOUGH = 500
-#: Of the box that tells rows from columns: how far it is sheared, not the same way along any two axes.
+#: Shear of the box that distinguishes rows from columns; it differs for each pair of axes.
 _SHEAR = 1e-3 * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-0.7, 0.4, 0.0]])
-#: Pairs nearest to the cutoff that are taken across it.
+#: Number of pairs nearest to the cutoff that are moved across it.
 _CROSSINGS = 4
-#: How far a range is resolved, over the cutoff; smooth ends are 0 within rounding a little before.
+#: Resolution of the measured range, relative to the cutoff; a smooth function is 0 within rounding slightly
+#: before its end.
 _RESOLVED, _BEFORE = 2e-3, 0.03
 
 

@@ -164,7 +164,7 @@ class ImpactContact(_Contact):
 Contact = Annotated[PenaltyContact | ProjectionContact | ImpactContact, Discriminator("kind")]
 
 
-#: Iterations are counted in 32 bits.
+#: Largest number of iterations, which are counted in 32 bits.
 _MOST = 2**31 - 1
 
 
@@ -334,13 +334,13 @@ class BallSpec(TomlTable):
 
 # --- what the tables must say together ----------------------------------------------------------------
 
-#: Parameters that a gradient can be asked for, by contact.
+#: Parameters with respect to which gradients are available, by contact model.
 _PARAMETERS = {
     "penalty": ("k", "damping", "eps"),
     "projection": ("k", "alpha", "restitution", "tol"),
     "impact": ("restitution",),
 }
-#: What is wrong with a file: the key at fault, what was seen, what to do.
+#: Error in a file: the key, the observation, and the remedy.
 Problem = tuple[str, str, str]
 
 

@@ -28,7 +28,7 @@ from mdnum.systems.toml import flat
 if TYPE_CHECKING:
     from ase import Atoms
 
-#: Of a description, what says nothing about what is computed.
+#: Keys of a description that do not affect the computation.
 _ASKED = ("name", "about", "dynamics.steps", "record.save_every")
 _CHANGE_OBJECTS = "Change the objects: mdnum.changed(simulation, {...})"
 

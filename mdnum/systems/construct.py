@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from ase import Atoms
 
 
-#: Two energies of a pair that differ by more are not the same function in either order, relative.
+#: Relative difference above which the energies of a pair in both orders count as different.
 _SYMMETRIC = 1e-12
-#: How far inside of the cutoff an energy is compared with that at it, and how steep it may be there, both per
-#: cutoff.
+#: Distance from the cutoff at which the energy is compared with that at the cutoff, and the largest slope
+#: there, both relative to the cutoff.
 _INSIDE, _STEEP = 1e-7, 1e4
 
 

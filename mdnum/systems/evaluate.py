@@ -174,5 +174,5 @@ def _numbers_of(force: PairForce | ManyBodyForce, bare, cell: Cell, types: int, 
 _HURRY: Any = {"compiler_options": {"xla_backend_optimization_level": 0}}
 evaluate_listed, _numbers = eqx.filter_jit(_listed), eqx.filter_jit(_numbers_of)
 _QUICKLY = eqx.filter_jit(_listed, **_HURRY), eqx.filter_jit(_numbers_of, **_HURRY)
-#: Atoms up to which compiling takes longer than a few calls.
+#: Number of atoms up to which compiling takes longer than a few evaluations.
 _SMALL = 1000

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 
 STRUCTURE_FILE = "structure.extxyz"
-#: Of a system file: words, what is hashed by itself, and what is asked about the run.
+#: Keys of a system file: texts, values with a separate digest, and requests for the run.
 _NOT_THE_PROGRAM = {"name", "about", "structure", "gradient", "variants", "fork"}
-#: What can be done with a folder whose simulation came from no file.
+#: Remedy for a folder whose simulation was not built from a file.
 GIVE_OBJECTS = "Give the simulation itself, made by the same code, from Python"
 BALL_SCHEMA = "ball-schema.json"
 

@@ -37,12 +37,12 @@ from mdnum.systems.construct import in_fixed_point
 from mdnum.systems.load import System
 from mdnum.systems.simulation import Simulation
 
-#: Other words for a parameter.
+#: Alternative names of parameters.
 _ALIASES = {
     "r_cut": "cutoff.radius", "r_onset": "cutoff.onset", "dt": "dynamics.timestep",
     "x0": "initial.positions", "v0": "initial.velocities", "scale": "box.scale", "box": "box.scale",
 }  # fmt: skip
-#: Units by the last word of a name, or by what a field of an integrator is.
+#: Units by the last word of a name, or by the kind of a field of an integrator.
 _UNITS = {
     "sigma": "{length}", "epsilon": "{energy}", "depth": "{energy}", "r0": "{length}", "skin": "{length}",
     "radius": "{length}", "onset": "{length}", "time": "{time}", "temperature": "{temperature}",

@@ -21,7 +21,7 @@ Length = Annotated[float, Field(gt=0, description="length (Å or σ)")]
 Energy = Annotated[float, Field(gt=0, description="energy (eV or ε)")]
 Compare = Literal["r2 <", "r2 <=", "r <", "r <="]
 
-#: A switched cutoff without an onset starts to switch at this fraction of its radius.
+#: Default onset of a switched cutoff, as a fraction of its radius.
 ONSET_FRACTION = 0.9
 
 
@@ -295,7 +295,7 @@ class CutoffTable(TomlTable):
 
 # --- structure, lists, dynamics, precision ---------------------------------------------------------------
 FloatName = Literal["float64", "float32"]
-#: Skin when the file gives none: LAMMPS uses 2.0 Å and 0.3 σ; 1.0 Å suits the argon-sized systems here.
+#: Default skin: LAMMPS uses 2.0 Å and 0.3 σ; 1.0 Å suits the argon-sized systems of mdnum.
 DEFAULT_SKIN = {"metal": 1.0, "lj": 0.3}
 
 Flags = Annotated[tuple[bool, bool, bool], from_array]

@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from mdnum.md.cell import Cell
     from mdnum.units import Units
 
-#: Closer than this (Å) is a mistake in any structure of metal units without a pair sigma.
+#: Distances below this (Å) are errors in any structure in metal units without a pair sigma.
 _SMALLEST_DISTANCE = 0.3
-#: Atoms of a crystal that is built; their positions alone take half a gigabyte.
+#: Largest number of atoms of a crystal built by mdnum; the positions alone take half a gigabyte.
 _MOST_ATOMS = 20_000_000
-#: Atoms of the cubic cell of a crystal, by its name.
+#: Number of atoms in the cubic cell of a crystal, by its name.
 ATOMS_IN_CELL = {"fcc": 4, "bcc": 2, "sc": 1, "diamond": 8}
-#: Cutoff radii that a coordinate or a cell vector may be long: its ulp is then 2e-8 of the cutoff.
+#: Largest coordinate or cell vector in cutoff radii; its ulp is then 2e-8 of the cutoff.
 _FARTHEST = 1e8
-#: Lennard-Jones atoms closer than this many σ (240,000 ε) are a mistake and not a hot pair.
+#: Distances of Lennard-Jones atoms below this many σ (240,000 ε) are errors.
 _SMALLEST_IN_SIGMA = 0.4
 
 
@@ -356,7 +356,7 @@ def with_images(
     return x, origin
 
 
-#: What `to_extxyz` writes above the atoms of a system.
+#: Comment line that `to_extxyz` writes for a system.
 _HEAD = re.compile(
     r'(\d+)\n(?:Lattice="([^"]*)" )?Properties=species:S:1:pos:R:3(:momenta:R:3)?(:masses:R:1)? '
     r'pbc="([TF]) ([TF]) ([TF])"\n'

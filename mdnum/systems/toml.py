@@ -28,7 +28,7 @@ from mdnum.registry import meant
 Key = tuple[str, ...]
 #: Name of the system file in a folder.
 
-#: Depth of tables and arrays beyond which a file is refused.
+#: Largest nesting depth of tables and arrays.
 _DEEPEST = 20
 # what is valid in TOML and acted on by a terminal, or reorders what is read
 _UNPRINTED = re.compile("[\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\U000e0000-\U000e007f]")
@@ -191,9 +191,9 @@ def _value(value: Any) -> str:
 # --- tables -------------------------------------------------------------------------------------------
 
 Positive, NonNegative = Annotated[float, Field(gt=0)], Annotated[float, Field(ge=0)]
-#: TOML has arrays only; strict pydantic would refuse a list where a tuple is declared.
+#: TOML has only arrays; strict pydantic would reject a list if a tuple is declared.
 from_array = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
-#: Smallest size of a number but 0; what is computed with it squares it.
+#: Smallest magnitude of a nonzero number, because computations square it.
 _SMALLEST = 1e-150
 _LARGEST_INT = 2**62
 

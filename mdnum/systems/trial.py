@@ -27,9 +27,9 @@ from mdnum.systems.simulation import Simulation
 
 _TEXTS = beside(__file__)
 FORMATS: tuple[jaxmd.Format, ...] = ("dense", "sparse", "ordered-sparse")
-#: Relative difference of energies that are the same, by whether all arithmetic is in double precision.
+#: Relative difference below which energies count as equal, by whether all arithmetic is in double precision.
 SAME = {True: 1e-9, False: 1e-5}
-#: More slots of padding, with which no energy may change.
+#: Additional padding slots, which must not change any energy.
 _MORE = 8
 
 

@@ -14,8 +14,8 @@ from mdnum.audit.structures import molecules, nearest_distance, whole
 from mdnum.audit.subject import CalculatorSubject, largest
 from mdnum.units import ENERGY, FORCE, LENGTH, Measured
 
-#: Å between two parts that cannot feel one another, and a cell that does not repeat around them: some lists
-#: take long over an empty one.
+#: Distance (Å) between two groups that cannot interact, and size of a cell that does not repeat around them:
+#: some lists are slow for large empty cells.
 _FAR, _BOX = 60.0, 75.0
 _AWAY = f"{_FAR:g} {LENGTH}"
 _ENERGY, _FORCE = f"energy ({ENERGY})", f"force ({FORCE})"  # columns

@@ -17,7 +17,7 @@ from mdnum.audit.noise import NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject, Forces, bits, differences, largest
 
 _SEEDS = (271828, 314159)  # two, to tell numbers that are drawn from a seed that is set
-#: What some calculators read from `Atoms.info`.
+#: Keys of `Atoms.info` that some calculators read.
 _INFO = {"charge": 1, "spin": 2, "total_charge": 1, "multiplicity": 2}
 
 

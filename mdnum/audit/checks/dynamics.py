@@ -25,14 +25,15 @@ from mdnum.audit.subject import CalculatorSubject, largest, rms
 from mdnum.audit.thresholds import PairThreshold, find_thresholds
 from mdnum.units import ENERGY, LENGTH, Measured, Units
 
-#: Of a run where nobody says how many. A step takes some six calls: two in the run of half the time step,
-#: warming up, work on the way.
+#: Default number of steps of a run. A step takes about six calls: two in the run at half the time step, and
+#: those for equilibration and for the work.
 _STEPS = 200
 _COMPARED = 12
-#: Of the brief form: steps, structures on their way that new objects are asked about, power iterations.
+#: Brief version: number of steps, number of structures along the run that are evaluated by new objects, and
+#: number of power iterations.
 _FEW_STEPS, _FEW_COMPARED, _FEW_ITERATIONS = 16, 2, 3
-#: Share of the thermal energy of an atom that may drift away in a ps before a run is not one at constant
-#: energy: within 100 ps all of it.
+#: Drift per ps, as a share of the thermal energy of an atom, above which a run is not at constant energy: the
+#: whole thermal energy within 100 ps.
 _MUCH = 1e-2
 _WANDERS = 1e-4  # of kT: a sum of jumps that wanders less in a unit of time is not reported
 _SWING = 1e-2  # of kT: energy of an atom that may come and go without a flip or the integrator

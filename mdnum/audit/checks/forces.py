@@ -32,19 +32,19 @@ _LADDER = 0.064 * 0.25 ** np.arange(9)  # Å, each a quarter of the one before: 
 _SUMS = {"NET_FORCE": "energy/length", "NET_TORQUE": "energy"}
 _SIGNIFICANT = 10.0  # difference over estimated error from which forces and energy disagree
 _SMALL = 1e-4  # of the root mean square force: below, a disagreement is one of tables or precision
-#: Of the root mean square force: noise above a tenth of it leaves nothing to be said of forces, and above the
-#: other is more than single precision explains.
+#: Noise relative to the root mean square force: above the first value, forces cannot be tested; above the
+#: second, the noise exceeds that of single precision.
 _DROWNED, _LOUD = 0.1, 1e-3
 _DIRECTIONS, _ATOMS = 3, 4
-#: Atoms of the cluster that is taken where rounding hides the forces on more, and Å of a cell around it that
-#: does not repeat.
+#: Number of atoms of the cluster that is used if rounding hides the forces in larger structures, and distance
+#: (Å) to the walls of a non-repeating cell.
 _CLUSTER, _BOX = 24, 75.0
 _SAME = 0.01  # of the largest disagreement: below, one factor explains it
-#: Of kT: a change of it below is one of precision rather than of physics; a jump of it, or a difference
-#: between two ways of writing one structure down, above the other is an error.
+#: In units of kT: changes of the energy below the first value are attributed to precision; jumps, or
+#: differences between two representations of a structure, above the second value are errors.
 _SMALL_OFFSET, _LARGE_OFFSET = 1e-6, 1e-3
-#: Of two energies of one structure: changes of their difference that rounding explains, of doubles and of
-#: numbers of single precision.
+#: Changes of the difference between two energies of one structure that rounding explains, for double and for
+#: single precision.
 _ROUNDING, _ROUNDING_SINGLE = 1e-11, 1e-5
 _NOTHING = 1e-12  # eV/Å: a force below is none, where no noise is louder
 _STEP, _CENTRAL = 1e-3, 1e-3  # Å to either side, for the derivative of that difference, and its error

@@ -18,22 +18,23 @@ from mdnum.audit.structures import group, modified, nearest_distance
 from mdnum.audit.subject import CalculatorSubject, Forces, differences, largest, rms
 from mdnum.units import ENERGY, FORCE, LENGTH, Measured
 
-#: Times what two ways of writing one structure down may differ by: below, noise is measured again before they
-#: are said to differ.
+#: If two representations of a structure differ by more than their tolerance but less than this multiple of
+#: it, the noise is measured again.
 _NEARLY = 30.0
 _SMALL = 1e-3  # of kT, and of the root mean square force: a difference below is one of precision
-#: Of other ways to write a structure down, those that a calculator for any cell has to take: it may know
-#: rectangular cells alone, or molecules by the order of their atoms.
+#: Among the representations, those that every calculator must support; others may fail for a calculator
+#: limited to rectangular cells, or to molecules in a given order of atoms.
 _MUST_ANSWER = ("TRANSLATION", "IMAGES", "FACES", "CELL_ULP", "EXTENSIVE")
 _REPORTS = ("PLACE_IN_LIST", "TOPOLOGY_BY_ORDER", "WHOLE_MOLECULES")  # findings beside the codes of ways
 
-#: Coordinates that should be 0 and are not quite: a denormal-like displacement that was seen to cost 5 eV,
-#: one that is lost when it is added to a cell's length, and half an ulp of 1.
+#: Tiny nonzero coordinates: a displacement that caused an error of 5 eV in some code, one that is lost when
+#: it is added to the length of a cell, and half an ulp of 1.
 _TINY = (1e-52, 1e-17, 2.0**-53)
 
 
-#: Tests that a way of writing a structure down makes by itself: one that mirrors has vectors of the same
-#: handedness, and a place was found by exchanging atoms in two orders, each answer by a new object.
+#: Distinguishing tests that a representation makes implicitly: mirror images with vectors of the same
+#: handedness, and a position in the list found by exchanging atoms in two orders, each evaluated by a new
+#: object.
 _SEPARATE = {
     "LEFT_HANDED": ("determinant",), "MIRROR": ("determinant",), "PLACE_IN_LIST": ("repeat", "place"),
 }  # fmt: skip

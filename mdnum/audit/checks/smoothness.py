@@ -23,13 +23,14 @@ ORDERS = (
 )  # fmt: skip
 _ULPS = 12  # representable distances shown on either side of a jump
 _DRAWN = 4
-#: An energy jump above so many kT is an error: a thousand of them in one direction make one kT; one below the
-#: second, or of the force below so many kT per unit of length, is information.
+#: Energy jumps above the first number (in kT) are errors: a thousand of them in one direction add up to one
+#: kT. Energy jumps below the second number, and force jumps below this number of kT per unit of length, are
+#: information.
 _LARGE, _SMALL, _SMALL_FORCE = 1e-3, 1e-7, 1e-5
 _STEEP = 5.0  # a switch whose curvature is this many times that of the well is what limits the time step
 
 
-#: Codes that report a jump of the energy, and of the force alone.
+#: Codes that report a jump of the energy, and a jump of the force only.
 _ENERGY = ("ENERGY_JUMP", "CUTOFF_JUMP_AMONG_MANY", "JUMP_AMONG_MANY", "NEIGHBOR_CAP")
 _FORCE = ("FORCE_JUMP", "NEIGHBOR_CAP_BY_ORDER", "ORDER")
 
@@ -39,7 +40,8 @@ class SmoothnessCheck(AuditCheck):
 
     name, title, order, calls = "smoothness", "Smoothness", 50, 2100
     needed_to = ("differentiate",)
-    #: Neighbors that a crowded center gets, and routes through the structure that are scanned.
+    #: Number of neighbors of a crowded central atom, and number of paths through the structure that are
+    #: scanned.
     neighbors, routes = 160, 2
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:

@@ -17,8 +17,8 @@ from mdnum.audit.subject import Answered, CalculatorSubject, differences, larges
 from mdnum.audit.thresholds import find_thresholds
 from mdnum.units import ENERGY, FORCE, Measured
 
-#: How often one structure is asked about again: by one object at once, by it with another structure between,
-#: and by new objects.
+#: Number of repeated calls for one structure: by one object in succession, by it with another structure
+#: between, and by new objects.
 _AT_ONCE, _BETWEEN, _NEW = 4, 2, 3
 _TINY = 10.0 ** np.arange(-9, -1)  # Å by which an atom is moved a little further each time
 _KEPT = 100.0  # an answer that should have changed by so many of its last digits, and did not, was kept
