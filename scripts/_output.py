@@ -1,4 +1,4 @@
-"""What the studies share: how they are started, what they print, and how their figures look."""
+"""What scripts share: how they are started, and what they print."""
 
 from __future__ import annotations
 
@@ -6,52 +6,17 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-from cycler import cycler
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
 from mdnum.errors import MdnumError
 
-# Okabe and Ito's palette: told apart by people who do not see all colors
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
-# matplotlib types its names one by one
-_STYLE: Any = {
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "axes.prop_cycle": cycler(color=COLORS),
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10,
-    "font.size": 9,
-    "grid.color": "#e3e6ea",
-    "grid.linewidth": 0.6,
-    "legend.frameon": False,
-    "savefig.dpi": 160,
-}
-
-
-def parser(about: str | None, script: str | None = None) -> argparse.ArgumentParser:
-    """A command line with the script's docstring as its help, and -o for the figure of one that draws.
-
-    Args:
-        about: the script's docstring.
-        script: its __file__ where it draws a figure, which is called after it by default.
-    """
-    made = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    if script is not None:
-        default = Path(f"{Path(script).stem}.png")
-        made.add_argument(
-            "-o", "--output", type=Path, default=default, metavar="FILE",
-            help=f"the figure, PNG, SVG or PDF (default {default})",
-        )  # fmt: skip
-    return made
+def parser(about: str | None) -> argparse.ArgumentParser:
+    """A command line with the script's docstring as its help."""
+    return argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def start(main: Callable[[], None]) -> None:
@@ -90,16 +55,3 @@ def _cell(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def figure(width: float = 8.0, height: float = 5.0) -> Figure:
-    """An empty figure in the style of the studies."""
-    mpl.rcParams.update(_STYLE)
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def save(drawn: Figure, path: Path) -> None:
-    """Write a figure and say where."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    drawn.savefig(path)
-    say(f"figure: {path}")

@@ -7,13 +7,12 @@ import operator
 import os
 import time
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
-from _output import figure, save, say, table
+from _output import say, table
 from _processes import children_seconds, machine
 
 #: What was measured, its value, the limit, and whether it holds.
@@ -87,18 +86,3 @@ def finish(
     print("on " + result["machine"])
     show(result)
     table("\nrequired", ("what", "measured", "required", "holds"), claims(result))
-
-
-def bars(path: Path, xlabel: str, panels: Mapping[str, Sequence[tuple[str, float]]]) -> None:
-    """A panel of horizontal bars by title, on a logarithmic axis that all panels share."""
-    drawn = figure(3.6 * len(panels) + 1.4, 3.2)
-    every = drawn.subplots(1, len(panels), sharex=True, squeeze=False)[0]
-    for axes, (title, rows) in zip(every, panels.items(), strict=True):
-        names, values = zip(*rows, strict=True)
-        axes.barh(range(len(rows)), values)
-        axes.set_yticks(range(len(rows)), names)
-        axes.set_xscale("log")
-        axes.invert_yaxis()
-        axes.set_xlabel(xlabel)
-        axes.set_title(title)
-    save(drawn, path)

@@ -17,7 +17,6 @@ of the compiled one: its bytes are those of an accelerator, its times mean nothi
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import time
@@ -31,7 +30,7 @@ import _shared  # noqa: F401  what scripts share is found by it
 import jax
 import numpy as np
 from _liquid import liquid
-from _output import say, start, table
+from _output import parser, say, start, table
 from _processes import machine
 
 from mdnum.md import foreign
@@ -95,7 +94,7 @@ def measure(atoms: int, steps: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measure each size and print."""
-    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made = parser(__doc__)
     made.add_argument(
         "--sizes", nargs="+", type=int, metavar="N", default=[4_000, 32_000], help="atoms, about"
     )
@@ -118,15 +117,9 @@ def main() -> None:
         return
     print(f"on {where}: {machine()}")
     columns = (
-        "N",
-        "steps",
-        "lists",
-        "flips/step",
-        "bytes/step to host",
-        "of flips",
-        "bytes/step to device",
+        "N", "steps", "lists", "flips/step", "bytes/step to host", "of flips", "bytes/step to device",
         "steps/s",
-    )
+    )  # fmt: skip
     cells = [
         [
             f"{row['atoms']:,}", row["steps"], row["lists"], row["flips"] / row["steps"],

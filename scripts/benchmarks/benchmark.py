@@ -37,7 +37,7 @@ import numpy as np
 from _liquid import R_CUT, SKIN, liquid
 from _output import parser, say, start, table
 from _processes import memory, start_up
-from _turns import Claim, bars, claim, finish, in_turn, on_cores
+from _turns import Claim, claim, finish, in_turn, on_cores
 
 if TYPE_CHECKING:
     from mdnum.systems import Simulation
@@ -201,7 +201,7 @@ def show(result: dict[str, Any]) -> None:
 
 
 def _options() -> argparse.Namespace:
-    made = parser(__doc__, __file__)
+    made = parser(__doc__)
     made.add_argument("--quick", action="store_true", help="500 atoms and short turns: does it work?")
     made.add_argument("--full", action="store_true", help="4000, 32000 and 108000 atoms; a few minutes")
     made.add_argument("--sizes", nargs="+", type=int, metavar="N", help="atoms, about (default 4000)")
@@ -214,7 +214,7 @@ def _options() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Parse, measure, print and draw."""
+    """Parse, measure, and print."""
     chosen = _options()
     on_cores(chosen.cores)
     import _peers
@@ -237,10 +237,6 @@ def main() -> None:
     say("start-up")
     result["start_up"] = start_up()
     finish(chosen, result, show, claims)
-    panels: dict[str, list[tuple[str, float]]] = {}
-    for row in result["speeds"]:
-        panels.setdefault(f"N = {row['atoms']:,}", []).append((row["code"], row["cpu_ns_per_atom"]))
-    bars(chosen.output, "CPU ns of an atom's step, all cores", panels)
 
 
 if __name__ == "__main__":

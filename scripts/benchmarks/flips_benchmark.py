@@ -42,7 +42,7 @@ import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
 from _liquid import R_CUT, liquid
 from _output import parser, say, start, table
-from _turns import Claim, bars, claim, finish, in_turn, on_cores, seconds
+from _turns import Claim, claim, finish, in_turn, on_cores, seconds
 
 OURS, SETS, MERGE = "mdnum", "MDAnalysis, sets", "vesin, sorted merge"
 EVERY, FAR = "every step", "every 100th step"
@@ -354,7 +354,7 @@ def show(result: dict[str, Any]) -> None:
 
 
 def _options() -> argparse.Namespace:
-    made = parser(__doc__, __file__)
+    made = parser(__doc__)
     made.add_argument("--quick", action="store_true", help="500 atoms and few frames: does it work?")
     made.add_argument("--atoms", type=int, help="about so many (default 10000)")
     made.add_argument("--turns", type=int, help="turns of each contender (default 2)")
@@ -364,7 +364,7 @@ def _options() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Parse, measure, print and draw."""
+    """Parse, measure, and print."""
     chosen = _options()
     cores = on_cores(1)
     os.environ["OMP_NUM_THREADS"] = "1"
@@ -390,11 +390,6 @@ def main() -> None:
         many(moved, FAR, [kept[100 * step] for step in range(1, 4)], copies),
     ]
     finish(chosen, result, show, claims)
-    panels: dict[str, list[tuple[str, float]]] = {}
-    for row in result["speeds"]:
-        title = f"{row['frames']}: {row['flips']:,.0f} flips a frame, N = {row['atoms']:,}"
-        panels.setdefault(title, []).append((row["code"], row["cpu_ms"]))
-    bars(chosen.output, "CPU ms a frame", panels)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any
 
 import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
-from _output import figure, parser, save, say, start, table
+from _output import parser, say, start, table
 from _turns import Claim, claim, finish, in_turn, ratios, seconds
 
 if TYPE_CHECKING:
@@ -178,23 +178,8 @@ def show(result: dict[str, Any]) -> None:
                                               for one in found.values()]])  # fmt: skip
 
 
-def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Ratios by system, beside what they should not pass."""
-    drawn = figure(6.0, 1.4 + 0.6 * len(rows))
-    axes = drawn.subplots()
-    at = np.arange(len(rows))
-    axes.barh(at - 0.2, [row["cpu_ratio"] for row in rows], 0.38, label="CPU time")
-    axes.barh(at + 0.2, [row["ratio"] for row in rows], 0.38, label="clock")
-    axes.axvline(MOST_RATIO, color="black", lw=0.8, label=f"{MOST_RATIO}")
-    axes.set_yticks(at, [f"{row['system']} ({row['atoms']:,})" for row in rows])
-    axes.invert_yaxis()
-    axes.set_title(f"{TRIPLE} over one recorded run")
-    drawn.legend(loc="outside lower center", ncols=3)
-    save(drawn, path)
-
-
 def _options() -> argparse.Namespace:
-    made = parser(__doc__, __file__)
+    made = parser(__doc__)
     made.add_argument("--quick", action="store_true", help="the crystal alone, a short turn: does it work?")
     made.add_argument(
         "--systems", nargs="+", metavar="NAME",
@@ -214,7 +199,7 @@ def _options() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Parse, measure, print and draw."""
+    """Parse, measure, and print."""
     chosen = _options()
     names = chosen.systems or (
         ["argon/crystal-108"] if chosen.quick else ["argon/crystal-108", "argon/liquid-864", "4000"]
@@ -232,7 +217,6 @@ def main() -> None:
         low, high = chosen.along
         result["map"] = mapped(low, high, *((60, 1) if chosen.quick else (500, BOUNDARIES)))
     finish(chosen, result, show, claims)
-    draw(result["ratios"], chosen.output)
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ import numpy as np
 from _liquid import liquid
 from _output import parser, say, start, table
 from _processes import peak_mb
-from _turns import Claim, bars, claim, finish, in_turn, ratios
+from _turns import Claim, claim, finish, in_turn, ratios
 
 if TYPE_CHECKING:
     from mdnum.systems import System
@@ -276,7 +276,7 @@ def show(result: dict[str, Any]) -> None:
 
 
 def _options() -> argparse.Namespace:
-    made = parser(__doc__, __file__)
+    made = parser(__doc__)
     made.add_argument("--quick", action="store_true", help="256 atoms, a short turn: does it work?")
     made.add_argument("--sizes", type=int, nargs="+", metavar="N", help="atoms (default 500 4000)")
     made.add_argument("--steps", type=int, help="of a rollout (default 1000)")
@@ -298,7 +298,7 @@ def _options() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Parse, measure, print and draw."""
+    """Parse, measure, and print."""
     chosen = _options()
     if chosen.peak_of:
         method, atoms, steps = chosen.peak_of
@@ -315,10 +315,6 @@ def main() -> None:
     for atoms in sizes:
         result["rows"] += race(atoms, steps, turns, chosen.memory, tuple(chosen.without))
     finish(chosen, result, show, claims)
-    panels: dict[str, list[tuple[str, float]]] = {}
-    for row in result["rows"]:
-        panels.setdefault(f"N = {row['atoms']:,}", []).append((row["name"], row["cpu_ms"]))
-    bars(chosen.output, "CPU ms of a step", panels)
 
 
 if __name__ == "__main__":

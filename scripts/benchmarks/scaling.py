@@ -37,7 +37,7 @@ from typing import Any
 import _shared  # noqa: F401  what scripts share is found by it
 import numpy as np
 from _liquid import liquid
-from _output import figure, parser, save, say, start, table
+from _output import parser, say, start, table
 from _processes import peak_mb
 from _turns import Claim, claim, finish
 
@@ -195,30 +195,8 @@ def show(result: dict[str, Any]) -> None:
         table("\n`mdnum run` from a shell", ("what", "steps", "s", "loop s", "peak MB"), cells)
 
 
-def draw(rows: list[dict[str, float]], path: Path) -> None:
-    """Time of an atom's step and of a flip, and memory, against the number of atoms."""
-    drawn = figure(8.0, 3.4)
-    left, right = drawn.subplots(1, 2)
-    atoms = [row["atoms"] for row in rows]
-    labels = ("step, recorded, an atom", "recording, a flip", "neighbor search, an atom")
-    for name, label in zip(_COLUMNS, labels, strict=False):
-        growth = slope(rows, name)
-        left.plot(atoms, [row[name] for row in rows], "o-", label=f"{label}: N^{growth:.2f}")
-    left.set_ylabel("CPU time (µs)")
-    right.plot(atoms, [row["peak_mb"] for row in rows], "o-", label=f"N^{slope(rows, 'peak_mb'):.2f}")
-    right.set_ylabel("peak memory (MB)")
-    for axes in (left, right):
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xlabel("atoms")
-        # room for the legend
-        axes.margins(y=0.4)
-        axes.legend()
-    save(drawn, path)
-
-
 def _options() -> argparse.Namespace:
-    made = parser(__doc__, __file__)
+    made = parser(__doc__)
     made.add_argument("--sizes", nargs="+", type=int, metavar="N", default=list(SIZES), help="atoms, about")
     made.add_argument("--seconds", type=float, default=SECONDS, help="CPU time of a size's steps, about")
     made.add_argument("--no-commands", action="store_true", help="only the loop")
@@ -227,7 +205,7 @@ def _options() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Measure each size alone, on two cores and twice at a time, print and draw."""
+    """Measure each size alone, on two cores and twice at a time, and print."""
     if sys.argv[1:2] == ["--child"]:
         print(json.dumps(measure(int(sys.argv[2]), float(sys.argv[3]))))
         return
@@ -250,8 +228,6 @@ def main() -> None:
     if not chosen.no_commands:
         result["commands"] = commands(chosen.sizes)
     finish(chosen, result, show, claims)
-    if len(rows) > 1:
-        draw(rows, chosen.output)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ PAGE = ROOT / "docs" / "scripts.md"
 MARK = "<!-- written by scripts/makers/list_scripts.py -->"
 RAW = argparse.RawDescriptionHelpFormatter
 TITLES = {
-    "studies": "Studies: a question, a table and a figure",
+    "studies": "Studies: a question and a table",
     "benchmarks": "Benchmarks: how fast",
     "campaigns": "Campaigns: how often, over hundreds of cases",
     "makers": "Makers of what is shipped",

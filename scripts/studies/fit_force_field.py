@@ -29,7 +29,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import _shared  # noqa: F401  what scripts share is found by it
 import equinox as eqx
@@ -37,16 +36,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from _output import COLORS, figure, parser, save, say, start, table
+from _output import parser, say, start, table
 from ase import Atoms
 from ase.build import bulk
 from jaxtyping import Array, Float
 
+import mdnum
 from mdnum.gradients import Method, Problem, method
 from mdnum.gradients.differences import Replicas, settled
 from mdnum.gradients.losses import GreenKuboDiffusion, Loss, RadialDistribution
 from mdnum.gradients.tape import RunTape
-from mdnum.systems import Simulation, System, SystemSpec, build
+from mdnum.systems import Simulation
 
 SIGMA, EPSILON, TEMPERATURE, DENSITY = 3.405, 0.0103235, 150.0, 0.5 / 3.405**3
 """Argon (Rahman 1964), hot and half as dense as the liquid: Å, eV, K, atoms per Å³."""
@@ -122,36 +122,20 @@ class Descent:
     values: list[np.ndarray] = field(default_factory=list)
     losses: list[float] = field(default_factory=list)
     gradients: list[np.ndarray] = field(default_factory=list)
-    g: list[np.ndarray] = field(default_factory=list)
 
 
 def liquid(cells: int, radius: float) -> Simulation:
     """Argon, melted hot, under a thermostat."""
+
+    def simulation(atoms: Atoms, temperature: float) -> Simulation:
+        return mdnum.simulation(
+            atoms, mdnum.LennardJones(SIGMA, EPSILON), mdnum.Cut("hard", radius), units="metal", skin=1.0,
+            timestep=TIMESTEP, temperature=temperature, friction=2.0, seed=1,
+        )  # fmt: skip
+
     atoms = bulk("Ar", "fcc", a=(4 / DENSITY) ** (1 / 3), cubic=True).repeat(cells)
-    hot = settled(build(_system(atoms, radius, 300.0)), 500)
-    melted = atoms.copy()
-    melted.set_positions(hot.positions)
-    return build(_system(melted, radius, TEMPERATURE))
-
-
-def _system(atoms: Atoms, radius: float, temperature: float) -> System:
-    spec = SystemSpec.model_validate(
-        {
-            "units": "metal",
-            "structure": {"file": "made in memory"},
-            "potential": {"kind": "lennard-jones", "sigma": SIGMA, "epsilon": EPSILON},
-            "cutoff": {"kind": "hard", "radius": radius},
-            "neighbors": {"skin": 1.0},
-            "dynamics": {
-                "kind": "langevin",
-                "timestep": TIMESTEP,
-                "temperature": temperature,
-                "friction": 2.0,
-                "seed": 1,
-            },
-        }
-    )
-    return System(f"argon-{len(atoms)}", spec, None, atoms)
+    atoms.set_positions(settled(simulation(atoms, 300.0), 500).positions)
+    return simulation(atoms, TEMPERATURE)
 
 
 def averages(problems: Sequence[Problem], values: dict[str, float]) -> tuple[np.ndarray, float]:
@@ -166,8 +150,8 @@ def averages(problems: Sequence[Problem], values: dict[str, float]) -> tuple[np.
 
 def gradient(
     method: Method, problems: Sequence[Problem], values: dict[str, float], target: Target
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Loss of the averages, its gradient by the logarithms of the parameters, and g(r).
+) -> tuple[float, np.ndarray]:
+    """Loss of the averages, and its gradient by the logarithms of the parameters.
 
     The loss is not linear, so averages come first: each replica is then differentiated with the weights that
     the loss gives to what it adds to them.
@@ -180,7 +164,7 @@ def gradient(
         weighed = eqx.tree_at(lambda one: (one.by_g, one.by_d), problem.loss, (by_g, by_d))
         found = method(replace(problem, loss=weighed).at(values), NAMES)
         total += [float(found.gradient[name]) * values[name] for name in NAMES]
-    return float(target.loss(g, d)), total / len(problems), g
+    return float(target.loss(g, d)), total / len(problems)
 
 
 def descend(word: str, problems, target: Target, guess: np.ndarray, iterations: int, rate: float) -> Descent:
@@ -197,11 +181,10 @@ def descend(word: str, problems, target: Target, guess: np.ndarray, iterations: 
     state = optimizer.init(logs)
     for step in range(iterations + 1):
         values = dict(zip(NAMES, np.exp(np.asarray(logs)).tolist(), strict=True))
-        loss, slope, g = gradient(method(word), problems, values, target)
+        loss, slope = gradient(method(word), problems, values, target)
         path.values.append(np.exp(np.asarray(logs)))
         path.losses.append(loss)
         path.gradients.append(slope)
-        path.g.append(g)
         off = np.array(list(values.values())) / (SIGMA, EPSILON) - 1
         say(f"{word} {step:3d}: loss {loss:.3e}, sigma {off[0]:+.2%}, epsilon {off[1]:+.2%}")
         updates, state = optimizer.update(jnp.asarray(slope), state, logs)
@@ -209,30 +192,9 @@ def descend(word: str, problems, target: Target, guess: np.ndarray, iterations: 
     return path
 
 
-def draw(paths: list[Descent], target: Target, centers: np.ndarray, path: Path) -> None:
-    """How far each parameter is from the truth, step by step; and g(r)."""
-    drawn = figure(9.0, 4.0)
-    left, right = drawn.subplots(1, 2)
-    for one, style in zip(paths, ("-", ":"), strict=False):
-        off = 100 * (np.array(one.values) / (SIGMA, EPSILON) - 1)
-        for k, word in enumerate(("sigma", "epsilon")):
-            left.plot(off[:, k], style, color=COLORS[k], label=f"{word}, {one.method}")
-    left.axhspan(-1, 1, color="#e3e6ea", zorder=0)
-    left.set_title("from the truth, % (gray: within 1)")
-    left.set_xlabel("step of the descent")
-    left.legend()
-    right.plot(centers, target.g, color=COLORS[6], lw=2.5, label="target")
-    right.plot(centers, paths[0].g[0], color=COLORS[1], label="guess")
-    right.plot(centers, paths[0].g[-1], "--", color=COLORS[5], label="found")
-    right.set_title("g(r)")
-    right.set_xlabel("r (Å)")
-    right.legend()
-    save(drawn, path)
-
-
 def main() -> None:
-    """Parse, make the target, descend with each gradient, print and draw."""
-    made = parser(__doc__, __file__)
+    """Parse, make the target, descend with each gradient, and print."""
+    made = parser(__doc__)
     made.add_argument("--cells", type=int, default=3, help="fcc cells along an edge (default 3: 108 atoms)")
     made.add_argument("--radius", type=float, default=5.45, help="hard cutoff, Å (default 5.45, 1.6 sigma)")
     made.add_argument("--steps", type=int, default=200, help="of each rollout (default 200)")
@@ -295,7 +257,6 @@ def main() -> None:
             for one in paths
         ),
     )
-    draw(paths, target, np.asarray(seen.rdf.centers), chosen.output)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Each study runs from its command line with small settings and leaves its table and its figure."""
+"""Each study runs from its command line with small settings and leaves its table."""
 
 from __future__ import annotations
 
@@ -76,11 +76,6 @@ def rows(table: str, columns: str, *firsts: str | tuple[str, ...]) -> list[dict[
     return [dict(zip(columns.split(), cells, strict=False)) for cells in found]
 
 
-def is_png(path: Path) -> bool:
-    """Whether a file holds a picture."""
-    return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
-
-
 @pytest.mark.parametrize("name", STUDIES)
 def test_help_says_the_question_and_how_to_read_the_answer(name: str, here) -> None:
     text = here(name, "--help")
@@ -111,7 +106,7 @@ def test_trusted_gradients_of_a_listed_network_are_those_of_differences(tmp_path
 
 @pytest.mark.nightly
 def test_the_benchmark_measures_what_it_names(tmp_path: Path) -> None:
-    made = json.loads(study("benchmark", "--quick", "--turns", "1", "--json", "-o", "b.png", cwd=tmp_path))
+    made = json.loads(study("benchmark", "--quick", "--turns", "1", "--json", cwd=tmp_path))
     speeds = {one["code"]: one for one in made["speeds"]}
     assert {"mdnum, recorded", "mdnum, unrecorded", "jax-md loop"} <= set(speeds)
     assert all(one["steps_per_second"] > 0 and one["cpu_ms_per_step"] > 0 for one in speeds.values())
@@ -122,7 +117,6 @@ def test_the_benchmark_measures_what_it_names(tmp_path: Path) -> None:
     assert all(one["flips"] > 0 for one in made["memory"])
     assert set(made["list_builds_ms"]["500"]) == {"mdnum host", "vesin", "jax-md update"}
     assert made["start_up"]["cpu_seconds"] > 0
-    assert is_png(tmp_path / "b.png")
 
 
 @pytest.mark.nightly
@@ -140,7 +134,7 @@ def test_no_table_and_no_row_of_positions_leaves_an_accelerator(tmp_path: Path) 
 
 @pytest.mark.nightly
 def test_the_benchmark_of_flips_measures_what_it_names(tmp_path: Path) -> None:
-    made = json.loads(study("flips_benchmark", "--quick", "--json", "-o", "b.png", cwd=tmp_path))
+    made = json.loads(study("flips_benchmark", "--quick", "--json", cwd=tmp_path))
     speeds = {(one["frames"], one["code"]): one for one in made["speeds"]}
     for frames in ("every step", "every 100th step"):
         ours, merged = (speeds[frames, code] for code in ("mdnum", "vesin, sorted merge"))
@@ -152,7 +146,6 @@ def test_the_benchmark_of_flips_measures_what_it_names(tmp_path: Path) -> None:
     assert all(taken["command", frames] > taken["reading", frames] > 0 for frames in (60, 240))
     assert len(made["memory"]) == 4
     assert {one["atoms"] for one in made["many"]} == {1000}
-    assert is_png(tmp_path / "b.png")
 
 
 @pytest.mark.nightly
@@ -165,25 +158,13 @@ def test_balls_are_timed_against_their_own_recorded_run(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_the_cost_of_a_comparison_is_a_ratio(tmp_path: Path) -> None:
-    words = ["--quick", "--no-answers", "--json", "-o", "r.png"]
+    words = ["--quick", "--no-answers", "--json"]
     made = json.loads(study("fork_benchmark", *words, cwd=tmp_path))
     (one,) = made["ratios"]
     assert one["system"] == "argon/crystal-108" and one["atoms"] == 108
     # three runs; on a busy machine a clock can say anything
     assert 1 < one["cpu_ratio"] < 30
     assert one["triple_compile"] > 0
-    assert is_png(tmp_path / "r.png")
-
-
-@pytest.mark.nightly
-def test_a_gradient_in_float32_agrees_with_one_in_float64_over_a_short_horizon(tmp_path: Path) -> None:
-    words = ["--cutoffs", "quintic", "--steps", "100", "--points", "5", "--replicas", "0", "-o", "g.png"]
-    table = study("gradient_horizon", *words, cwd=tmp_path)
-    (found,) = rows(table, "cutoff growth exponent float32 float64 ratio scatter flips", "quintic")
-    # neither format reaches the tolerance, no other start was asked for
-    assert [found[word] for word in ("float32", "float64", "ratio", "scatter")] == ["-"] * 4
-    assert 0 < float(found["growth"]) < 0.1 and 0 < float(found["exponent"]) < 0.1
-    assert is_png(tmp_path / "g.png")
 
 
 @pytest.mark.nightly
