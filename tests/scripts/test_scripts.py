@@ -84,19 +84,6 @@ def test_help_says_the_question_and_how_to_read_the_answer(name: str, here) -> N
 
 
 @pytest.mark.nightly
-def test_ase_agrees_and_searches_are_listed_with_where_they_stop(here) -> None:
-    words = ["argon/crystal-108", "--every-kind", "none", "--pairs", "argon/crystal-108"]
-    table = here("ase_comparison", *words)
-    compared = row(table, "argon/crystal-108", "hard")
-    assert compared[-1] == "yes"
-    assert float(compared[3]) <= 1e-12
-    assert float(compared[4]) <= 1e-10
-    assert row(table, "vesin")[-1] == "agrees"
-    assert row(table, "vesin")[-2] == "-1 ulp"
-    assert any("relative" in cell for cell in row(table, "mdanalysis"))
-
-
-@pytest.mark.nightly
 def test_trusted_gradients_of_a_listed_network_are_those_of_differences(tmp_path: Path) -> None:
     words = ["--only", "the same, listed", "--seeds", "2"]
     *_, last = study("learned_gradients", *words, "--store", "starts", cwd=tmp_path).strip().splitlines()
