@@ -36,31 +36,35 @@ from mdnum.program import Progress, Twin
 from mdnum.rollout.engine import Start, first_state
 from mdnum.systems.simulation import Simulation
 
-#: Components that are compared, at most; fewer where so much of the variance is explained by fewer.
+#: Largest number of compared components; fewer if they explain this share of the variance.
 COMPONENTS, _EXPLAINED = 10, 0.999
-#: Runs of one verdict.
+#: Number of runs of one verdict.
 RUNS = 3
-#: A component beyond so many standard deviations stands out; more where an ensemble has wider tails.
+#: Number of standard deviations beyond which a component is an outlier; larger if an ensemble has wider
+#: tails.
 LIMIT = 2.0
-#: Share of the ensemble's own runs that may stand out: two of three do then in 2.8 % of all tries.
+#: Share of the runs of the ensemble that may be outliers; two of three are then outliers in 2.8 % of all
+#: tests.
 ALONE = 0.1
-#: False positives that are accepted.
+#: Accepted rate of false positives.
 ACCEPTED = 0.04
 _FOLDS = 10
 # a feature whose spread is rounding has none
 _ROUNDING = 1e-14
-#: Windows that are tried, as shares of the step at which two members have split; where they do not, of this.
+#: Tested windows, as shares of the step at which two members split; if they do not split, of the given number
+#: of steps.
 _SHARES, _UNSPLIT = (0.07, 0.15, 0.25, 0.4, 0.55, 0.7, 0.85), 1000
-#: Runs have split where they are so many cutoffs apart.
+#: Separation at which runs count as split, in cutoffs.
 _SPLIT = 0.04
-#: A window is good where every planted change is so many limits away, and the latest good one is taken:
-#: a change that acts rarely has then had time to act.
+#: Factor by which every deliberate change must exceed its limit in a usable window; the latest usable window
+#: is chosen, so that changes with rare effects have time to act.
 _CLEAR = 3.0
-#: Fewer members than this have no tail to set a limit by.
+#: Smallest number of members for which a limit can be estimated.
 FEWEST = 20
-#: Features that are named, at most; one is where it matters so much, relative to the one that matters most.
+#: Largest number of features that are named, and smallest weight of a named feature relative to the largest
+#: weight.
 _NAMED, _TELLING = 5, 0.02
-#: Noise of B's runs; no seed of a calibration's.
+#: Random seed of the noise of runs B, which differs from those of calibrations.
 _SEED = 1_000_003
 
 

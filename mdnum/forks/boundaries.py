@@ -25,8 +25,8 @@ from mdnum.systems import BallSystem, opened
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
 
-#: Boundaries that are searched for, unless more are asked for: as many as a figure can name, and more of a
-#: ball, whose runs take no time.
+#: Default for the largest number of boundaries, as many as a figure can label; more for a ball, whose runs
+#: are fast.
 MOST, MOST_BALL = 24, 64
 
 
@@ -132,7 +132,7 @@ class NumberLine:
         self, program: Program, number: Number, steps: int, loss: Callable[..., float] | None = None
     ):
         self.program, self.number, self.steps, self.loss = program, number, steps, loss
-        #: What is kept of each run: everything but its marks and its last state.
+        #: Stored data of each run: everything except its marks and its last state.
         self.known: dict[int, DecisionHistory] = {}
 
     def value(self, place: int) -> float:

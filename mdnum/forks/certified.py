@@ -33,9 +33,9 @@ from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.describe import program
 from mdnum.systems.simulation import Simulation
 
-#: Ambiguous decisions that are listed; the count covers all of them.
+#: Largest number of ambiguous decisions that are listed; the count includes all.
 LISTED = 10_000
-#: Binary digits behind the point to which the square root of an exact squared distance is taken.
+#: Number of binary digits after the point of the square root of an exact squared distance.
 _ROOT_BITS = 400
 
 

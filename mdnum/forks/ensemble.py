@@ -21,14 +21,15 @@ from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, 
 from mdnum.rollout.program import MdProgram
 from mdnum.systems.simulation import Simulation
 
-#: Hats of the pair histogram, which reaches so many times the cutoff, or to half the box.
+#: Number of basis functions (hats) of the pair histogram, and its range in cutoffs, which is limited to half
+#: the box.
 HATS, _REACH = 24, 1.5
-#: Displacement of the furthest atom of a start, in float32 ulps of the largest coordinate. An atom then
-#: moves by more than ten: the rounding of a single precision run must drown in it.
+#: Largest displacement of an atom of a starting state, in float32 ulps of the largest coordinate, so that it
+#: exceeds the rounding errors of a single-precision run.
 NOISE = 40
-#: A pair of members is followed no further than this, and compared so often.
+#: Largest number of steps for which a pair of members is followed, and number of steps between comparisons.
 _LONGEST, _EVERY = 20_000, 50
-#: What planted changes multiply the time step and the cutoff radii by.
+#: Factors of deliberate changes on the time step and the cutoff radii.
 _TIMESTEP, _RADIUS = 1.025, 0.96
 
 _NUMBERS = (

@@ -31,22 +31,24 @@ if TYPE_CHECKING:
 
 Difference = tuple[str, Any, Any]
 
-#: Of a system file by world, what does not decide what is computed, and what makes it another system.
+#: For each world: keys of a system file that do not affect the computation, and keys that make it a different
+#: system.
 _ELSEWHERE = {
     "md": ("about", "name", "record.save_every", "dynamics.steps", "fork", "gradient", "variants"),
     "ball": ("about", "name", "loss", "fork", "gradient", "variants"),
     "flips": (),
 }
 _SYSTEM = {"md": ("units", "potential.kind"), "ball": ("contact.kind", "integrator.kind"), "flips": ()}
-#: What is said of positions that a loop or a file gave, and may differ.
+#: Properties of positions from a loop or a file that may differ.
 _GIVEN = ("format", "length", "time", "slice")
-#: Stored at every step; that one of them differs in a bit means that the state does.
+#: Quantities stored at every step; if a bit of one of them differs, the states differ.
 _NUMBERS = ("potential", "kinetic", "displacement", "min_margin")
-#: Of the provenance, what bits depend on; its fingerprint is a hash of these and of the dtypes.
+#: Entries of the provenance on which bits depend; the fingerprint is a hash of these and of the dtypes.
 _ARITHMETIC = ("versions", "cpu", "devices", "jax_settings", "environment")
-#: What drawn velocities come from.
+#: Keys that determine randomly drawn velocities.
 _DRAWN = ("dynamics.temperature", "dynamics.seed", "dynamics.remove_drift", "structure.velocities")
-#: Boxes and masses are those of one system up to this part; they may differ in their last digits.
+#: Relative difference of boxes and masses up to which two systems count as the same; their last digits may
+#: differ.
 _SAME = 1e-6
 
 

@@ -34,18 +34,18 @@ from mdnum.rollout.engine import FAILURES, Engine, Segment
 from mdnum.rollout.epoch import over_rows
 from mdnum.systems.simulation import Simulation
 
-#: Decisions of a step that are kept: those which the perturbation reaches first.
+#: Number of decisions per step that are stored: those which the perturbation reaches first.
 KEPT = 3
-#: Time steps by which velocities are multiplied where a length of the tangent is asked for.
+#: Number of time steps by which velocities are multiplied in the norm of a tangent.
 _CLOCK = 30
-#: Beyond this displacement, as a share of the cutoff, a forecast is not to be relied on. Measured on argon's
-#: crystal: every first flip was predicted up to 0.006, one of two at 0.02, none of six late ones at 0.04.
+#: Displacement, as a share of the cutoff, above which a forecast is unreliable. For a crystal of argon every
+#: first flip was predicted up to 0.006, one of two at 0.02, and none of six late ones at 0.04.
 LINEAR = 5e-3
-#: How far off the amplitude of a flip may be, as a share of it, for each cutoff of displacement. Measured on
-#: a crystal, cold, warm and with a continuous force, and a liquid: 196 at most in 304 decisions, 15 in seven
-#: of eight; it is large where a pair moves across its axis and hardly along it.
+#: Relative error of the amplitude of a flip, for each cutoff of displacement. Measured for a crystal (cold,
+#: warm, and with a continuous force) and a liquid: at most 196 in 304 decisions, 15 in seven of eight; it is
+#: large if a pair moves perpendicular to its axis.
 _SECOND_ORDER = 200.0
-#: Rounding perturbs a run by no more than so many ulps of its start.
+#: Largest perturbation of a run by rounding, in ulps of its starting state.
 _ULPS = 8.0
 
 

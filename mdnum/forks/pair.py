@@ -34,18 +34,18 @@ from mdnum.systems import BallSystem
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
 
-#: The split tolerance as a share of the longest cutoff, or of the largest start height. Flips that split a
-#: crystal do so slowly, and its atoms have no room to be much further apart; docs/verdict-calibration.md has
-#: the verdicts by tolerance.
+#: Split tolerance as a share of the longest cutoff or the largest initial height. Flips separate the runs of
+#: a crystal slowly, and its atoms cannot move far apart; docs/verdict-calibration.md gives verdicts by
+#: tolerance.
 SPLIT = 0.01
-#: A run is followed for so many times the steps to its split, so that "did not split" means something.
+#: Factor on the step of the split up to which a run is continued, so that "did not split" is a result.
 _BEYOND = 2.0
-#: A counterfactual ends when an imposed decision is so many tolerances from its threshold.
+#: A counterfactual ends if the margin of an imposed decision exceeds this number of tolerances.
 _GUARD = 3.0
-#: Repeats are perturbed by what a choice does within so many steps, and by so many tolerances at most: a
-#: choice that changes everything at once still leaves room. The other displacement is so many times smaller.
+#: Number of steps after which the effect of a choice determines the displacement of repeats, and its largest
+#: value in tolerances; and the factor by which the second displacement is smaller.
 _SOON, _LARGEST, _DECADES = 100, 1e-3, 100.0
-#: Cross-run flips that are kept; the counts cover all of them.
+#: Largest number of stored cross-run flips; the counts include all.
 FLIPS_KEPT = 100_000
 
 

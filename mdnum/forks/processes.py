@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 
 ProgramName = Literal["scan", "rollout", "vmap", "grad", "eager"]
 
-#: Steps of the eager program: operation by operation, a step takes a hundred times as long.
+#: Largest number of steps of the eager program, whose steps take a hundred times as long.
 _EAGER_STEPS = 12
-#: Copies in a batch.
+#: Number of copies in a batch.
 _BATCH = 4
-#: Variants that run at a time, and how long one may take, s.
+#: Number of simultaneous variants, and time limit of one variant, s.
 _PROCESSES, _TIMEOUT = 2, 600
 _NO_FMA = ("--xla_cpu_max_isa=AVX",)
 

@@ -25,7 +25,7 @@ from mdnum.md.neighbors import ListBuilder, PairTable, VerletList
 from mdnum.numerics.sums import Halves, Reduction, Sequential, Twice
 from mdnum.systems.simulation import Simulation
 
-#: The sums that go with each format.
+#: Order of the sum over neighbors for each list format.
 _SUMS: Mapping[str, Reduction] = {"dense": Twice(), "sparse": Sequential(), "ordered-sparse": Halves()}
 
 

@@ -28,11 +28,11 @@ from mdnum.rollout.lockstep import beside
 from mdnum.rollout.program import pair_bound, pair_margin
 from mdnum.rollout.tracks import Track
 
-#: How far around the pair atoms are shown, in its cutoffs.
+#: Distance from the pair up to which atoms are shown, in cutoffs of the pair.
 REACH = 1.25
-#: A minimal cause keeps the runs together up to so many times the step of the split.
+#: Factor on the step of the split up to which a minimal cause must keep the runs together.
 _BEYOND = 1.25
-#: Positions of A are kept at so many steps of a search.
+#: Number of steps of a search at which positions of A are stored.
 _SAMPLES = 400
 
 

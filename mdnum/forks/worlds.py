@@ -18,12 +18,12 @@ from mdnum.systems.toml import flat
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
 
-#: What has a dtype of its own, by world.
+#: Roles with separate dtypes, by world.
 ROLES = {
     "md": ("state", "force", "decision", "accumulate"),
     "ball": ("state", "arithmetic", "decision", "accumulate"),
 }
-#: Of a system file, tables that do not enter a step.
+#: Tables of a system file that do not affect a step.
 _BALL_ELSEWHERE = ("loss", "gradient", "variants", "precision", "fork")
 
 

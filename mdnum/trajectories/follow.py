@@ -43,10 +43,10 @@ from mdnum.trajectories.trajectory import Trajectory
 from mdnum.trajectories.unwrapping import Unwrapping
 
 Pair = tuple[int, int, int]
-#: Takes rows of a table: its name and equally long columns.
+#: Function that receives the name of a table and its columns of equal length.
 Sink = Callable[[str, dict[str, Any]], None]
 
-#: Rows of the table of pairs that come to differ.
+#: Largest number of rows of the table of pairs that begin to differ.
 ROWS = 1_000
 _FIRST = 8
 # frames at which the flux through the threshold is measured from velocities

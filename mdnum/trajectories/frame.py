@@ -28,7 +28,7 @@ _LEAP_BOXES, _LEAP_SIZES = 100.0, 1e4
 _SOME = 500
 _UNIT = {32: 2.0**-24, 64: 2.0**-53}
 
-#: Indices of some atoms of a file; None for all.
+#: Indices of selected atoms of a file; None for all.
 AtomIndices = Int[np.ndarray, "chosen"] | None
 
 

@@ -14,7 +14,8 @@ from jaxtyping import Float, Int
 from mdnum.md.ledger import Members
 from mdnum.trajectories.frame import Frame
 
-#: Width of a box over the reach below which pairs are followed by shift; above 2, since a box may shrink.
+#: Ratio of the width of a box to the range below which pairs are tracked by shift; above 2, because a box may
+#: shrink.
 NARROW = 2.2
 # images of pairs that are examined together; and of one pair that are told apart, along each vector
 _TOGETHER, _APART = 1_000_000, 256

@@ -51,7 +51,7 @@ _WIDE, _DISAGREE, _NO_ANSWER = 2.0, 0.75, 0.5
 # an estimate below it may be of a file that holds every step; crossings below which they are no rate
 _MAYBE_NONE, _CROSSED = 0.02, 20
 
-#: The logarithm of the odds of a share, and its standard deviation.
+#: Logarithm of the odds of a share, and its standard deviation.
 Estimate = tuple[float, float]
 
 

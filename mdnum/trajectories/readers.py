@@ -21,7 +21,7 @@ _SLICE = re.compile(r"(-?\d+)?(:(-?\d+)?(:(-?\d+)?)?)?")
 _ASE_SUFFIXES = frozenset({".traj", ".json", ".db", ".bundle", ".castep", ".xsf", ".con"})
 # Amber's, of which MDAnalysis reads those that are whole
 _NETCDF = frozenset({"nc", "ncdf", "netcdf"})
-#: What to do with frames that are not in a file.
+#: Remedy for frames that are not in a file.
 IN_MEMORY = "Give the path of a trajectory; arrays go into mdnum.flips(array, cell=...) or a mdnum.Recorder"
 
 
@@ -30,7 +30,7 @@ def _concrete(reader: Any) -> None:
         raise TypeError(f"it has no {' and no '.join(missing)}")
 
 
-#: Formats in the word of `--format` and of the end of a file's name; others are MDAnalysis's or ASE's.
+#: Readers by the name of `--format` and by file extension; other formats are read by MDAnalysis or ASE.
 READERS: Registry[Trajectory] = Registry(
     "trajectory format", "mdnum.trajectories", kind=Trajectory, check=_concrete
 )

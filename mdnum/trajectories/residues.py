@@ -28,7 +28,7 @@ from mdnum.trajectories.tracker import Groups, Tracker
 # sites that no atom is at, by the names of GROMACS, AMBER and CHARMM; the last two of water alone
 _VIRTUAL = re.compile(r"MW\d*|EPW?\d*|LP[A-Z]?\d*|MCH3|MNH3|DUM\w*")
 _OF_WATER, _WATER = frozenset({"M", "OM"}), re.compile(r"HOH|WAT|SOL|H2O|TIP\w*|TP\w*|OPC\w*")
-#: Points in time of a map of contacts.
+#: Largest number of points in time of a map of contacts.
 MOMENTS = 200
 # pairs of residues whose atoms are examined together
 _TOGETHER = 20_000

@@ -127,7 +127,7 @@ class Resolution:
         return float(steps_of(np.array(frame.furthest), self.step, self.digits)) / 2
 
 
-#: Of coordinates that are rounded to float32 and to nothing else.
+#: Resolution of coordinates that are rounded only to float32.
 FLOAT32 = Resolution("float32", 0.0, 32, 0)
 
 

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
 
-#: radius of a pair of species that is never inside
+#: Radius of a pair of species that is never inside.
 NEVER = -1.0
 
 

@@ -34,7 +34,7 @@ from mdnum.trajectories.lattice import (
 )
 from mdnum.trajectories.rules import Capped, Nearest
 
-#: more pairs than this would take longer than anybody waits
+#: Largest number of pairs; a search for more would take too long.
 MOST_PAIRS = 2_000_000_000
 # bytes that a pair takes while members are sorted, as measured
 _BYTES = 95

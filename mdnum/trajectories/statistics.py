@@ -27,7 +27,7 @@ from mdnum.md.ledger import Columns
 from mdnum.trajectories.history import Contacts, History, Strides, Sums, contacts, doublings, mended
 from mdnum.trajectories.topology import AtomTable
 
-#: Stays from which the share that is inside again is taken: all of them in most files.
+#: Largest number of contacts from which the fraction of returning pairs is computed.
 _AGAIN_STAYS = 200_000
 _BUSIEST = 500
 _POINTS = 160

@@ -25,11 +25,11 @@ from mdnum.trajectories.lattice import Participants, Placed, wrap
 from mdnum.trajectories.search import Changed, exact_square
 from mdnum.vectors import SIXTEEN, lowest_bit, near_atom, near_box
 
-#: atoms of a cluster
+#: Number of atoms of a cluster.
 CLUSTER = SIXTEEN
-#: tiles are to serve while atoms move so many times their root mean square displacement of one frame
+#: Displacement for which tiles remain valid, in root mean square displacements per frame.
 FRAMES, FEWEST = 60.0, 5.0
-#: largest margin around a cluster's box, and largest such displacement, as shares of the radius
+#: Largest margin around the box of a cluster, and largest such displacement, as shares of the radius.
 LARGEST, FURTHEST = 0.3, 0.5
 # lattice vectors between two atoms that were wrapped, as integers; the one in the middle is none
 _VECTORS = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)

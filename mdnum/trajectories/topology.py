@@ -30,7 +30,7 @@ from mdnum.errors import InputError
 from mdnum.reading import check_claim, reading
 from mdnum.trajectories.frame import Box
 
-#: what a reader of results from MDAnalysis's coordinates should know
+#: Note on results that are read from coordinates by MDAnalysis.
 NARROWED = "MDAnalysis hands every coordinate over in float32, whatever the file stores."
 
 _UNNAMED = "The file says how many atoms there are and nothing else; names and elements need a topology."

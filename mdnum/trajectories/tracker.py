@@ -37,7 +37,7 @@ from mdnum.trajectories.tiles import Tiles, tiles_of
 
 #: Indices of the atoms on either side of a pair; None for all.
 Groups = tuple[Int[np.ndarray, "first"] | None, Int[np.ndarray, "second"] | None]
-#: `Tracker.min_margin` looks this share of the radius away from it
+#: Range of distances around the radius that `Tracker.min_margin` examines, relative to the radius.
 HORIZON = 0.02
 
 

@@ -23,7 +23,7 @@ from mdnum.trajectories.frame import Box, Frame, FrameCheck
 from mdnum.trajectories.repeats import RepeatedFrames
 from mdnum.trajectories.topology import AtomTable, Topology
 
-#: Frames from which the resolution of a file is read.
+#: Number of frames from which the resolution of a file is determined.
 SAMPLE = 8
 
 

@@ -34,8 +34,8 @@ class Recorder:
     """Recorder of flips, and of pairs that the neighbor list in use lacks, for any simulation loop.
 
     The loop need not be changed; the data given to `see` lead to the same folder, findings and page as
-    `mdnum.flips` for a file with the same frames. Decisions are derived from the positions in float64, with a
-    bound on what positions in float32 leave undecided.
+    `mdnum.flips` for a file with the same frames. Decisions are computed from the positions in float64; an
+    error bound marks decisions that float32 positions leave uncertain.
 
     Example:
         >>> with mdnum.Recorder(8.5, box=box, fractional=True, out="runs/mine") as rec:

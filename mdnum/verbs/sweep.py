@@ -1,4 +1,4 @@
-"""`mdnum sweep`: which choices move which results, which do not, and the cheapest setting that is enough."""
+"""`mdnum sweep`: which choices change which results, and the cheapest setting that is accurate enough."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ def sweep(
     keep_runs: bool = False,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Which choices move which results, by how many errors; and the cheapest setting that is enough.
+    """Find which choices change which results, and the cheapest setting that is accurate enough.
 
-    Points are stored by what they are made of: of the same sweep with more values, seeds or measures only
-    what is new is computed, and one that was stopped goes on when it is asked again.
+    Points are stored under names derived from their input. If a sweep is repeated with more values, seeds or
+    measures, only the new points are computed; a stopped sweep continues when it is called again.
 
     Example:
         >>> mdnum.sweep("argon/liquid-864", {"dynamics.timestep": [0.001, 0.002, 0.004]}, seeds=8)
@@ -66,31 +66,33 @@ def sweep(
         system: a simulation, a system, a shipped name or the path of a system file.
         over: values by key of the system file, or texts as on the command line: "cutoff.radius=7:9:0.5",
             "dynamics.timestep=0.001,0.002", "precision".
-        seeds: how many, or which, `dynamics.seed` has: each draws velocities and noise anew. A ball, of which
-            nothing is drawn, is run once.
-        measure: names of `mdnum.sweeps.measures.MEASURES`; default the usual ones of the system's world.
-        steps: of a run at the system's own time step, default the system's: all runs take the same time.
-        design: "one-at-a-time" around the system's own values, "factorial", or "space-filling" between the
+        seeds: the number of random seeds, or the values of `dynamics.seed`; each gives different initial
+            velocities and noise. A ball, which has no random numbers, is run once.
+        measure: names of `mdnum.sweeps.measures.MEASURES`; default those for molecular dynamics or balls.
+        steps: number of steps of a run at the time step of the system, by default that of the system; all
+            runs cover the same simulated time.
+        design: "one-at-a-time" around the values of the system, "factorial", or "space-filling" between the
             ends of each choice.
-        samples: of a space-filling design, a power of two.
-        tolerance: how far a result may be from the converged one: by measure in its unit, or one number as a
-            share of each measure's size. Without it nothing is recommended.
-        converged: the end of an axis that counts as converged, by key: "largest", "smallest" or a value;
+        samples: number of samples of a space-filling design, a power of two.
+        tolerance: largest difference from the converged result, by measure in its unit, or one number
+            relative to the magnitude of each measure; without it, no value is recommended.
+        converged: the end of an axis that is regarded as converged, by key: "largest", "smallest" or a value;
             default the largest cutoff, the smallest time step, the largest system, double precision.
-        on: where to compute: tcp://host:port of a dask scheduler, a TOML file that describes an executor of
-            executorlib, such as jobs of SLURM, or any `concurrent.futures.Executor`;
-            default processes of this machine.
-        workers: processes; default one for each core.
-        points_in: folder of the points, which sweeps may share; default "sweep-points" beside the new folder.
-        save_every: steps between frames, where a measure needs frames; default 200 frames a run.
+        on: executor of the points: tcp://host:port of a dask scheduler, a TOML file that describes an
+            executor of executorlib, such as SLURM jobs, or any `concurrent.futures.Executor`; default local
+            processes.
+        workers: number of processes; default one per core.
+        points_in: folder of the points, which several sweeps may share; default "sweep-points" next to the
+            new folder.
+        save_every: number of steps between frames, if a measure needs frames; default 200 frames per run.
         keep_runs: keep the run folder of each point.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        its tables are points, estimates, differences and settings.
+        an outcome with the tables points, estimates, differences and settings.
 
     Raises:
-        InputError: a choice, a measure or an engine that there is not, or a system that cannot be run.
+        InputError: a choice, a measure or an executor does not exist, or the system cannot be run.
         FolderError: a folder cannot be used.
     """
     question = Question(seeds, measure, steps, design, samples, tolerance, converged, save_every)
@@ -113,7 +115,7 @@ def sweep(
 
 
 def command(system: str, *, over: Sequence[str] = (), dry_run: bool = False, **given: Any) -> Any:
-    """`mdnum sweep`: options as texts."""
+    """Execute `mdnum sweep`, whose options are texts."""
     for name in ("tolerance", "converged"):
         if texts := given.pop(name, None):
             given[name] = _assignments(name, frame.words(texts))
@@ -136,7 +138,7 @@ def _assignments(name: str, texts: Sequence[str]) -> Any:
 
 
 def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
-    """What a sweep would compute: points, those that are there, time and disk."""
+    """Return what a sweep would compute: number of points, stored points, time and disk space."""
     from mdnum.verbs import Reply
 
     where = given.pop("points_in", None) or Path(given.get("out") or "runs/x").parent / "sweep-points"
@@ -167,7 +169,7 @@ def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
 def _compute(
     place: Workspace, plan: Plan, log: Any, on: Any, workers: int | None, keep: bool, code: bool
 ) -> dict[str, Any]:
-    """Computes the points that are not there, and waits for those that another sweep computes."""
+    """Compute the missing points, and wait for points that another sweep is computing."""
     wanted = {one.address: one for one in plan.points if not one.wrong}
     missing = [a for a in wanted if not enough(place.result(a), plan.wanted)]
     missed = place.nearest(wanted[missing[0]].state) if missing else None
@@ -245,7 +247,7 @@ def _compute(
 def _after_a_loss(
     place: Workspace, one: Task, wanted: Mapping[str, Planned], error: BaseException, counts: dict[str, Any]
 ) -> list[list[Planned]]:
-    """Points of a task whose process died each time: this sweep gives up the one it was at work on."""
+    """Handle a task whose process died each time: the point that it was computing is omitted."""
     from mdnum.sweeps.points import write_result
 
     again = []

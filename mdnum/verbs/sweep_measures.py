@@ -1,7 +1,7 @@
-"""Measures of a sweep that run a system again: forks of two runs, and gradients with their trusted horizon.
+"""Measures of a sweep that need further runs: forks of two runs, and gradients with their horizon.
 
-They are added to `mdnum.sweeps.measures.MEASURES` from here, above the forks and gradients that they are made
-of.
+This module adds them to `mdnum.sweeps.measures.MEASURES`, because `sweeps` may not import forks and
+gradients.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def _twin(simulation: Any, steps: int, argument: str) -> Any:
 
 
 def _pair(run: Sample, argument: str) -> Any:
-    """The run and its twin, followed until they split: by default one coordinate starts an ulp away."""
+    """Run a system and its twin until they split; by default they differ by an ulp of one coordinate."""
     from mdnum.forks import fork
 
     if ("fork", argument) not in run.made:
@@ -59,7 +59,7 @@ def separation(run: Sample, argument: str) -> Value:
 
 
 def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
-    """The loss and the full name of the parameter that LOSS/PARAMETER names."""
+    """Return the loss and the full name of the parameter in LOSS/PARAMETER."""
     from mdnum.gradients import parameters
     from mdnum.gradients.losses import parse
 
@@ -74,7 +74,7 @@ def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
 
 
 def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
-    """The diagnosis of a gradient as `grad` makes it, and the full name of the parameter."""
+    """Return the diagnosis of a gradient, as in `grad`, and the full name of the parameter."""
     from mdnum.gradients import Problem
     from mdnum.gradients.diagnose import diagnose
 

@@ -1,4 +1,4 @@
-"""How `mdnum sweep` is judged and shown: which choices move what, what could have been seen, what to use."""
+"""Verdict and report page of `mdnum sweep`: significant changes, detection limits, recommended values."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ROWS, _POINTS, _VALUES = 500, 300, 20
 
 
 def _shown(view: View, name: str) -> str:
-    """A measure's name without the folder of its file, or with as much of it as tells it from the others."""
+    """Return the name of a measure, with the part of its path that distinguishes it from others."""
     parts, others = Path(name).parts, [one["name"] for one in view.summary["measures"] if one["name"] != name]
     ends = ["/".join(parts[-k:]) for k in range(1, len(parts))] if ".py:" in name else []
     return next((end for end in ends if not any(one.endswith(f"/{end}") for one in others)), name)
@@ -35,7 +35,7 @@ def _unit(view: View, name: str) -> str:
 
 
 def _moved(view: View) -> dict[str, list[str]]:
-    """Measures that each choice moves."""
+    """Return the measures that each choice changes."""
     found: dict[str, list[str]] = {axis["key"]: [] for axis in view.summary["axes"]}
     physical = {one["name"] for one in view.summary["measures"] if one["physical"]}
     for row in view.summary["differences"]:
@@ -46,7 +46,7 @@ def _moved(view: View) -> dict[str, list[str]]:
 
 
 def judge(view: View) -> Verdict:
-    """Which choices move which results, and what to use."""
+    """Return the verdict: which choices change which results, and recommended values."""
     s = view.summary
     moved = _moved(view)
     said = [TEXTS("moves", key=key, measures=listed(names)) for key, names in moved.items() if names]
@@ -104,7 +104,7 @@ def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
 
 
 def _advised(view: View, advice: Mapping[str, Any]) -> str:
-    """A sentence on what to use along an axis."""
+    """Return a sentence on the recommended value of an axis."""
     key, end, best = advice["choice"], advice["end"], advice["best"]
     seeds = len(view.summary["seeds"])
     if key in FREE:
@@ -120,7 +120,7 @@ def _advised(view: View, advice: Mapping[str, Any]) -> str:
 
 
 def _together(view: View) -> list[str]:
-    """A sentence on all recommendations together."""
+    """Return a sentence on the test of all recommended values together."""
     joint = view.summary["joint"]
     if joint is None or joint["inside"] is False:
         return []
@@ -133,13 +133,13 @@ def _together(view: View) -> list[str]:
 
 
 def _keyed(view: View, setting: Sequence[str]) -> str:
-    """A setting as KEY = VALUE."""
+    """Format a setting as KEY = VALUE."""
     keys = [axis["key"] for axis in view.summary["axes"]]
     return listed([f"{key} = {value}" for key, value in zip(keys, setting, strict=True)])
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """The answer first, then each choice."""
+    """Return the page: the recommendations first, then each choice."""
     s = view.summary
     keys = TEXTS.keys(
         points=s["points"], settings=s["settings"], computed=s["computed"], found=s["found"],
@@ -171,13 +171,13 @@ def _sections(view: View) -> Iterator[Section]:
 def _most(
     rows: Sequence[Any], columns: Mapping[str, str], stored: str, bad: Callable[[Any], Any] | None = None
 ) -> list[Any]:
-    """A table of the first rows, with the place of all rows if there are more."""
+    """Return a table of the first rows, with the name of the file of all rows if there are more."""
     more = [TEXTS("more_rows", shown=_ROWS, all=len(rows), stored=stored)] if len(rows) > _ROWS else []
     return [*more, table_of(rows[:_ROWS], columns, bad=bad)]
 
 
 def _several(words: Sequence[str], separator: str = ", ") -> str:
-    """Words in a line; of many, the first and the last with their number."""
+    """Join words; if there are many, only the first and the last, with their number."""
     if len(words) <= _VALUES:
         return separator.join(words)
     return TEXTS("many_values", first=separator.join(words[:3]), last=words[-1], n=len(words))
@@ -236,7 +236,7 @@ def _settings(view: View) -> list[Any]:
 
 
 def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
-    """Each measure along an axis, others at their base, with its error."""
+    """Yield figures of each measure along an axis, with errors; other choices have their base values."""
     s, values = view.summary, axis["values"]
     if not all(isinstance(one, int | float) for one in values):
         return

@@ -1,4 +1,4 @@
-"""What a worker of `mdnum sweep` does with its points, in a process of its own."""
+"""Computation of points by a worker of `mdnum sweep`, in a separate process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SERIES = "series.parquet"
 
 @dataclass(frozen=True)
 class Task:
-    """Some points that are computed one after the other, by one program where they have one shape."""
+    """Points that are computed one after the other, with one program if their arrays have the same shapes."""
 
     workspace: str
     points: tuple[Mapping[str, Any], ...]  # each with address, state and settings
@@ -37,7 +37,7 @@ class Task:
 
 
 def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> bool:
-    """Whether a stored result has all that is asked."""
+    """True if a stored result contains all requested measures."""
     if result is None:
         return False
     if result["status"] == "failed":
@@ -47,16 +47,16 @@ def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> boo
 
 
 def _missing(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> list[str]:
-    """Measures that a result lacks, or has of another source."""
+    """Return measures that a result lacks, or that were computed by other source code."""
     stored = {} if result is None else result["measures"]
     return [name for name, at in measures.items() if stored.get(name, {}).get("digest") != at]
 
 
 def work(task: Task) -> list[dict[str, Any]]:
-    """Computes what is not there; for each point its address and what became of it.
+    """Compute missing points; return the address and the outcome of each point.
 
-    "computed", "there", "busy" (another process has it), or "full" with the reason (its folder cannot be
-    written).
+    The outcome is "computed", "there" (already stored), "busy" (another process computes it), or "full" with
+    the reason (its folder cannot be written).
     """
     place, told = Workspace(Path(task.workspace)), []
     for point in task.points:
@@ -117,7 +117,7 @@ def _compute(place: Workspace, task: Task, point: Mapping[str, Any]) -> None:
 
 
 def _simulation(task: Task, point: Mapping[str, Any]) -> Any:
-    """A simulation, or the system of a ball."""
+    """Make a simulation, or the system of a ball."""
     from mdnum.systems import opened
 
     with allow_code(task.allow_code):
@@ -148,7 +148,7 @@ def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
 
 
 def _bounced(system: Any, steps: int, task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
-    """A ball's run; its variants and gradients are no points of a sweep."""
+    """Run a ball, without its variants and gradients."""
     import pyarrow
     import pyarrow.parquet as parquet
 

@@ -49,9 +49,9 @@ def copy(system: str, target: Path | None = None) -> Reply:
 
 
 def _size_in(file: Path) -> dict[str, Any]:
-    """Number of atoms or balls in a shipped system file, and what it says it is; checks nothing.
+    """Return the number of atoms or balls of a shipped system file, and its description, without checks.
 
-    To check and build all of them takes jax, ASE and seconds, which a list is not worth.
+    Checking and building all systems for a list would need jax and ASE, and take seconds.
     """
     table = tomllib.loads(file.read_text(encoding="utf-8"))
     about, start, structure = table["about"], table.get("start", {}), table.get("structure", {})

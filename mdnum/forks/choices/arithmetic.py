@@ -35,9 +35,10 @@ from mdnum.systems.ball import MaximumRule, RelativeRule, SumRule
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
 
-#: What "precision" without a role means: of molecular dynamics all but what is carried from step to step.
+#: Roles changed by "precision" without a role: for molecular dynamics, all except the state that is carried
+#: from step to step.
 _DEFAULT = {"md": ("force", "decision", "accumulate"), "ball": ROLES["ball"]}
-#: As jax-md names its formats.
+#: Names of formats in jax-md.
 FORMATS = ("dense", "sparse", "ordered-sparse")
 
 

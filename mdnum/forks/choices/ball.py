@@ -14,7 +14,7 @@ from mdnum.program import Twin
 from mdnum.systems import BallSystem
 from mdnum.systems.ball import FixedRule, RelativeRule
 
-#: Rules that a tolerance of metres belongs to.
+#: Stopping rules whose tolerance is a length in meters.
 RULES = {
     "sum": "the sum of the residuals of all balls",
     "per-instance": "each ball's own residual",

@@ -19,12 +19,12 @@ from mdnum.systems.load import world_of
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
 
-#: Reductions whose result does not depend on the order of their terms.
+#: Reductions whose results do not depend on the order of their terms.
 ORDERLESS = ("exact", "fixed-point")
-#: What `mdnum fork processes` varies, and people may look for here.
+#: Names varied by `mdnum fork processes`, which users may also try here.
 _PROGRAMS = ("jit", "eager", "vmap", "grad", "xla")
 _WORLDS = {"md": "of molecular dynamics", "ball": "of a ball"}
-#: Fields that are written with their sign.
+#: Fields that are printed with their sign.
 _SIGNED = ("ulps", "more")
 
 

@@ -35,10 +35,11 @@ from mdnum.program import Twin
 if TYPE_CHECKING:
     from mdnum.systems.simulation import Simulation
 
-#: Exchanges of axes, half turns about one, and the inversion that every box has.
+#: Symmetry operations of boxes: exchanges of axes, half turns about one axis, and the inversion, which is a
+#: symmetry of every box.
 _SYMMETRIES = ("yzx", "yxz", "xzy", "zyx", "-x-yz", "x-y-z", "-xy-z", "-x-y-z")
 _AXES = re.compile(r"(?!.*([xyz]).*\1)(-?[xyz]){3}")
-#: Numbers that ship as choices, whether a system has them or not.
+#: Parameters that are built-in choices, even if a system does not have them.
 OFTEN = {
     "md": (
         "cutoff.radius", "cutoff.in_sigma", "dynamics.timestep", "dynamics.temperature", "potential.sigma",
@@ -50,7 +51,7 @@ OFTEN = {
         "flight.gravity",
     ),
 }  # fmt: skip
-#: So close to a face of the box, as a share of it, an ulp could take an atom across.
+#: Distance from a face of the box, relative to its edge, within which an ulp could move an atom across.
 _NEAR = 1e-6
 _NO_NEIGHBOR = "is 0, and the next float is nothing beside any other number"
 

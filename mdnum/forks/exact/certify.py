@@ -23,7 +23,8 @@ Roles = Mapping[str, str]
 
 _NARROW: Roles = dict.fromkeys(ROLES["md"], "float32")
 
-#: Precisions that are ranked of molecular dynamics, from none to all in double; a role not named is float64.
+#: Ranked precisions of molecular dynamics, from no role to all roles in double precision; roles that are not
+#: named are float64.
 MD_POLICIES: Mapping[str, Roles] = {
     "float32": _NARROW,
     **{
@@ -34,14 +35,15 @@ MD_POLICIES: Mapping[str, Roles] = {
     "float64, force bfloat16": {"force": "bfloat16"},
     "float64": {},
 }
-#: Of a ball: every role in one format, or one role alone in float32.
+#: Ranked precisions of a ball: every role in one format, or one role in float32.
 BALL_POLICIES: Mapping[str, Roles] = {
     **{name: dict.fromkeys(ROLES["ball"], name) for name in ("float64", "float32", "float16", "bfloat16")},
     **{f"{role} in float32": {role: "float32"} for role in ROLES["ball"]},
 }
-#: Separation from the exact run up to which its growth is fitted, as a share of the program's scale.
+#: Largest separation from the exact run to which its growth is fitted, as a share of the scale of the
+#: program.
 _SATURATED = 0.04
-#: Quality of a fit from which on a growth counts as exponential.
+#: Smallest quality of a fit for which growth counts as exponential.
 _EXPONENTIAL = 0.95
 
 

@@ -31,13 +31,14 @@ from mdnum.numerics.exact import enclosed
 from mdnum.rollout.engine import first_state
 from mdnum.systems.simulation import Simulation
 
-#: All pairs are looked at in every step.
+#: Largest number of atoms, because all pairs are examined in every step.
 MOST_ATOMS = 108
-#: Bits that a step loses about, of an LJ liquid at the usual time step, and what must be left at the end.
+#: Approximate loss of bits per step for a Lennard-Jones liquid at the usual time step, and number of bits
+#: that must remain at the end.
 _BITS_PER_STEP, _BITS_LEFT = 0.35, 60
-#: Restarts before a decision is called undecidable.
+#: Number of restarts after which a decision counts as undecidable.
 _RESTARTS = 5
-#: Bits carried beyond those that the ball's radius leaves meaningful.
+#: Number of bits that are kept beyond those that the radius of a ball leaves significant.
 _GUARD_BITS = 32
 _U = 2.0**-53
 
