@@ -168,26 +168,31 @@ def correlated(series: Float[np.ndarray, "samples"]) -> tuple[float, float, floa
 
 @_measure("energy", "potential energy per atom")
 def energy(run: Sample) -> Value:
+    """Time average of the potential energy per atom, energy, with its error from `correlated`."""
     return Value(*correlated(run.series["potential"] / run.atoms))
 
 
 @_measure("temperature", "temperature")
 def temperature(run: Sample) -> Value:
+    """Time average of the kinetic temperature, temperature, with its error from `correlated`."""
     return Value(*correlated(run.series["temperature"]))
 
 
 @_measure("pressure", "pressure")
 def pressure(run: Sample) -> Value:
+    """Time average of the virial pressure, pressure, with its error from `correlated`."""
     return Value(*correlated(run.series["pressure"]))
 
 
 @_measure("1/length³", "atoms per volume")
 def density(run: Sample) -> Value:
+    """Time average of the number of atoms per volume, 1/length³, with its error from `correlated`."""
     return Value(*correlated(run.atoms / run.volumes))
 
 
 @_measure("1/time", "flips per atom and time")
 def flips(run: Sample) -> Value:
+    """Time average of the flips per atom and time, 1/time, with its error from `correlated`."""
     each = (run.series["entered"] + run.series["left"])[1:]
     step = np.diff(run.series["time"])[:1]
     return Value(*correlated(each / run.atoms / step)) if len(each) else Value(np.nan)
@@ -208,6 +213,10 @@ def drift(run: Sample) -> Value:
 
 @_measure("", "spread of the conserved energy over that of the kinetic energy")
 def fluctuation(run: Sample) -> Value:
+    """Standard deviation of the conserved energy over that of the kinetic energy, dimensionless.
+
+    A line is subtracted from the conserved energy of the second half; the error is the scatter of 8 blocks.
+    """
     half = slice(len(run.series["time"]) // 2, None)
     kept, kinetic = run.series["conserved"][half], run.series["kinetic"][half]
 
@@ -243,11 +252,13 @@ def heat_capacity(run: Sample) -> Value:
 
 @_measure("", "pairs that lists lost", physical=False)
 def lost(run: Sample) -> Value:
+    """Number of pairs within the cutoff that neighbor lists lacked, dimensionless; without an error."""
     return Value(float(run.summary["lost_pairs"]), 0.0, np.inf)
 
 
 @_measure("steps/s", "speed of the run", physical=False)
 def speed(run: Sample) -> Value:
+    """Steps per second, 1/s, the median over neighbor lists; its error comes from the seeds alone."""
     return Value(float(run.summary["steps_per_second"] or np.nan))
 
 
@@ -260,6 +271,7 @@ def _peak(frames: Float[np.ndarray, "frames places"]) -> Value:
 
 @_measure("", "height of the first peak of g(r)", "frames")
 def rdf(run: Sample) -> Value:
+    """Height of the first peak of g(r), dimensionless; its error is the scatter of blocks of frames."""
     return _peak(radial_distribution(run)[0])
 
 
@@ -285,6 +297,7 @@ def radial_distribution(run: Sample) -> tuple[Float[np.ndarray, "frames bins"], 
 
 @_measure("", "height of the highest peak of the structure factor S(k)", "frames")
 def structure_factor(run: Sample) -> Value:
+    """Height of the highest peak of S(k), dimensionless; its error is the scatter of blocks of frames."""
     return _peak(structure_factors(run)[0])
 
 
@@ -329,6 +342,10 @@ def _mean_square(x: Float[np.ndarray, "frames atoms 3"]) -> Float[np.ndarray, "l
 
 @_measure("length²", "mean squared displacement over half of the run", "frames")
 def msd(run: Sample) -> Value:
+    """Mean squared displacement of the atoms over the second half of the run, length².
+
+    The displacement of the center is subtracted; the error is the standard error over atoms.
+    """
     x, _, _ = run.frames
     if len(x) < 4:
         return Value(np.nan)
@@ -363,21 +380,25 @@ def diffusion(run: Sample) -> Value:
 
 @_measure("length", "mean height at the end", world="ball")
 def final_height(run: Sample) -> Value:
+    """Height at the end of the run, averaged over the balls, length; exact, without an error."""
     return Value(float(run.series["mean_height"][-1]), 0.0, np.inf)
 
 
 @_measure("", "energy at the end as a share of that at the start", world="ball")
 def energy_kept(run: Sample) -> Value:
+    """Energy at the end of the run divided by that at its start, dimensionless; without an error."""
     return Value(float(run.series["energy"][-1] / run.series["energy"][0]), 0.0, np.inf)
 
 
 @_measure("", "contacts that begin, per ball", world="ball")
 def bounces(run: Sample) -> Value:
+    """Number of contacts that begin during the run, per ball, dimensionless; without an error."""
     return Value(float(run.series["entered"].sum() / run.atoms), 0.0, np.inf)
 
 
 @_measure("", "solver iterations per step", physical=False, world="ball")
 def iterations(run: Sample) -> Value:
+    """Mean number of solver iterations per step, dimensionless; without an error."""
     return Value(float(run.series["iterations"][1:].mean()), 0.0, np.inf)
 
 
@@ -462,12 +483,8 @@ def measured(measures: Sequence[Measure], run: Sample) -> dict[str, dict[str, An
             found[one.name] = {"value": None, "why": why, "digest": one.digest}
             continue
         if np.isfinite(value.value):
-            found[one.name] = {
-                "value": float(value.value),
-                "error": value.error,
-                "effective": value.effective,
-                "digest": one.digest,
-            }
+            found[one.name] = {"value": float(value.value), "error": value.error,
+                               "effective": value.effective, "digest": one.digest}  # fmt: skip
         else:
             found[one.name] = {"value": None, "why": "too few steps or frames", "digest": one.digest}
     return found

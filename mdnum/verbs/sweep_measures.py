@@ -43,14 +43,17 @@ def _date(run: Sample, argument: str, name: str) -> Value:
 
 
 def fork(run: Sample, argument: str) -> Value:
+    """Time of the first different decision of two runs, time; its error comes from the seeds alone."""
     return _date(run, argument, "fork")
 
 
 def split(run: Sample, argument: str) -> Value:
+    """Time until two runs are a hundredth of the cutoff apart, time; its error comes from the seeds."""
     return _date(run, argument, "split")
 
 
 def separation(run: Sample, argument: str) -> Value:
+    """Rate of the exponential growth of the separation of two runs, 1/time, from a fit of its logarithm."""
     found = _pair(run, argument)
     grown = found.growth["B"]
     if not grown.plain:
@@ -88,6 +91,7 @@ def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
 
 
 def gradient(run: Sample, argument: str) -> Value:
+    """Derivative of a loss by the reference method of `mdnum grad`, unit of the loss over the parameter's."""
     found, name = _diagnosis(run, argument)
     if found.agreement is None:
         raise InputError(found.failed["agreement"])
@@ -96,6 +100,7 @@ def gradient(run: Sample, argument: str) -> Value:
 
 
 def horizon(run: Sample, argument: str) -> Value:
+    """Time up to which that derivative is trusted, time; its error comes from the seeds alone."""
     found, _ = _diagnosis(run, argument)
     if found.trust is None:
         raise InputError(found.failed["trust"])
@@ -113,10 +118,6 @@ for _name, _unit, _title, _of in (
     ("gradient", "", "derivative of a loss with respect to a parameter", gradient),
     ("horizon", "time", "time up to which that derivative is trusted", horizon),
 ):
-    _takes, _sources, _check = (
-        ("CHOICE", _FORKS, _twin) if _of in (fork, split, separation) else (_LOSS, _GRADIENTS, _asked)
-    )
-    MEASURES.add(
-        _name,
-        Measure(_name, _unit, _title, _of, "simulation", takes=_takes, sources=_sources, check=_check),
-    )
+    _kind = ("CHOICE", _FORKS, _twin) if _of in (fork, split, separation) else (_LOSS, _GRADIENTS, _asked)
+    MEASURES.add(_name, Measure(_name, _unit, _title, _of, "simulation", takes=_kind[0], sources=_kind[1],
+                                check=_kind[2]))  # fmt: skip

@@ -196,9 +196,8 @@ def _differences(view: View) -> list[Any]:
             "would have seen": row["detectable"],
         })  # fmt: skip
     names = ("measure", "choice", "difference", "error", "in errors", "chance", "moves", "would have seen")
-    return _most(
-        rows, {name: name for name in names}, "differences.parquet", lambda row: row["moves"] == "yes"
-    )
+    columns = {name: name for name in names}
+    return _most(rows, columns, "differences.parquet", lambda row: row["moves"] == "yes")
 
 
 def _tolerances(view: View) -> dict[str, str]:
@@ -225,13 +224,8 @@ def _settings(view: View) -> list[Any]:
         inside = {True: "yes", False: "no", None: "not decided"}[joint["inside"]]
         rows.append({"choice": "together", "value": _keyed(view, joint["setting"]), "within": inside,
                      "by": _shown(view, joint["worst"] or ""), "": ""})  # fmt: skip
-    columns = {
-        "choice": "choice",
-        "value": "value",
-        "within its tolerance": "within",
-        "kept out by": "by",
-        "": "",
-    }
+    columns = {"choice": "choice", "value": "value", "within its tolerance": "within", "kept out by": "by"}
+    columns[""] = ""
     return _most(rows, columns, "summary.json")
 
 
