@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import multiprocessing
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from html import escape
 from pathlib import Path
@@ -37,11 +38,13 @@ ASKED: dict[str, tuple[Any, tuple[Any, ...], dict[str, Any]]] = {
     "demos": (mdnum.demonstrate, ("sum-order",), {}),
 }
 FIGURES = {"md", "fork", "flips", "ball", "demos"}
+#: What compiles longest; the other kinds are in every run.
+NIGHTLY = {"fork", "grad"}
 
 
 @pytest.fixture(scope="module")
-def returned(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
-    """What a worker of a pool returned, by kind of folder; it was given paths relative to its folder."""
+def returned(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Outcome]]:
+    """What a worker of a pool returns, by kind of folder; it is given paths relative to its folder."""
     here = tmp_path_factory.mktemp("pool")
     x = np.random.default_rng(5).uniform(0, 9, (8, 30, 3))
     ase.io.write(here / "gas.extxyz", [Atoms("Ar30", positions=one, cell=[9] * 3, pbc=True) for one in x])
@@ -50,16 +53,30 @@ def returned(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
         patch.setenv("MPLBACKEND", "agg")
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(1, mp_context=context) as pool:
-            waiting = {
-                kind: pool.submit(verb, *words, out=kind, **options)
-                for kind, (verb, words, options) in ASKED.items()
-            }
-            return {kind: future.result(timeout=300) for kind, future in waiting.items()}
+
+            @functools.cache
+            def of(kind: str) -> Outcome:
+                verb, words, options = ASKED[kind]
+                return pool.submit(verb, *words, out=kind, **options).result(timeout=300)
+
+            # the worker starts where its paths lead from
+            of("demos")
+            patch.undo()
+            yield of
 
 
-@pytest.fixture(params=sorted(ASKED))
-def outcome(request: pytest.FixtureRequest, returned: dict[str, Outcome]) -> Outcome:
-    return returned[request.param]
+@pytest.fixture(
+    params=[
+        pytest.param(kind, marks=pytest.mark.nightly) if kind in NIGHTLY else kind for kind in sorted(ASKED)
+    ]
+)
+def kind(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def outcome(kind: str, returned: Callable[[str], Outcome]) -> Outcome:
+    return returned(kind)
 
 
 @pytest.fixture(autouse=True)
@@ -74,8 +91,7 @@ def figures(outcome: Outcome) -> list[Figure | Plot]:
     return [part for part in parts if isinstance(part, Figure | Plot)]
 
 
-def test_it_comes_back_from_a_pool_as_plain_data(returned, outcome):
-    kind = next(kind for kind, one in returned.items() if one is outcome)
+def test_it_comes_back_from_a_pool_as_plain_data(kind, outcome):
     assert outcome.kind == kind and outcome.path == outcome.folder and outcome.path.is_absolute()
     assert outcome.result is None and outcome.findings == outcome.verdict.findings
     assert outcome.summary["headline"] == outcome.verdict.headline
@@ -85,12 +101,15 @@ def test_it_comes_back_from_a_pool_as_plain_data(returned, outcome):
     assert len(pickle.dumps(outcome)) < 200_000
 
 
+@pytest.mark.nightly
 def test_a_headline_names_every_parameter_of_a_gradient(returned):
-    headline, steps = returned["grad"].verdict.headline, returned["grad"].summary["steps"]
+    headline, steps = returned("grad").verdict.headline, returned("grad").summary["steps"]
     assert f"After {steps} steps" in headline and "d final-height / d y0 = " in headline
 
 
-@pytest.mark.parametrize("kind", ["grad", "ball", "fork"])
+@pytest.mark.parametrize(
+    "kind", ["ball", *(pytest.param(one, marks=pytest.mark.nightly) for one in ("fork", "grad"))]
+)
 def test_a_result_is_shown_in_a_line_or_two(kind, tmp_path):
     verb, words, options = ASKED[kind]
     result = verb(*words, out=tmp_path / kind, report=False, **options).result
@@ -153,7 +172,7 @@ def test_what_is_shown_of_it_fits_a_screen(outcome):
 
 
 def test_without_its_folder_it_still_says_what_was_found(returned, tmp_path):
-    ball = returned["ball"]
+    ball = returned("ball")
     moved = pickle.loads(pickle.dumps(ball).replace(b"ball", b"bowl"))
     assert not moved.path.exists()
     html = moved._repr_html_()
@@ -172,7 +191,7 @@ def copied(outcome: Outcome, to: Path) -> Outcome:
 
 @pytest.mark.parametrize("damage", ["cut", "bits", "gone", "other"])
 def test_a_damaged_table_is_one_line(returned, tmp_path, damage):
-    outcome = copied(returned["md"], tmp_path)
+    outcome = copied(returned("md"), tmp_path)
     file = tmp_path / "flips.parquet"
     data = file.read_bytes()
     if damage == "gone":
@@ -213,8 +232,8 @@ def test_text_from_files_is_escaped_wherever_it_is_shown(tmp_path, monkeypatch):
 
 
 def test_an_interrupted_verb_is_raised_through_a_pool(returned):
-    again = pickle.loads(pickle.dumps(Interrupted(returned["ball"])))
-    assert again.outcome.verdict.headline == returned["ball"].verdict.headline
+    again = pickle.loads(pickle.dumps(Interrupted(returned("ball"))))
+    assert again.outcome.verdict.headline == returned("ball").verdict.headline
 
 
 def test_a_verb_is_logged_and_nothing_is_printed(tmp_path, caplog, capsys):
