@@ -1,4 +1,4 @@
-"""Five terms, two orders, two answers: a float16 sum that decides whether a solver stops."""
+"""The order of a float16 sum of five terms determines whether a solver stops."""
 
 from __future__ import annotations
 
@@ -48,16 +48,20 @@ def run() -> Demo:
     seen = residual["large first"], residual["small first"]
     return Demo(
         title="The order of a sum decides whether a solver stops",
-        question="Five float16 penetrations add up to exactly the tolerance. Is their sum below it?",
+        question=(
+            "The exact sum of five float16 penetrations equals the tolerance. Is the computed sum below it?"
+        ),
         result=(
-            f"Largest first, the sum is {seen[0]:.10f} and the solver stops; smallest first, it is "
-            f"{seen[1]:.10f} and the solver goes on."
+            f"If the largest term is added first, the sum is {seen[0]:.10f} and the solver stops; if "
+            f"the smallest is added first, the sum is {seen[1]:.10f} and the solver continues."
         ),
         answer=(
-            "Large first, each small term is a quarter of the accumulator's last place and is rounded away: "
-            f"{seen[0]:.13f} is below the tolerance and the solver stops. Small first, they add up to one "
-            f"last place: {seen[1]:.10f} is not below, and the solver makes an iteration. jnp.sum gives "
-            f"{hidden['large first']:.10f} both ways, because it adds float16 in float32."
+            "If the largest term is added first, each small term is a quarter of an ulp of the "
+            f"partial sum and is lost to rounding: {seen[0]:.13f} is below the tolerance, and the "
+            "solver stops. If the small terms are added first, they add up to one ulp: "
+            f"{seen[1]:.10f} is not below the tolerance, and the solver makes an iteration. jnp.sum "
+            f"gives {hidden['large first']:.10f} in both orders, because it adds float16 numbers in "
+            "float32."
         ),
         numbers={
             "large_first": seen[0],
@@ -106,8 +110,8 @@ def run() -> Demo:
         ],
         plots=[_errors(histories)],
         in_md=(
-            "The force on an atom is such a sum over its neighbors, in the order of the list; the same table "
-            "can be made of it (running_sum_table of what a Tap has seen)."
+            "The force on an atom is such a sum over its neighbors, in the order of the list. The "
+            "same table can be made for it (running_sum_table with the terms recorded by a Tap)."
         ),
         data={
             "penetrations": TERMS.astype(float),

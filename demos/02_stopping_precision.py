@@ -217,18 +217,19 @@ def run() -> Demo:
     ]
     return Demo(
         title="The dtype of a sum decides whether the solver runs",
-        question="A batch penetrates the floor by the tolerance in all. Does the solver start?",
+        question=("The sum of the penetrations of a batch equals the tolerance. Does the solver start?"),
         result=(
-            "Summed in bfloat16 or float16, the residual is one ulp too small, the solver makes no "
-            f"iteration, and dloss/dk is exactly 0 instead of {truth['bfloat16']:.2g}."
+            "If the residual is summed in bfloat16 or float16, it is one ulp too small, the solver "
+            f"makes no iteration, and dloss/dk is exactly 0 instead of {truth['bfloat16']:.2g}."
         ),
         answer=(
-            "In float32 it makes one iteration and the loss depends on k. Summed in bfloat16 or float16, "
-            "largest term first, the small terms are absorbed, the sum stays one ulp below the tolerance, "
-            "and the loop ends before k was used: the derivative is exactly 0, and the loss does not depend "
-            "on k. A float32 sum over the same narrow state restores the path. In float16 the derivative is "
-            f"then still a subnormal, {100 * lost:.0f} % off; with the loss scaled by 2^15 it is right to "
-            f"{restored:.1g}."
+            "If the residual is summed in float32, the solver makes one iteration and the loss "
+            "depends on k. If it is summed in bfloat16 or float16, largest term first, the small "
+            "terms are lost to rounding, the sum stays one ulp below the tolerance, and the loop "
+            "ends before k is used: the loss does not depend on k, and the derivative is exactly 0. "
+            "A float32 sum of the same 16-bit state makes the loss depend on k again. In float16 the "
+            f"derivative is then still a subnormal number with an error of {100 * lost:.0f} %; if the "
+            f"loss is scaled by 2^15, the error is {restored:.1g}."
         ),
         numbers={
             "iterations": counts,
@@ -245,8 +246,9 @@ def run() -> Demo:
         tables=[_table(rows, truth, scaled), *(_running(dtype, sums[dtype][1]) for dtype in FORMATS)],
         plots=[_sum_plot(sums), _penetrations(rows)],
         in_md=(
-            "Forces, displacements and residuals are sums too: a list that is rebuilt when a sum passes a "
-            "threshold, or a constraint solver that stops at a tolerance, decides by the last bit of one."
+            "Forces, displacements and residuals are also sums. If a list is rebuilt when a sum "
+            "exceeds a threshold, or a constraint solver stops at a tolerance, the last bit of the "
+            "sum may decide."
         ),
         data={**data, "float16 scaled": {"grad_k": scaled.gradient["k"], "loss_scale": 2.0**15}},
     )

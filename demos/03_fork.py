@@ -75,18 +75,23 @@ def run() -> Demo:
     jump = H * abs(float(b.v[at - 1, 0]))
     return Demo(
         title="One ulp, another step of contact",
-        question="Two balls start at neighboring floats. Do they touch the floor in the same step?",
+        question=(
+            "The initial heights of two balls are neighboring floats. Do the balls touch the floor "
+            "in the same step?"
+        ),
         result=(
-            f"One ulp higher at the start, and the ball touches the floor at step {contact[1]} instead of "
-            f"{contact[0]}: the two are {after:.2g} m apart afterwards, {before:.1g} m before."
+            "If the initial height is one ulp larger, the ball touches the floor at step "
+            f"{contact[1]} instead of {contact[0]}: the separation of the two balls is {before:.1g} m "
+            f"before and {after:.2g} m afterwards."
         ),
         answer=(
-            f"Started at {low!r} m and at the next float, one ball touches in step {contact[0]} and the "
-            f"other in step {contact[1]}: at the end of step {at} they are at {height[0]:.2g} m and "
-            f"{height[1]:.2g} m. One velocity is reset, the other ball falls on for a step, and a separation "
-            f"of {before:.1g} m becomes {after:.1g} m. Told the decisions of the first, the second stays "
-            f"within {held.separation.max():.1g} m of it: the decision is the cause. On a spring the same "
-            "flip separates nothing, because the force at the boundary is 0."
+            f"If the initial heights are {low!r} m and the next float, one ball touches the floor in "
+            f"step {contact[0]} and the other in step {contact[1]}: at the end of step {at} their "
+            f"heights are {height[0]:.2g} m and {height[1]:.2g} m. The velocity of one ball is reset, "
+            f"the other ball falls for one more step, and a separation of {before:.1g} m becomes "
+            f"{after:.1g} m. With the decisions of the first ball imposed, the second ball stays "
+            f"within {held.separation.max():.1g} m of it: the decision is the cause. On a spring the "
+            "same flip does not separate the balls, because the force is 0 when contact begins."
         ),
         numbers={
             "first_contact": contact[:2],
@@ -162,8 +167,9 @@ def run() -> Demo:
         ],
         plots=[_heights(a, b, at), _separations(a, parted, held, soft)],
         in_md=(
-            "A pair of atoms crosses the cutoff one step earlier. Where the force is cut hard the runs part "
-            "by the jump; where it goes to zero smoothly the flip only comes along."
+            "A pair of atoms crosses the cutoff one step earlier. With a hard cutoff the runs "
+            "diverge because the force jumps; if the force goes to zero smoothly, the flip is a "
+            "bystander."
         ),
         data={
             "separation": parted.separation,

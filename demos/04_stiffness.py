@@ -1,4 +1,4 @@
-"""Stiffness: a contact may be stable and the ball look fine while its derivative grows past every bound."""
+"""Stiffness: a stable contact whose trajectory looks correct while its derivative grows without bound."""
 
 from __future__ import annotations
 
@@ -344,10 +344,12 @@ def run() -> Demo:
     fine = float(long.energy[np.argmax(long.steps == overflow), 0, 0])
     return Demo(
         title="Stable, and yet not differentiable",
-        question="Up to which stiffness can the ball be trusted, and up to which its derivative?",
+        question=(
+            "Up to which stiffness can the trajectory of the ball be trusted, and up to which its derivative?"
+        ),
         result=(
-            f"At h sqrt(k) = {QUIET} the energy of the ball stays bounded, and its gradient overflows double "
-            f"precision at step {overflow:,}."
+            f"At h sqrt(k) = {QUIET} the energy of the ball stays bounded, but its gradient exceeds "
+            f"the range of double precision at step {overflow:,}."
         ),
         answer=(
             "Held in contact, a ball is stable under semi-implicit Euler up to h sqrt(k) = 2 (measured "
@@ -480,8 +482,11 @@ def run() -> Demo:
                 caption="At h sqrt(k) = 1 three steps are exactly half a turn, and nothing grows.",
             ),
         ),
-        in_md="Integrators of molecules are stable up to h omega = 2 of the fastest vibration; the "
-        "derivative of a liquid is lost long before, at any step, because collisions separate trajectories.",
+        in_md=(
+            "Integrators of molecular dynamics are stable up to h omega = 2 for the fastest "
+            "vibration. The derivative of a liquid is lost much earlier, at any time step, because "
+            "collisions separate trajectories."
+        ),
         data={"z": z.tolist(), "kind": kinds.tolist()},
     )
 

@@ -1,4 +1,4 @@
-"""The iteration count of a solver along its gain: a saw whose teeth stand between adjacent floats."""
+"""The number of solver iterations along the gain: a sawtooth with jumps between adjacent floats."""
 
 from __future__ import annotations
 
@@ -123,7 +123,9 @@ def run() -> Demo:
     smooth = abs(below.gradient) * (above.at - below.at)
     return Demo(
         title="Between two floats the solver makes one iteration fewer",
-        question="How does what a projection leaves depend on its gain, down to the last bit?",
+        question=(
+            "How does the remaining penetration after a projection depend on the gain, down to the last bit?"
+        ),
         result=(
             f"Between two adjacent floats of k the solver makes {below.iterations} or {above.iterations} "
             f"iterations, and the loss jumps from {below.loss:.3g} to {above.loss:.3g}."
@@ -187,8 +189,9 @@ def run() -> Demo:
         tables=[_table(found)],
         plots=_plots(grid, found),
         in_md=(
-            "A tolerance of a constraint solver or of a minimizer, a list rebuilt one step earlier: along "
-            "any parameter the program changes at a set of points, and a gradient knows nothing of them."
+            "A tolerance of a constraint solver or a minimizer, or a list that is rebuilt one step "
+            "earlier, has the same effect: along any parameter the sequence of operations changes at "
+            "certain points, and a gradient contains no information on them."
         ),
         data={"at": [b.above.at for b in found]},
     )

@@ -1,4 +1,4 @@
-"""A gap between two thresholds: what it does to decisions that waver, and what it costs."""
+"""A gap between two thresholds: its effect on fluctuating decisions, and its cost."""
 
 from __future__ import annotations
 
@@ -81,19 +81,22 @@ def run() -> Demo:
     one, two = GAPS[1], None
     return Demo(
         title="Two thresholds instead of one",
-        question="A decision wavers about its threshold. What does a gap between two thresholds change?",
+        question=(
+            "A quantity fluctuates around the threshold of a decision. What is the effect of two "
+            "separate thresholds?"
+        ),
         result=(
-            f"A gap between two thresholds turns {low} contact flips into {high}, and {starts[two]} flips of "
-            f"a stopping decision into {starts[one]}."
+            f"With a gap between two thresholds there are {high} instead of {low} contact flips, and "
+            f"{starts[one]} instead of {starts[two]} flips of a stopping decision."
         ),
         answer=(
-            f"Balls shaken on a spring cross the floor {low} times; if a contact that began below 0 ends "
-            f"only above {LIFTS[2]:g} m, {high} times. A solver that starts when a float16 sum reaches tol "
-            f"changes its mind {starts[two]} times in {PRESSED_STEPS} steps, and in {apart[two]} of them "
-            "another order of the sum decides otherwise; if it starts at "
-            f"{one:g} tol, {starts[one]} and {apart[one]}. The "
-            "price: the spring pulls up to the gap, and penetrations up to the gap are left alone. A gap "
-            "narrower than the noise helps little."
+            f"Balls on a vibrating spring cross the floor {low} times; if a contact begins below 0 "
+            f"but ends only above {LIFTS[2]:g} m, they do so {high} times. A solver that starts when "
+            f"a float16 sum reaches tol changes its decision {starts[two]} times in {PRESSED_STEPS} "
+            f"steps, and in {apart[two]} of these steps another order of the sum gives a different "
+            f"decision; if it starts at {one:g} tol, the numbers are {starts[one]} and {apart[one]}. "
+            "The disadvantage is that the spring pulls on balls within the gap, and penetrations "
+            "within the gap are not removed. A gap narrower than the noise has little effect."
         ),
         numbers={
             "contact_flips_without": low,
@@ -157,8 +160,9 @@ def run() -> Demo:
         ],
         plots=[_heights(contact[0.0], contact[LIFTS[2]]), _gaps(rows), _residuals(stop[None][0])],
         in_md=(
-            "The skin of a Verlet list is this gap for the list, not for the interaction: a pair at the "
-            "cutoff flips as often as before. A pair that enters at r - d and leaves at r + d would not."
+            "The skin of a Verlet list is such a gap for rebuilding the list, but not for the "
+            "interaction: a pair at the cutoff flips as often as without a skin. If pairs entered at "
+            "r - d and left at r + d, they would flip less often."
         ),
         data={"contact_flips": {str(lift): n for lift, n in rows.items()}},
     )

@@ -1,4 +1,4 @@
-"""One ball more below the floor, far from the others: whose solver notices?"""
+"""One more ball below the floor, far from the others: which solvers does it affect?"""
 
 from __future__ import annotations
 
@@ -84,16 +84,21 @@ def run() -> Demo:
     drift = _growth()
     return Demo(
         title="A sum over the batch couples balls that never meet",
-        question="A ball far from the others sinks below the floor. Do their solvers notice?",
+        question=(
+            "A ball far from the others penetrates the floor. Does this affect the solvers of the others?"
+        ),
         result=(
-            f"One more ball in the batch turns {total['before'][0]} iterations of every other ball into "
-            f"{total['after'][0]} under one sum, and changes none under a rule for each ball."
+            "With a common sum, one more ball in the batch changes the number of iterations for "
+            f"every other ball from {total['before'][0]} to {total['after'][0]}; with a separate rule "
+            "for each ball it changes none."
         ),
         answer=(
-            f"Under one sum for the batch all of them do: {total['before'][0]} iterations become "
-            f"{total['after'][0]} and the derivative of their loss by the gain goes from "
-            f"{total['grad_k'][0]:.2g} to {total['grad_k'][1]:.2g}. With a rule for each ball none does. The "
-            "largest term couples only where the stranger is the largest and above the tolerance."
+            "With a common sum for the batch, all of them are affected: the number of iterations "
+            f"changes from {total['before'][0]} to {total['after'][0]}, and the derivative of their "
+            f"loss with respect to the gain from {total['grad_k'][0]:.2g} to "
+            f"{total['grad_k'][1]:.2g}. With a rule for each ball, no other ball is affected. A rule "
+            "based on the largest term couples the balls only if the additional ball has the largest "
+            "term and exceeds the tolerance."
         ),
         numbers={
             "coupling": {name: row["coupling"] for name, row in found.items()},
@@ -169,8 +174,9 @@ def run() -> Demo:
             )
         ],
         in_md=(
-            "The energy of a batch of structures, the residual norm of all constraints, the largest "
-            "displacement in the box: one number for all lets a stranger decide about everybody's next step."
+            "The energy of a batch of structures, the residual norm of all constraints and the "
+            "largest displacement in the box are such common numbers: one structure, constraint or "
+            "atom can decide the next step of all others."
         ),
         data=found,
     )

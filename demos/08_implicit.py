@@ -1,4 +1,4 @@
-"""The derivative of a solver's iterations and the derivative of what it solves for are two numbers."""
+"""The derivative of a solver's iterations differs from that of its fixed point."""
 
 from __future__ import annotations
 
@@ -245,7 +245,9 @@ def run() -> Demo:
     flat = tapes[-1].implicit / tapes[-2].implicit
     return Demo(
         title="Iterations and their fixed point have different derivatives",
-        question="A projection returns a ball to the floor. How does where it ends depend on the gain?",
+        question=(
+            "A projection returns a ball to the floor. How does the final position depend on the gain?"
+        ),
         result=(
             "The derivative of the fixed point is 0; through the iterations that ran at a tolerance of 1e-2 "
             f"it is {unrolled[0]:.2g}."
@@ -333,8 +335,8 @@ def run() -> Demo:
         ],
         plots=[_artefact(unrolled, near), _memory_plot(tapes), _accuracy_plot(solved)],
         in_md=(
-            "Bond constraints (SHAKE), induced dipoles and relaxed structures are fixed points too: "
-            "differentiating the iterations adds a term of the size of the tolerance."
+            "Bond constraints (SHAKE), induced dipoles and relaxed structures are also fixed points: "
+            "differentiating the iterations adds a term of the order of the tolerance."
         ),
         data={"says": {"implicit": said.description, "why": said.notes["k"]}},
     )

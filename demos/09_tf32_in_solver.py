@@ -1,4 +1,4 @@
-"""A solver whose matrix products keep ten bits: it says converged, and is not."""
+"""A solver with ten-bit matrix products that reports convergence although it has not converged."""
 
 from __future__ import annotations
 

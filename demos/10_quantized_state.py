@@ -1,4 +1,4 @@
-"""Few bits in an input, in a parameter, in the state: which of them costs the contact history."""
+"""Few bits in an input, a parameter or the state: which of them changes the contact history?"""
 
 from __future__ import annotations
 
@@ -211,10 +211,13 @@ def run() -> Demo:
     at = BITS.index(16)
     return Demo(
         title="Quantize what is read, not what is remembered",
-        question="An input, a parameter, the state in b bits each: for how long are the contacts the same?",
+        question=(
+            "An input, a parameter or the state is stored in b bits. For how many steps are the "
+            "contacts unchanged?"
+        ),
         result=(
-            f"With 16 bits the contacts are right for {found['state'][at]:.0f} steps if the state is "
-            f"quantized, and for {found['parameter'][at]:.0f} if the stiffness is."
+            f"With 16 bits the contacts are correct for {found['state'][at]:.0f} steps if the state "
+            f"is quantized, and for {found['parameter'][at]:.0f} steps if the stiffness is."
         ),
         answer=(
             f"With 16 bits in the state the first contact differs after {found['state'][at]:.0f} steps, in "
@@ -272,8 +275,8 @@ def run() -> Demo:
         ],
         plots=[_horizons(found, doubling)],
         in_md=(
-            "A table of ε and σ in few bits is benign, positions in few bits are not; positions on an "
-            "integer lattice make the neighbor decision exact."
+            "A table of ε and σ in few bits is harmless, but positions in few bits are not; with "
+            "integer positions the neighbor decision is exact."
         ),
         data={"bits": list(BITS), "horizons": found, "flips": flips},
     )

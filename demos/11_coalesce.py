@@ -1,4 +1,4 @@
-"""Duplicates of a sparse tensor are a sum, and storage order is its order."""
+"""Duplicates of a sparse tensor are summed, in the order in which they are stored."""
 
 from __future__ import annotations
 
@@ -116,8 +116,8 @@ def run() -> Demo:
         ],
         plots=[_spread(held[:, 0], exact[0])],
         in_md=(
-            "A list with both (i, j) and (j, i), a force scattered onto atoms, atomic additions on a device: "
-            "the same sum with duplicates, in an order nobody wrote down."
+            "A list with both (i, j) and (j, i), forces scattered to atoms, and atomic additions on "
+            "a device are also sums of duplicates, in an order that the program does not specify."
         ),
         data={"panel": panel, "load": load, "distinct": distinct, "below_limit": yields},
     )

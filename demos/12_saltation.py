@@ -1,4 +1,4 @@
-"""The derivative that steps cannot see: the time of an impact moves, a program of fixed steps does not."""
+"""The derivative through an impact: the time of the impact changes, which fixed steps do not show."""
 
 from __future__ import annotations
 
@@ -98,11 +98,11 @@ def run() -> Demo:
     )
     return Demo(
         title="The derivative through an impact",
-        question="How does the height after three impacts change with the height at the start?",
+        question=("How does the height after three impacts depend on the initial height?"),
         result=(
-            f"The height changes by {exact[0]:.5f} m per m of the start. Differentiated "
-            "step by step the program says 0 at every step size; with the saltation matrix the error is of "
-            f"order {order:.2f}."
+            f"The derivative of the height with respect to the initial height is {exact[0]:.5f}. The "
+            "derivative of the steps of the program is 0 at every step size; with the saltation "
+            f"matrix the error is of order {order:.2f} in the step size."
         ),
         answer=(
             f"By {exact[0]:.5f} m per m. Discretize, then differentiate: the derivative of the steps is "
@@ -171,8 +171,11 @@ def run() -> Demo:
             ),
             _history(naive),
         ),
-        in_md="A pair that crosses a hard cutoff: the force jumps, and without the saltation term "
-        "the derivative misses how the crossing moves (0.360 for 0.4114 in pair/leaving-well).",
+        in_md=(
+            "When a pair crosses a hard cutoff, the force jumps. Without the saltation term the "
+            "derivative does not contain the shift of the crossing time (0.360 instead of 0.4114 in "
+            "pair/leaving-well)."
+        ),
     )
 
 

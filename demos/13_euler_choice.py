@@ -113,9 +113,9 @@ def run() -> Demo:
     opposite = explicit[1] * semi[1] < 0
     return Demo(
         title="Two Eulers, two gradients",
-        question="Does it matter whether a step moves with the old velocity or with the new one?",
+        question=("Does it matter whether a step moves the ball with the old or with the new velocity?"),
         result=(
-            f"Two lines in another order, and the derivative after 2 s is {explicit[1]:+.3f} or "
+            f"If two lines are exchanged, the derivative after 2 s is {explicit[1]:+.3f} or "
             f"{semi[1]:+.3f} (exact: {float(end.gradient['y0']):+.3f})."
         ),
         answer=(
@@ -185,9 +185,11 @@ def run() -> Demo:
             _against_step("height", "Error of the height against the step", "error of y (m)", lines),
             _against_step("slope", "Error of the derivative against the step", "error of dy/dy0", slopes),
         ),
-        in_md="The integrator is part of the program that is differentiated: velocity Verlet and leapfrog "
-        "with other half steps have other gradients, and a force that is only continuous costs the gradient "
-        "an order.",
+        in_md=(
+            "The integrator is part of the program that is differentiated: velocity Verlet and "
+            "leapfrog with different half steps have different gradients. If the derivative of the "
+            "force is not continuous, the order of the gradient is lower by one."
+        ),
         data={"energy_gain": grown},
     )
 

@@ -1,4 +1,4 @@
-"""Zeno: infinitely many bounces in a finite time, and what three programs make of them."""
+"""Zeno: infinitely many bounces in a finite time, simulated by three programs."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def run() -> Demo:
     gaps = [float(f"1e-{n}") for n in range(1, 11)]
     return Demo(
         title="Infinitely many bounces",
-        question="When does a bouncing ball come to rest, and which program knows?",
+        question=("When does a bouncing ball come to rest, and which program finds this time?"),
         result=(
             f"The ball is at rest after {limit:.6f} s and infinitely many bounces. Located impacts find that "
             f"time within {off:.0e} s; fixed steps never come to rest."
@@ -142,8 +142,10 @@ def run() -> Demo:
             ),
         ),
         plots=(_heights(exact, plain[0], limit), _staircase(exact, located, counted, limit)),
-        in_md="Constraints and contacts that close in ever shorter times: a step that waits for each event "
-        "never ends, a step that skips them never rests.",
+        in_md=(
+            "Constraints and contacts may close at ever shorter intervals: a program that locates "
+            "every event never ends, and a program that skips events never comes to rest."
+        ),
     )
 
 

@@ -1,4 +1,4 @@
-"""A softplus contact: what its width does to the loss landscape, and the bias it buys."""
+"""A softplus contact: the effect of its width on the loss, and the resulting bias."""
 
 from __future__ import annotations
 
@@ -69,10 +69,13 @@ def run() -> Demo:
     calm = min(WIDTHS, key=lambda eps: found[eps].rough)
     return Demo(
         title="How soft a floor",
-        question="Which width of a softplus contact makes the loss usable, and at what price?",
+        question=(
+            "Which width of a softplus contact makes the loss suitable for optimization, and how "
+            "large is the bias?"
+        ),
         result=(
-            f"A contact {single:g} m wide leaves one of {found[0.0].minima} minima; at 0.1 m that minimum "
-            f"has moved by {bias[0.1]:.3f} m."
+            f"With a contact {single:g} m wide, one of {found[0.0].minima} minima is left; at 0.1 m "
+            f"this minimum has moved by {bias[0.1]:.3f} m."
         ),
         answer=(
             f"With a hard contact the loss has {found[0.0].minima} minima and its derivative is off by "
@@ -175,8 +178,10 @@ def run() -> Demo:
                 caption="The width that helps is half the way in one step; beyond it only the bias grows.",
             ),
         ),
-        in_md="The switching width of a cutoff: wide enough to be resolved by the steps, it makes forces and "
-        "gradients smooth; the potential that is simulated is then another one.",
+        in_md=(
+            "This is the switching width of a cutoff: if it is wide enough to be resolved by the "
+            "steps, forces and gradients are smooth, but the simulated potential is a different one."
+        ),
         data={
             "minima": {f"{eps:g}": one.minima for eps, one in found.items()},
             "gradient_error": {f"{eps:g}": one.rough for eps, one in found.items()},

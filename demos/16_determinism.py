@@ -1,4 +1,4 @@
-"""Repeat runs in new processes: bits equal or not, and what that does and does not tell."""
+"""Repeated runs in new processes: whether their bits are equal, and what this shows."""
 
 from __future__ import annotations
 
@@ -86,10 +86,12 @@ def run() -> Demo:
     contacts = [own["plain_contact"], old["plain_contact"]]
     return Demo(
         title="The same bits every time, and what that is worth",
-        question="Does a rollout give the same bits in a new process, compiled otherwise, in a batch?",
+        question=(
+            "Does a rollout give the same bits in a new process, with another compilation, and in a batch?"
+        ),
         result=(
-            f"{len(found)} processes give the same bits, and a start one ulp higher ends {ulp:.1g} m away, "
-            "just as repeatably."
+            f"{len(found)} processes give the same bits. A run whose initial height is one ulp larger "
+            f"ends {ulp:.1g} m away, and is equally reproducible."
         ),
         answer=(
             f"mdnum's program, whose products are rounded before they are added, has one fingerprint in "
@@ -185,8 +187,9 @@ def run() -> Demo:
             )
         ],
         in_md=(
-            "Two runs of one system on one machine agree bit for bit; another order of the neighbor list, "
-            "another instruction set or number of threads makes another run, as right as the first."
+            "Two runs of one system on one machine agree bit for bit. With another order of the "
+            "neighbor list, another instruction set or another number of threads the run is "
+            "different, but equally correct."
         ),
         data={"same": same, "found": found},
     )

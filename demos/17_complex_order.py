@@ -115,5 +115,8 @@ def run() -> Demo:
             Series("arg S", step, np.angle(peak), "points", "muted"),
             Series("with the jumps of the ledger", step, phase),
         ), caption="arg S jumps at its branch cut; each jump is a flip.")],
-        in_md="These are atoms already: a Lennard-Jones layer, differentiated through its steps.",
+        in_md=(
+"This demonstration uses atoms: a Lennard-Jones layer, differentiated through the steps "
+"of the simulation."
+),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Residuals of 9.96e-4 and 1.004e-3 at a tolerance of 1e-3, and what each run does next."""
+"""Residuals of 9.96e-4 and 1.004e-3 at a tolerance of 1e-3, and their effect on each run."""
 
 from __future__ import annotations
 
@@ -49,7 +49,10 @@ def run() -> Demo:
     exact = -ALPHA * RESIDUALS[1]
     return Demo(
         title="Two residuals on either side of a tolerance",
-        question="S is 9.96e-4 in one run, 1.004e-3 in another, the tolerance 1e-3. What does each do next?",
+        question=(
+"The residual S is 9.96e-4 in one run and 1.004e-3 in another, and the tolerance is "
+"1e-3. What happens next?"
+),
         result="S = 9.96e-4 stops, S = 1.004e-3 makes one more iteration: the run that was lower by 8e-6 m "
         f"ends higher by {jump:.3g} m, its contact lasts {lasts[1]} step instead of {lasts[0]}, and its next "
         f"one begins at step {again[1]} instead of {again[0]}.",
@@ -79,6 +82,8 @@ def run() -> Demo:
                     (Series("", np.arange(1, STEPS + 1), apart),), y_scale="log",
                     caption="8e-6 m before the decision, thirty times that after it; where a contact begins "
                     "a step earlier in one run the distance jumps.")],
-        in_md="A minimizer, SHAKE or a self-consistent field that stops one iteration earlier leaves other "
-        "positions, and a list that is built from them may hold another pair.",
+        in_md=(
+"If a minimizer, SHAKE or a self-consistent field stops one iteration earlier, the "
+"positions differ, and a list that is built from them may contain another pair."
+),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""An implicit derivative at a singular fixed point, and what a regularization makes of it."""
+"""An implicit derivative at a singular fixed point, and the effect of a regularization."""
 
 from __future__ import annotations
 
@@ -62,7 +62,10 @@ def run() -> Demo:
     kink = float(jax.grad(lambda p: jnp.maximum(p, 0.0))(0.0))
     return Demo(
         title="A fixed point whose derivative does not exist",
-        question="A bead rests at x = p^(1/3) under a load p. What is dx/dp where the load vanishes?",
+        question=(
+"The equilibrium position of a bead under a load p is x = p^(1/3). What is dx/dp at zero "
+"load?"
+),
         result=f"dx/dp is infinite at p = 0 and {plain[1]:.2f} at 8e-6. A regularization of {spring:g} in "
         f"the linear solve gives half of that, and {solved[spring][-1]:.2f} at p = 0: one over the number "
         "chosen.",
@@ -95,6 +98,9 @@ def run() -> Demo:
             *(Series(f"{a:g} in the solve", np.array(LOADS[:-1]), np.array(solved[a][:-1]), "line", role)
               for a, role in zip(ADDED, ("first", "second", "third"), strict=True)),
         ), x_scale="log", y_scale="log", caption="Each regularization ends at one over itself.")],
-        in_md="A structure at a soft mode: the smallest eigenvalue of its Hessian vanishes, and with it the "
-        "derivative of every relaxed position; Tikhonov's term hides that, and does not mend it.",
+        in_md=(
+"For a structure with a soft mode, the smallest eigenvalue of the Hessian vanishes, and "
+"the derivatives of all relaxed positions diverge. A Tikhonov term hides this problem, "
+"but does not solve it."
+),
     )  # fmt: skip

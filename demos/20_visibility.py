@@ -1,4 +1,4 @@
-"""A ball behind an edge: seen or not is an event, and softened it is another optimization problem."""
+"""A ball behind an edge: visibility is an event, and smoothing it changes the optimization problem."""
 
 from __future__ import annotations
 
@@ -67,7 +67,10 @@ def run() -> Demo:
     wide, hard = WIDTHS[-2], slopes[0.0]
     return Demo(
         title="Seen or not is an event",
-        question="How fast must a ball be thrown up behind an edge of 1 m to be seen for half a second?",
+        question=(
+"A ball is thrown up behind an edge of 1 m. At which speed is it visible for half a "
+"second?"
+),
         result=f"Thrown at {best:.4f} m/s the ball is seen for half a second. Counted in steps the time "
         "seen has the derivative 0 everywhere (exact: "
         f"{exact:.4f} s per m/s); softened over {wide:g} m it leads to {found[wide]:.3f} m/s, the answer to "
@@ -101,6 +104,8 @@ def run() -> Demo:
             for w, role in zip((0.0, *WIDTHS[1:]), ("ink", "first", "second", "third"), strict=True)),
             verticals=((best, "exact"),), caption="Counted in steps the loss is flat where nothing is "
             "seen and a staircase elsewhere. Softened it has a slope everywhere, its minimum elsewhere.")],
-        in_md="A coordination number counts neighbors within a radius; its smooth form has a gradient, and "
-        "is another order parameter.",
+        in_md=(
+"A coordination number counts neighbors within a radius; its smooth version has a "
+"gradient, but is a different order parameter."
+),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Sampling and rounding flip the same decision: which of the two was it, and how many samples would tell."""
+"""Sampling and rounding can flip the same decision: how to distinguish them, with how many samples."""
 
 from __future__ import annotations
 
@@ -66,11 +66,15 @@ def run() -> Demo:
     crossing = SAMPLES[int(np.argmax(rounding > sampling))]
     return Demo(
         title="Which was it, the samples or the rounding?",
-        question="A residual is a mean of random samples, summed in float16. Who flips the stopping "
-        "decision?",
-        result=f"With 1024 samples another key flips {by_key[3]} of {PAIRS} decisions, another order of the "
-        f"sum {by_order[3]}. With {crossing} rounding is the larger error: every run stops, and every one is "
-        "wrong.",
+        question=(
+"A residual is the mean of random samples, summed in float16. What changes the stopping "
+"decision?"
+),
+        result=(
+f"With 1024 samples, another random key changes {by_key[3]} of {PAIRS} decisions, and "
+f"another order of the sum changes {by_order[3]}. With {crossing} samples rounding is the "
+"larger error: every run stops, with a wrong result."
+),
         answer="Run twice more, each time with one of the two changed, and the flip says whose it was. "
         f"Sampling falls as one over the root of the number: {needed:,} samples put the margin of "
         f"{MEAN - TOL:.0e} three standard errors away. Rounding grows with the number, because a running "
@@ -96,6 +100,8 @@ def run() -> Demo:
             Series("rounding", np.array(SAMPLES, float), rounding, "line+points", "bad"),
         ), x_scale="log", y_scale="log", horizontals=((MEAN - TOL, "margin"),),
             caption="Where the curves cross, more samples stop helping.")],
-        in_md="The noise of a thermostat and the order of a force sum both move the step at which a list is "
-        "rebuilt; a run with the same noise in another order tells them apart.",
+        in_md=(
+"The noise of a thermostat and the order of a force sum both change the step at which a "
+"list is rebuilt; a run with the same noise and another order distinguishes them."
+),
     )  # fmt: skip

@@ -51,10 +51,15 @@ def run() -> Demo:
     runs = {name: np.array([five(worlds, name, one, 1.0) for one in h]) for name in worlds}
     return Demo(
         title="Five things that are called error",
-        question="A ball on a stiff floor, 2000 steps in float32: how exact is its height after 2 s, and "
-        "why?",
-        result=f"The height is within {error:.1e} m although rounding moves it by {rounding:.1e} m and the "
-        f"step by {steps:.1e} m: here the two cancel. Five numbers tell why, and none of them is the others.",
+        question=(
+"A ball on a stiff floor is simulated for 2000 steps in float32: how accurate is its "
+"height after 2 s, and why?"
+),
+        result=(
+f"The error of the height is {error:.1e} m, although the rounding error is {rounding:.1e} "
+f"m and the discretization error {steps:.1e} m: in this run the two cancel. Five "
+"different quantities describe the errors of the run."
+),
         answer=f"Precision is {roundoff:.1e}, and it is the same for every run in float32. What the "
         "roundings add up to is the distance from the same program in float64; what the step adds is the "
         f"distance of that from the motion. h sqrt(k) is {100 * stability:.0f} % of its limit, so that "
@@ -84,6 +89,9 @@ def run() -> Demo:
             Series("rounding, float32", h, runs["float32"][:, 1], "line+points"),
             Series("rounding, float16", h, runs["float16"][:, 1], "line+points", "bad"),
         ), x_scale="log", y_scale="log", caption="A shorter step lowers one error and raises the other.")],
-        in_md="The five of a simulation: its dtype, the distance from a reference code, dt times the fastest "
-        "frequency over 2, the growth of a displacement, and what halving dt changes.",
+        in_md=(
+"The five quantities of a simulation are its dtype, the difference from a reference "
+"code, half of dt times the fastest frequency, the growth of a displacement, and the "
+"change when dt is halved."
+),
     )  # fmt: skip
