@@ -263,7 +263,7 @@ def test_code_that_a_file_names_is_executed_where_that_was_allowed_and_nowhere_e
         with pytest.raises(InputError, match=r"potential\.function: .*mine\.py:morse.*--allow-code"):
             ask()
     assert not ran.exists() and not (tmp_path / "run").exists()
-    done = mdnum.run(path, steps=5, out=tmp_path / "run", allow_code=True)
+    done = mdnum.run(path, steps=5, out=tmp_path / "run", check=False, allow_code=True)
     assert ran.exists() and (done.folder / "mine.py").read_text() == CODE
     copied = done.folder / "mine.py.ran"
     from mdnum.verbs import frame
@@ -272,11 +272,11 @@ def test_code_that_a_file_names_is_executed_where_that_was_allowed_and_nowhere_e
     with pytest.raises(InputError, match=r"run/mine\.py:morse"):
         mdnum.run(None, resume=done.folder, steps=8)
     assert not copied.exists()
-    again = mdnum.run(None, resume=done.folder, steps=8, allow_code=True, report=False)
+    again = mdnum.run(None, resume=done.folder, steps=8, check=False, allow_code=True, report=False)
     assert copied.exists() and again.summary["steps"] == 8
     # what was stored is compared without it, and followed again with it
     copied.unlink()
-    same = mdnum.fork_folders(done.folder, done.folder, out=tmp_path / "same")
+    same = mdnum.fork_folders(done.folder, done.folder, out=tmp_path / "same", report=False)
     assert not copied.exists() and same.summary["fork"] is None and same.summary["atoms"] == 500
     with pytest.raises(InputError, match=r"run/mine\.py:morse"):
         mdnum.fork_folders(done.folder, done.folder, replay=True, repeats=0, out=tmp_path / "replay")

@@ -83,12 +83,15 @@ def test_it_is_compiled_into_the_loop_over_the_list(by_species):
     assert "mdnum_pairs_" in str(jax.make_jaxpr(step)(jnp.asarray(wrapped.T), tables))
 
 
-def test_values_by_species_have_names_and_derivatives(by_species, by_pair):
-    """By the chain rule from those by pair."""
+def test_values_by_species_have_names(by_species):
     found = mdnum.parameters(by_species)
     assert found["potential.sigma"].by == "species" and found["potential.sigma"].value.shape == (3,)
     changed = mdnum.changed(by_species, {"potential.species.Kr.sigma": 1.25})
     assert changed.potential.by_species["sigma"].tolist() == [1.0, 1.25, 0.8]
+
+
+@pytest.mark.nightly
+def test_derivatives_by_species_follow_from_those_by_pair(by_species, by_pair):
     names = ("potential.sigma", "potential.epsilon", "potential.species.Kr.sigma")
     loss = everything(27)
     mine = mdnum.method("symmetric")(Problem(by_species, loss, 8), names).gradient

@@ -257,6 +257,7 @@ def test_checks_that_were_not_selected_are_named_and_a_measured_number_is_not_no
     assert [name for name in CHECKS if name in headline] == [list(CHECKS)[-1]] == ["dynamics"]
 
 
+@pytest.mark.slow
 def test_no_bound_is_below_the_largest_error(good):
     """A difference may be smaller than its error by chance, and promises no more than the error."""
     _, values = good.result["forces"].says
