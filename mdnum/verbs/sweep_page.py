@@ -89,7 +89,8 @@ def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
     for advice in s["advice"]:
         if advice["converged"] is False and advice["choice"] not in FREE:
             worst = _shown(view, advice["settings"][1]["worst"])
-            values = {"key": advice["choice"], "end": advice["end"], "next": advice["settings"][1]["value"]}
+            end, near = label(advice["end"]), label(advice["settings"][1]["value"])
+            values = {"key": advice["choice"], "end": end, "next": near}
             yield TEXTS.finding("NOT_CONVERGED", section="What to use", measure=worst, **values)
     if (joint := s["joint"]) is not None and joint["inside"] is False:
         values: Any = {name: _keyed(view, joint[name]) for name in ("setting", "end")}
@@ -105,14 +106,14 @@ def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
 
 def _advised(view: View, advice: Mapping[str, Any]) -> str:
     """Return a sentence on the recommended value of an axis."""
-    key, end, best = advice["choice"], advice["end"], advice["best"]
+    key, end, best = advice["choice"], label(advice["end"]), label(advice["best"])
     seeds = len(view.summary["seeds"])
     if key in FREE:
-        return "" if best is None else TEXTS("use_fastest", key=key, best=best)
+        return "" if advice["best"] is None else TEXTS("use_fastest", key=key, best=best)
     undecided = next((one for one in advice["settings"] if one["value"] == advice["undecided"]), None)
     if undecided is not None and undecided["more"]:
         more = max(1, int(np.ceil(seeds * (undecided["more"] - 1))))
-        return TEXTS("use_undecided", key=key, best=best, value=undecided["value"], more=more,
+        return TEXTS("use_undecided", key=key, best=best, value=label(undecided["value"]), more=more,
                      measure=_shown(view, undecided["worst"]))  # fmt: skip
     if best == end:
         return TEXTS("use_end", key=key, end=end)
@@ -191,13 +192,21 @@ def _differences(view: View) -> list[Any]:
         rows.append({
             "measure": f"{shown} ({unit})" if unit else shown,
             "choice": f"{row['choice']} = {row['setting']}",
-            "difference": row["value"], "error": row["error"],
-            "in errors": row["sigmas"], "chance": row["chance"], "moves": row["moves"],
-            "would have seen": row["detectable"],
+            "difference ± error": _with_error(row), "in errors": row["sigmas"], "chance": row["chance"],
+            "moves": row["moves"], "detectable": row["detectable"],
         })  # fmt: skip
-    names = ("measure", "choice", "difference", "error", "in errors", "chance", "moves", "would have seen")
+    names = ("measure", "choice", "difference ± error", "in errors", "chance", "moves", "detectable")
     columns = {name: name for name in names}
     return _most(rows, columns, "differences.parquet", lambda row: row["moves"] == "yes")
+
+
+def _with_error(row: Mapping[str, Any]) -> str:
+    """A value with the digits that its error leaves, and the error."""
+    value, error = row["value"], row["error"]
+    if not (value and error):
+        return number(value, 5)
+    digits = 2 + int(np.floor(np.log10(abs(value))) - np.floor(np.log10(error)))
+    return f"{number(value, min(max(digits, 2), 12))} ± {number(error, 2)}"
 
 
 def _tolerances(view: View) -> dict[str, str]:
@@ -263,7 +272,7 @@ def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
         yield Plot(
             name, series=tuple(series), title=measure["title"], x_label=axis["key"],
             y_label=f"{shown} ({unit})" if unit else shown, caption=TEXTS("along"),
-            verticals=((float(axis["base"]), "its own"),),
+            verticals=((float(axis["base"]), "system file"),) * (x[0] < axis["base"] < x[-1]),
         )  # fmt: skip
 
 
@@ -271,11 +280,10 @@ def _estimates(view: View) -> list[Any]:
     keys = [axis["key"] for axis in view.summary["axes"]]
     rows = [
         {**dict(zip(keys, one["setting"], strict=True)), "measure": _shown(view, one["measure"]),
-         "mean": one["value"], "error": one["error"], "runs": one["runs"],
-         "effective samples": one["effective"]}
+         "mean ± error": _with_error(one), "runs": one["runs"], "effective samples": one["effective"]}
         for one in view.summary["estimates"]
     ]  # fmt: skip
-    names = [*keys, "measure", "mean", "error", "runs", "effective samples"]
+    names = [*keys, "measure", "mean ± error", "runs", "effective samples"]
     return _most(rows, {name: name for name in names}, "estimates.parquet")
 
 

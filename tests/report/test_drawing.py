@@ -184,6 +184,12 @@ def test_coinciding_series_are_all_seen():
     axes = lines(Series("a", x, x), Series("b", x, x, role="second"), Series("c", x, -x, role="bad"))
     first, second, third = (line.get_linewidth() for line in axes.lines)
     assert first > second == third
+    # as far apart as the curve is high, though by little of its value
+    high = 1000 + x / 100
+    first, second = (
+        line.get_linewidth() for line in lines(Series("a", x, high), Series("b", x, high + 0.02)).lines
+    )
+    assert first == second
 
 
 def test_labels_of_neighboring_marks_do_not_lie_upon_one_another():
