@@ -195,7 +195,7 @@ def stored(
 def counted(label: str, starts: int | str, rows: Sequence[dict[str, Any]]) -> list[Any]:
     """One line of the table."""
     errors = np.array([off(row) for row in rows])
-    trusted = np.array([row["verdict"] == "trusted" for row in rows])
+    trusted = np.array([row["verdict"] == "trusted" for row in rows], bool)
     line = [label, starts, len(rows), int(np.isinf(errors).sum()), int(trusted.sum())]
     line += [int((trusted & (errors > WRONG)).sum())]
     worst = errors[trusted].max(initial=0.0)
