@@ -21,13 +21,13 @@ from mdnum.verbs.sweep_page import judge, page
 class Stored:
     """In place of a workspace: each point has a result, whose value is its address."""
 
-    def __init__(self) -> None:
-        self.read = Counter[str]()
+    def __init__(self, *names: str) -> None:
+        self.read, self.names = Counter[str](), names or ("final_height",)
 
     def result(self, address: str) -> dict[str, Any]:
         self.read[address] += 1
         value = {"value": float(address), "error": 0.0, "effective": None, "digest": ""}
-        return {"status": "complete", "measures": {"final_height": value}, "summary": {}}
+        return {"status": "complete", "measures": dict.fromkeys(self.names, value), "summary": {}}
 
 
 def plan_of(settings: int) -> Plan:
@@ -70,3 +70,15 @@ def test_the_work_grows_with_the_number_of_settings_and_the_page_does_not():
     # the whole is named in each place, and a sentence has no list of 600 values
     texts = [part for part in parts if isinstance(part, str)]
     assert sum("600" in text for text in texts) >= 3 and max(map(len, texts)) < 1000
+
+
+def test_functions_of_one_name_in_two_files_have_figures_of_their_own():
+    plan, names = plan_of(5), ("/one/mine.py:height", "/two/mine.py:height")
+    (measure,) = plan.measures
+    plan = replace(
+        plan, measures=[replace(measure, name=name) for name in names], question=Question(measure=names)
+    )
+    parts = shown(plan, Stored(*names))
+    assert len({part.name for part in parts if isinstance(part, Plot)}) == 2
+    told = {row[0] for row in parts[1].rows}
+    assert told == {"one/mine.py:height (m)", "two/mine.py:height (m)"}
