@@ -38,7 +38,7 @@ def meant(word: str, known: Iterable[str]) -> str:
 def unknown(noun: str, word: str, known: Iterable[str], *, where: str | None = None) -> InputError:
     """Return the error for an unknown name, with the most similar name and the list of known names."""
     known = list(known)
-    remedy = f"{meant(word, known)}Known are {', '.join(known)}"
+    remedy = f"{meant(word, known)}Choose from {', '.join(known)}"
     return InputError(f"unknown {noun} {word!r}", remedy=remedy, where=where)
 
 

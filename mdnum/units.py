@@ -116,6 +116,6 @@ def get(name: str) -> Units:
         return _ALL[name]
     except KeyError:
         raise InputError(
-            f"unknown units {name!r}; known are {', '.join(_ALL)}",
+            f"unknown units {name!r}; known unit systems are {', '.join(_ALL)}",
             remedy="metal means Å, eV, amu and ps; lj means reduced units; ball means m and s",
         ) from None

@@ -235,7 +235,7 @@ def test_a_verb_that_was_stopped_is_resumed(site, capsys):
     assert call("spread", "numbers.txt") == 130
     assert "Continue it with `mdnum spread --resume runs/spread-1`" in capsys.readouterr().err
     assert call("run", "--resume", "runs/spread-1") == 2
-    assert "is the folder of `mdnum spread`" in capsys.readouterr().err
+    assert "is a folder of `mdnum spread`" in capsys.readouterr().err
     for words, said in (
         (("numbers.txt", "--resume", "runs/spread-1"), "FILE is an option of"),
         ((), "no file"),

@@ -160,7 +160,7 @@ def test_a_checkpoint_unpacks_to_no_more_than_itself(tmp_path):
     data = path.read_bytes()
     for claim in (b"(99999999999999999,), ", b"(7, 9999999999999999),"):
         path.write_bytes(data.replace(b"(7,), }" + b" " * (len(claim) - 6), claim + b"}"))
-        with pytest.raises(FolderError, match="not a readable checkpoint"):
+        with pytest.raises(FolderError, match="the checkpoint cannot be read"):
             checkpoint.read(path)
 
 

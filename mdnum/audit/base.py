@@ -129,8 +129,8 @@ def finding(
     """
     if left := [test for test in cause(code).tests if test not in tests]:
         raise ValueError(
-            f"{code} was reported before it was tested against its alternatives in "
-            f"{cause(code).rivals}: {left}"
+            f"{code} was reported without the tests that distinguish it from "
+            f"{', '.join(cause(code).rivals)}: {left}"
         )
     return Observed(code, severity, [one for one in variants if one], values)
 

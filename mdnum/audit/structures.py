@@ -46,16 +46,16 @@ def read_structure(words: str | Path) -> Atoms:
         chosen = list(ase_images(path, which))
         count = 1 if chosen else sum(1 for _ in ase_images(path))
     if len(chosen) != 1:
-        several = f"means {len(chosen)} structures, and an audit is about one structure"
+        several = f"selects {len(chosen)} structures, but an audit tests only one"
         raise InputError(
             several if chosen else f"the file has no structure {which} (it has {count})",
             where=text,
-            remedy="Name one by its number: file@0 is the first, file@-1 the last",
+            remedy="Select one by its index: file@0 is the first, file@-1 the last",
         )
     atoms = chosen[0]
     if not len(atoms):
         raise InputError(
-            "the structure holds no atoms", where=text, remedy="Give another file, or another index: file@0"
+            "the structure holds no atoms", where=text, remedy="Give another file or index, such as file@0"
         )
     bad = ~np.isfinite(atoms.positions).all(axis=1)
     if bad.any() or not np.isfinite(np.asarray(atoms.cell)).all():

@@ -320,13 +320,13 @@ def _positive(name: str, value: float, *, zero: bool = False, most: float = np.i
     if not np.isfinite(value) or value < 0 or (value == 0 and not zero) or value > most:
         low = "at least 0" if zero else "above 0"
         high = f" and at most {most:g}" if np.isfinite(most) else ""
-        raise InputError(f"{name} is {value!r}", remedy=f"Choose a finite value {low}{high}", where=name)
+        raise InputError(f"{name} = {value!r}; expected a finite value {low}{high}", where=name)
 
 
 def _numbers(n: Counts, least: int = 1) -> Float[np.ndarray, "*counts"]:
     n = np.asarray(n, np.float64)
     if np.any(n < least) or np.any(n != np.floor(n)) or np.any(np.isinf(n)):
-        raise InputError(f"impact number {n!r}", remedy=f"Give an integer of at least {least}")
+        raise InputError(f"impact number {n!r}; expected an integer of at least {least}")
     return n
 
 

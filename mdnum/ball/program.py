@@ -92,12 +92,12 @@ class BallProgram:
         if kinds[0] != kinds[1] or (self.problem.world.lift is None) != (other.problem.world.lift is None):
             raise InputError(
                 f"{kinds[0]} and {kinds[1]} make different kinds of decisions",
-                remedy="Compare programs with one kind of contact",
+                remedy="Compare programs with the same kind of contact",
             )
         if self.size != other.size:
             raise InputError(
                 f"the programs have {self.size} and {other.size} balls",
-                remedy="Compare programs of the same number of balls",
+                remedy="Compare programs with the same number of balls",
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
@@ -328,7 +328,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
             ends[name] = int(broken.argmax()) - 1
     last = min([a.steps, *ends.values()])
     if last < 0:
-        raise InputError("a start height is not finite in this precision", remedy="Use a wider dtype")
+        raise InputError("an initial height is not finite in this precision", remedy="Use a wider dtype")
     return last, {name: "blow-up" if ends.get(name) == last else "" for name in "AB"}
 
 

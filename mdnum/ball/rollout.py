@@ -310,8 +310,8 @@ def first_difference(a: BallRun, b: BallRun) -> BallDifference:
     """
     if (a.steps, a.balls) != (b.steps, b.balls):
         raise InputError(
-            f"the first run has {a.steps} steps of {a.balls} balls, the second {b.steps} of {b.balls}",
-            remedy="Compare runs of equal size",
+            f"the first run has {a.steps} steps and {a.balls} balls, the second {b.steps} and {b.balls}",
+            remedy="Compare runs with the same numbers of steps and balls",
         )
     separation, seed = np.zeros(0), None
     if a.kept and b.kept:

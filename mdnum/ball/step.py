@@ -253,7 +253,7 @@ class EventLocated(eqx.Module):
         return r(y + drift), r(v + r(self.h * a))
 
     def push(self, pull, motion):
-        raise TypeError("an event-located step has no contact force")
+        raise TypeError("the event-located integrator has no contact force")
 
 
 # --- contact models -------------------------------------------------------------------------------------

@@ -245,12 +245,12 @@ def _check(world: World) -> None:
         if name != "eps" or contact.smooth:
             _in_range(name, world.value(name))
     if world.control is not None and not np.all(np.isfinite(np.asarray(world.control, np.float64))):
-        raise InputError("the control contains a number that is not finite")
+        raise InputError("the control acceleration contains a number that is not finite")
     if isinstance(integrator, EventLocated):
         if not isinstance(contact, Impact):
             raise InputError(
-                "an event-located step needs an impact",
-                remedy="A penalty or a projection has no instant of contact; choose another integrator",
+                "the event-located integrator needs an impact contact",
+                remedy="A penalty or a projection has no instant of contact; use another integrator",
             )
         _count("max_impacts", integrator.max_impacts)
     if isinstance(contact, Projection):
@@ -276,7 +276,7 @@ def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
         if not float(rule.enter) >= float(rule.rule.tol):
             raise InputError(
                 f"enter = {rule.enter} is below tol = {rule.rule.tol}",
-                remedy="The solver starts above enter and stops below tol: enter is the larger one",
+                remedy="The solver starts above enter and stops below tol, so enter must be at least tol",
             )
         return
     tol = float(rule.tol)
@@ -286,17 +286,17 @@ def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
     role = max(usable, key=lambda one: usable[one])
     if not tol >= usable[role]:
         raise InputError(
-            f"tol = {tol:g} cannot be met with {role} in {getattr(policy, role)}",
+            f"tol = {tol:g} is too small for the role {role} in {getattr(policy, role)}",
             remedy=f"The smallest usable tolerance is {usable[role]:.3g}",
         )
     limit = limits.largest(policy.decision)
     if tol > limit:
-        raise InputError(f"tol = {tol:g} is beyond the largest {policy.decision}, {limit:g}")
+        raise InputError(f"tol = {tol:g} exceeds the largest {policy.decision} number, {limit:g}")
 
 
 def _count(name: str, value: int) -> None:
     if not 1 <= value <= _MOST_ITERATIONS:
-        raise InputError(f"{name} = {value}; expected a number from 1 to {_MOST_ITERATIONS}")
+        raise InputError(f"{name} = {value}; expected an integer from 1 to {_MOST_ITERATIONS}")
 
 
 def _in_range(name: str, value: Any) -> None:

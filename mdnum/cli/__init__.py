@@ -129,7 +129,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
             sys.exit(EXIT_STOPPED)
         if (seen := _no_device(error)) is None:
             raise
-        asked = InputError(seen, remedy="Set the variable to cpu, or unset it")
+        asked = InputError(seen, remedy="Set JAX_PLATFORMS to cpu, or unset it")
     else:
         compiled = sys.modules.get("mdnum.compiled")
         print_lines([] if compiled is None or compiled.all_kept() else [compiled.NOT_KEPT])

@@ -107,7 +107,7 @@ class _Questions(TyperGroup):
         elif "usual" in group and first not in self.commands and first != "--help":
             if "two" in group and len(args) > 1 and not (args[1].startswith("-") or ctx.resilient_parsing):
                 both, folders = " ".join(args[:2]), all(map(os.path.isdir, args[:2]))
-                remedy = f"Ask `mdnum {group['two'][0 if folders else 1]} {both}`"
+                remedy = f"Use `mdnum {group['two'][0 if folders else 1]} {both}`"
                 raise InputError(f"{both}: expected one system", remedy=remedy)
             args = [group["usual"], *args]
         return super().parse_args(ctx, args)

@@ -250,8 +250,8 @@ def calibrate(
     changes = planted(simulation) if changes is None else changes
     if not any(change.must_fail for change in changes):
         raise InputError(
-            "the list of planted changes that must be detected is empty",
-            remedy="Add a planted change that must be detected; otherwise the test proves nothing",
+            "no planted change has must_fail = True, so the test could not fail",
+            remedy="Add a planted change that must be detected",
         )
     tried = [steps] if steps is not None else _windows(simulation, start)
     nodes = nodes_of(simulation, start or first_state(simulation))

@@ -231,8 +231,7 @@ def boundaries(
     Error: boundaries are exact: the two sides are adjacent floats whose runs made different decisions.
     """
     most = (MOST_BALL if isinstance(system, BallSystem) else MOST) if most is None else most
-    if cells < 1 or most < 1:
-        raise InputError(f"cells = {cells} and most = {most}; expected at least 1")
+    expect_at_least(1, cells=cells, most=most)
     system = opened(system)
     program = program_of(system, steps)
     last = program.steps if steps is None else steps

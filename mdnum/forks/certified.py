@@ -177,8 +177,8 @@ def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
     """
     if not simulation.rule.safe:
         raise InputError(
-            "this rebuild rule can leave pairs out of the list, so their decisions would not be certified",
-            remedy="Use --set neighbors.rebuild.every=1 with check = true",
+            "with this rebuild rule the list may miss pairs, whose decisions would not be certified",
+            remedy="Set neighbors.rebuild.every = 1 and neighbors.rebuild.check = true",
             where="neighbors.rebuild",
         )
     decider, recorder = simulation.decider, PairRecorder(simulation)

@@ -173,7 +173,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
             raise InputError(
                 f"the runs are of different systems: {key} is {one} in the first and {other} in the second",
                 where=where,
-                remedy=f"{remedy}, which differ in numbers or in choices of the program",
+                remedy=f"{remedy}, which may differ in numbers or numerical choices",
             )
     if world == "flips":
         return _of_frames(first, second, where)
@@ -278,7 +278,7 @@ def _md_dates(first: RunFolder, second: RunFolder) -> dict[str, Any]:
     series = [folder.read("series", ["step", "pairs", *_NUMBERS]) for folder in (first, second)]
     steps = min(len(table["step"]) for table in series) - 1
     if steps < 0:
-        raise InputError("one run has no recorded step to compare", remedy="Resume that run, or repeat it")
+        raise InputError("one of the runs has no recorded step", remedy="Resume that run, or run it again")
     differ = np.zeros(steps + 1, bool)
     for name in _NUMBERS:
         one, other = (table[name][: steps + 1] for table in series)

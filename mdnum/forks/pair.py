@@ -176,17 +176,17 @@ def counterfactuals(
     """
     reason = twin.a.imposable or twin.b.imposable
     runs = counterfactual and reason is None
-    most = repeats_asked(repeats, runs, reason or "those are left out")
+    most = repeats_asked(repeats, runs, reason or "such runs are disabled")
     if back and not runs:
         raise InputError(
             f"A cannot be run with B's decisions, because B is not run with A's: "
-            f"{reason or 'those are left out'}",
-            remedy="Omit the option back",
+            f"{reason or 'such runs are disabled'}",
+            remedy="Omit the option `back`",
         )
     return runs, runs if back is None else back, most
 
 
-def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "those are left out") -> int:
+def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such runs are disabled") -> int:
     """Return the largest number of repeats: the requested number, or the default if decisions can be imposed.
 
     Raises:
@@ -202,7 +202,7 @@ def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "those a
     if repeats and not counterfactual:
         raise InputError(
             f"repeats = {repeats}, but B is not run with A's decisions, so there is nothing to repeat: {why}",
-            remedy="Omit the repeats, or set repeats = 0",
+            remedy="Set repeats = 0, or omit it",
         )
     return repeats
 

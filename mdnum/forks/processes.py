@@ -177,7 +177,7 @@ def variants(
     reference, own = next(((row, x) for row, x in found if x is not None), (None, None))
     if reference is None or own is None:
         row = found[0][0]
-        raise MdnumError(f"no variant ran; the error of {row.variant.name!r} was: {row.failed}")
+        raise MdnumError(f"all variants failed; the error of {row.variant.name!r} was: {row.failed}")
     cell = Cell.create(np.asarray(system.cell.matrix), system.pbc)
 
     def furthest(one: np.ndarray, other: np.ndarray) -> float:
@@ -403,7 +403,7 @@ def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
     own = system if isinstance(system, BallSystem) else system.file
     if own is None:
         raise InputError(
-            "objects of this process cannot be recreated in another process",
+            "a system made from Python objects cannot be recreated in another process",
             where=system.name,
             remedy="Give a system file",
         )

@@ -127,7 +127,7 @@ def pinned(
     last_step = fork.steps if steps is None else steps
     if pairs is None:
         if fork.decision is None:
-            raise InputError("the runs do not fork", remedy="Name the pairs whose decisions are pinned")
+            raise InputError("the runs do not fork", remedy="Give the pairs whose decisions to override")
         i, j = fork.decision.subject
         pairs = [(i, j)]
         spell = disagreements(fork, i, j)[0]
@@ -163,7 +163,7 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
     named = re.fullmatch(r"(\d+)\s*[-–]\s*(\d+)(?::(\d+)\.\.(\d+))?", text.strip())
     if named is None:
         raise InputError(
-            f"{text!r} is not a decision", where="pin", remedy="Write fork, 3-75 or 3-75:600..700"
+            f"{text!r} names no decision", where="pin", remedy="Write fork, 3-75 or 3-75:600..700"
         )
     pair = int(named[1]), int(named[2])
     _check_pair(pair, atoms)

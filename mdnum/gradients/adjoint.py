@@ -378,8 +378,8 @@ class StretchReversal:
         force: Any = simulation.force
         if guard is not None and not simulation.imposable:
             raise InputError(
-                "the contribution of flips is known only for pair potentials and for energies whose "
-                "pairs the list decides",
+                "the contribution of flips is known only for pair potentials, and for energies of "
+                "exactly the pairs in the list",
                 remedy="Use the method symmetric for a many-body potential",
                 where=simulation.name,
             )

@@ -108,7 +108,7 @@ class Implicit(BallMethod):
             raise InputError(
                 f"{type(contact).__name__} has no iterated projection, so it has no fixed point to "
                 "differentiate",
-                remedy="Use the unrolled derivative, or event-aware for an impact.",
+                remedy="Use the method unrolled, or event-aware for an impact contact.",
             )
         gain = float(contact.alpha) * float(contact.k)
         condition = max(1.0, gain + self.regularization) / min(1.0, gain + self.regularization)
@@ -194,7 +194,7 @@ class SoftFloor(BallMethod):
         """
         eps = _suitable(problem) if self.eps is None else self.eps
         if not eps > 0:
-            raise InputError(f"eps is {eps}", remedy="Choose a width above 0.", where="eps")
+            raise InputError(f"eps = {eps}", remedy="Choose a width above 0.", where="eps")
         soft = softened(problem, eps)
         # the soft floor's own stiffness and width are not what these names mean in the given program
         own = () if isinstance(problem.world.contact, Penalty) else (*_SOLVER, "eps", "rest_speed")
@@ -225,9 +225,9 @@ def softened(problem: BallProblem, eps: float) -> BallProblem:
     rate, h = speed / eps, float(world.integrator.h)
     if h * rate * _RESOLVED > 1.001:
         raise InputError(
-            f"the ball crosses the contact layer of width {eps:g} m in {1 / rate:.3g} s, which a step "
-            f"of {h:g} s does not resolve",
-            remedy=f"Choose eps of at least {_RESOLVED * speed * h:.2g} or a shorter step.",
+            f"the ball crosses the contact layer of width {eps:g} m in {1 / rate:.3g} s, too fast for "
+            f"a time step of {h:g} s",
+            remedy=f"Choose eps of at least {_RESOLVED * speed * h:.2g} or a shorter time step.",
             where="eps",
         )
     soft = SoftImpact(
@@ -295,8 +295,8 @@ class ThroughContacts(BallMethod):
             events, flagged = _events(problem, run)
         if flagged:
             raise NumericalError(
-                f"contacts that graze the floor: {int(flagged)}; the contact time has no derivative there",
-                remedy="Move the start or the step until the ball crosses the floor, or smooth the contact.",
+                f"contacts that only graze the floor: {int(flagged)}; their time has no derivative",
+                remedy="Change the start or the time step so that the ball hits the floor, or smooth it.",
             )
         use = used(problem, names, slopes, run, own=located or smooth)
         for name in names:

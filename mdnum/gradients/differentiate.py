@@ -138,9 +138,9 @@ def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) ->
             inputs = ", ".join(f"{one:.3g}" for one in blamed.inputs)
             if blamed.operation:
                 why = f": at step {blamed.step} {blamed.operation}({inputs}) in {blamed.source}"
-        what = "the loss" if not np.isfinite(found.value) else f"the gradient by {', '.join(bad)}"
+        what = "the loss" if not np.isfinite(found.value) else f"a derivative, by {', '.join(bad)}"
         raise NumericalError(
-            f"{what} is not finite{why}", where=found.method, remedy="Correct that operation"
+            f"{what} is not finite{why}", where=found.method, remedy="Correct the operation that produces it"
         )
     return found
 

@@ -464,5 +464,5 @@ def parse(text: str, simulation: Simulation, steps: int) -> Loss:
             options[key] = int(value) if "int" in known[key] else float(value)
         except ValueError:
             a = "a whole number" if "int" in known[key] else "a number"
-            raise InputError(f"{key} = {value!r} of the loss {name} is not {a}") from None
+            raise InputError(f"the option {key} of the loss {name} is {value!r}; expected {a}") from None
     return kind.named(options, simulation, steps)

@@ -56,13 +56,13 @@ class Problem:
         assert self.simulation.propagator is not None
         if not self.loss.looks_at(np.arange(self.steps + 1), self.steps).any():
             raise InputError(
-                f"the loss {self.loss.name} is evaluated at no step up to {self.steps}",
+                f"the loss {self.loss.name} is evaluated at none of the steps 0 to {self.steps}",
                 remedy="Run longer, or evaluate the loss earlier or more often",
             )
         around = surroundings(self.simulation)
         why = self.loss.reason_unavailable(around)
         if why is not None:
-            raise InputError(f"the loss {self.loss.name} is not defined here: {why}")
+            raise InputError(f"the loss {self.loss.name} is not defined for this system: {why}")
         # a loss that is no number is refused before anything is run
         shape: Any = jax.ShapeDtypeStruct
         vector = shape((3, self.simulation.atoms), self.simulation.policy.dtype("state"))

@@ -343,7 +343,7 @@ class ReversibleTape(RunTape):
         where = f"at step {step}" if last - step <= 1 else f"between steps {step} and {last}"
         raise NumericalError(
             f"the reversed run did not retrace the forward run: it deviated {where}",
-            remedy="The neighbor list may have missed pairs: rebuild it in time (neighbors.rebuild)",
+            remedy="The neighbor list may have missed pairs: rebuild it more often (neighbors.rebuild)",
             where=self.simulation.name,
         )
 

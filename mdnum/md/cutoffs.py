@@ -157,7 +157,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
         ends = [_ends(made, power) for power in (1, 3)]
     if made.smoothness < _ORDERS and not any(ends):
         after = _DERIVATIVES[max(made.smoothness + 1, 0)]
-        raise ValueError(f"its declared smoothness is {made.smoothness}, but its {after} does not jump")
+        raise ValueError(f"the cutoff declares smoothness {made.smoothness}, but its {after} does not jump")
 
 
 def _ends(made: Cutoff, power: int) -> bool:
@@ -182,7 +182,7 @@ def _ends(made: Cutoff, power: int) -> bool:
     off = ~(np.abs(2 * r * (slope - derivatives[1](jnp.asarray(r**2)))) <= 1e-9)
     if off.any():
         raise ValueError(
-            f"its slope is not the derivative of its energy at r = {r[off.argmax()]:g}, r_cut = 2"
+            f"the slope is not the derivative of the energy at r = {r[off.argmax()]:g}, r_cut = 2"
         )
     if made.switches and not np.allclose(energy[r < 1.6], r[r < 1.6] ** (-2 * power), rtol=1e-12):
         raise ValueError("the switching function changes the energy below the onset")
@@ -197,7 +197,7 @@ def _ends(made: Cutoff, power: int) -> bool:
             # no event tells of a jump of the energy at the onset, whatever is claimed
             if order <= claimed or (order == 0 and place == "the onset"):
                 raise ValueError(
-                    f"its {_DERIVATIVES[order]} jumps by {jump:g} at {place}, which contradicts its "
+                    f"the {_DERIVATIVES[order]} jumps by {jump:g} at {place}, which contradicts the "
                     f"declared smoothness of {claimed}"
                 )
             ends = True
@@ -205,7 +205,7 @@ def _ends(made: Cutoff, power: int) -> bool:
     for name, limit, least in (("energy", inside, 1e-9 * at.energy), ("force", -4 * steep, -1e-5 * at.slope)):
         told = float(getattr(made, f"{name}_jump")(at))
         if not abs(told - limit) <= least:
-            raise ValueError(f"its {name}_jump is {told:g}, but its {name} just inside r_cut is {limit:g}")
+            raise ValueError(f"{name}_jump is {told:g}, but the {name} just inside r_cut is {limit:g}")
     return ends
 
 

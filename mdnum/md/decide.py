@@ -56,7 +56,7 @@ class PairDecider:
     def __post_init__(self):
         if self.compare not in CONVENTIONS:
             raise InputError(
-                f"unknown convention {self.compare!r}; known are {', '.join(map(repr, CONVENTIONS))}",
+                f"unknown convention {self.compare!r}; expected one of {', '.join(map(repr, CONVENTIONS))}",
                 where="cutoff.compare",
             )
 

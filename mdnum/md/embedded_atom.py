@@ -50,13 +50,13 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
-        raise InputError("no such potential table", where=where, remedy="Correct potential.file") from None
+        raise InputError("no such table", where=where, remedy="Correct the key potential.file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"the potential table cannot be read ({error})", where=where) from error
     try:
         count, *elements = lines[3].split()
         if int(count) != len(elements):
-            raise ValueError(f"{count} elements announced, {len(elements)} named")
+            raise ValueError(f"line 4 announces {count} elements but names {len(elements)}")
         first, drho, second, dr, r_cut = (float(word) for word in lines[4].split())
         n_rho, n_r = int(first), int(second)
     except (IndexError, ValueError) as error:
@@ -76,13 +76,13 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
         raise InputError(
             f"the table is for {elements[0]}, but the structure holds {', '.join(others)}",
             where=where,
-            remedy="Correct the structure or potential.file",
+            remedy="Correct the structure, or the key potential.file",
         )
     # the line of the element: atomic number, mass, lattice constant, lattice; not needed
     words = " ".join(lines[6:]).split()
     expected = n_rho + 2 * n_r
     if len(words) != expected:
-        raise InputError(f"{len(words)} numbers after the element's line, expected {expected}", where=where)
+        raise InputError(f"expected {expected} numbers after line 6; found {len(words)}", where=where)
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError as error:

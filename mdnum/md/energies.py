@@ -236,7 +236,7 @@ def energy_function(
     if not others or not callable(function := others[0 if first else -1]):
         seen = ", ".join(type(part).__name__ for part in parts)
         raise InputError(
-            f"expected an energy function; got {seen}", remedy="Give a function, or (neighbor_fn, function)"
+            f"expected an energy function; found {seen}", remedy="Give it, or (neighbor_fn, function)"
         )
     start = others[0] if not first and len(others) > 1 else None
     if not name:
@@ -247,7 +247,7 @@ def energy_function(
     how = replace(how, images=lists is not None and "MultiImage" in type(lists).__name__)
     if how.parameters and parameters is None and start is None:
         raise InputError(
-            f"{name} takes its parameters as first argument, and none were given", remedy="Give parameters="
+            f"{name} takes parameters as its first argument, but none were given", remedy="Give parameters="
         )
     length, energy = _scales(units, name)
     tree = () if parameters is None else jax.tree.map(jnp.asarray, parameters)
@@ -274,7 +274,7 @@ def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Con
     if placed and (names[0] in _GRAPHS or "Graph" in str(placed[0].annotation)):
         raise InputError(
             f"{name} takes a graph, not a neighbor list, so mdnum cannot pass its list to it",
-            remedy="Wrap it: def energy(parameters, R, neighbor, cell), which makes the graph of "
+            remedy="Wrap it in a function energy(parameters, R, neighbor, cell) that makes the graph from "
             "neighbor.idx and mdnum.md.jaxmd.displacement(cell)",
         )
     open_ended = any(one.kind == kinds.VAR_KEYWORD for one in given)
@@ -297,5 +297,5 @@ def _scales(units: Any, name: str) -> tuple[float, float]:
     except (ValueError, KeyError):
         raise InputError(
             f"{name}: unknown units {units!r}",
-            remedy=f"Give one of {', '.join(LENGTHS)} and one of {', '.join(ENERGIES)}",
+            remedy=f"Give a length unit ({', '.join(LENGTHS)}) and an energy unit ({', '.join(ENERGIES)})",
         ) from None

@@ -113,9 +113,9 @@ class FixedPointUnits:
         """
         if not cell.orthorhombic:
             raise InputError(
-                "a fixed-point state needs a box with right angles along x, y and z",
+                "a fixed-point state needs an orthorhombic box along x, y and z",
                 where="precision.state",
-                remedy='Use state = "float64" for a tilted box',
+                remedy='Use state = "float64" for other boxes',
             )
         matrix = np.round(np.asarray(cell.matrix, np.float64) / self.spacing)
         if np.max(np.abs(matrix)) >= 2**50:

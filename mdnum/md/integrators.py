@@ -308,7 +308,7 @@ class KickDrift(Integrator):
         own = ("kick", "init", "finish", "begin", "deform")
         if other := [name for name in own if getattr(cls, name) is not getattr(KickDrift, name)]:
             raise TypeError(
-                f"{cls.__name__} overrides {other[0]}: derive it from Integrator, not from KickDrift"
+                f"{cls.__name__} overrides {other[0]}; derive the class from Integrator, not from KickDrift"
             )
 
     def kick(self, v: Vector, time: Number, acceleration: Vector) -> Vector:

@@ -140,7 +140,7 @@ def scalar(value: float | np.ndarray) -> Float[Array, ""]:
 def _refuse_update(*_: Any, **__: Any) -> NeighborList:
     raise InputError(
         "this neighbor list was built outside jax-md and cannot update itself",
-        remedy="build a new one with mdnum.md.jaxmd.as_neighbor_list",
+        remedy="Build a new one with mdnum.md.jaxmd.as_neighbor_list",
     )
 
 
@@ -165,7 +165,7 @@ def as_neighbor_list(
         code: error code of the list, for example as after an overflow.
     """
     if format not in _FORMATS:
-        raise InputError(f"unknown neighbor list format {format!r}; known are {', '.join(_FORMATS)}")
+        raise InputError(f"unknown neighbor list format {format!r}; known formats are {', '.join(_FORMATS)}")
     atoms = idx_dense.shape[0]
     own = jnp.arange(atoms, dtype=jnp.int32)[:, None]
     idx = jnp.where((idx_dense == own) | (idx_dense >= atoms), atoms, idx_dense).astype(jnp.int32)
@@ -252,9 +252,9 @@ class PairSearch:
         # a hair beyond half the width is the room that callers add for rounding, not another image
         if not 0 < r_list <= narrowest / 2 * (1 + 1e-9):
             raise InputError(
-                f"a neighbor list of radius {r_list:g} in a cell {narrowest:g} wide; "
+                f"the neighbor list has radius {r_list:g}, in a cell {narrowest:g} wide; "
                 f"expected a radius above 0 and up to {narrowest / 2:g}",
-                remedy="repeat the cell, or lower the cutoff or the skin",
+                remedy="Repeat the cell, or lower the cutoff or the skin",
             )
         self.cell = complete(cell, np.asarray(pbc))
         self.pbc = np.asarray(pbc, bool)
@@ -283,7 +283,7 @@ class PairSearch:
 
         def metric(Ra: Array, Rb: Array, **_: Any) -> Array:
             if Ra.shape != (3,):
-                raise ValueError("only three dimensions are supported")
+                raise ValueError("only positions in three dimensions are supported")
             delta = Ra - Rb
             delta = delta - jnp.where(wraps, jnp.round(delta), 0.0)
             return delta[0] * rows[0] + delta[1] * rows[1] + delta[2] * rows[2]

@@ -243,7 +243,7 @@ def _written(
             return value.name
         known = not isinstance(value, Tracer | jax.Array)
         if np.size(value) != 1 or kind not in ("VEC", "BOOL", "LONG" if known else ""):
-            raise TypeError("the value is an array, or a number of another kind")
+            raise TypeError("the value is an array, or of an unsupported type")
         if known:
             return _number(value, kind)
         constants.setdefault(id(value), value)

@@ -209,7 +209,7 @@ class PairFunction(PairPotential):
         self.shared = {key: value for key, value in parameters.items() if key not in own}
         if arguments[:1] not in (["r"], ["r2"]):
             raise InputError(
-                f"its first argument is called {arguments[0] if arguments else 'nothing'!r}; expected r, the "
+                f"the first argument is called {arguments[0] if arguments else 'nothing'!r}; expected r, the "
                 "distance, or r2, its square",
                 where=_name_of(function),
                 remedy="Name it r or r2",
@@ -218,7 +218,7 @@ class PairFunction(PairPotential):
             inspect.signature(function).bind(0.0, **parameters)
         except TypeError as error:
             raise InputError(
-                f"{error}; it takes {', '.join(arguments[1:])}",
+                f"{error}; the function takes {', '.join(arguments[1:])}",
                 where=_name_of(function),
                 remedy="Give a value for every parameter by name",
             ) from None
@@ -449,7 +449,7 @@ class Channels(eqx.Module):
         for name in terms:
             if not name.replace("_", "").replace("-", "").isalnum():
                 message = f"a term is called {name!r}; expected letters, digits, - and _"
-                raise InputError(message, where="terms", remedy="Give it another name")
+                raise InputError(message, where="terms", remedy="Give the term another name")
         groups: dict[bytes, dict[str, CutPotential]] = {}
         for name, term in terms.items():
             groups.setdefault(name.encode() if apart else np.asarray(term.r_cut).tobytes(), {})[name] = term

@@ -112,7 +112,7 @@ class Tersoff(ManyBody):
 
     def __post_init__(self) -> None:
         if self.m not in (1, 3):
-            raise InputError(f"Tersoff's exponent m is 1 or 3; got {self.m}")
+            raise InputError(f"Tersoff's exponent m is {self.m}; expected 1 or 3")
 
     @property
     def r_cut(self) -> Any:
@@ -183,5 +183,5 @@ def named(
     made, sets = _SETS[kind]
     if parameters not in sets:
         known = f"{'are' if len(sets) > 1 else 'is'} {' and '.join(sets)}"
-        raise InputError(f"no constants of {kind} called {parameters!r}; known {known}")
+        raise InputError(f"{kind} has no parameters called {parameters!r}; known {known}")
     return made(**sets[parameters], pbc=pbc)

@@ -29,7 +29,7 @@ class Threshold:
 
     def __post_init__(self):
         if self.comparison not in INCLUSIVE:
-            raise InputError(f"unknown comparison {self.comparison!r}; known are {', '.join(INCLUSIVE)}")
+            raise InputError(f"comparison {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
 
     def margin(self, quantity):
         """Return threshold - quantity: positive means that the decision is "yes".
@@ -61,14 +61,14 @@ class Hysteresis:
     def __post_init__(self):
         if self.enter.space != self.leave.space:
             raise InputError(
-                f"the two thresholds are in different spaces, {self.enter.space} and {self.leave.space}"
+                f"the two thresholds are for different quantities, {self.enter.space} and {self.leave.space}"
             )
         enter, leave = self.enter.value, self.leave.value
         # traced values are checked where they were made
         if isinstance(enter, float | int) and isinstance(leave, float | int) and leave < enter:
             raise InputError(
-                f"the decision would end at {leave:g}, before it begins at {enter:g}",
-                remedy="Put the threshold for leaving at or above the one for entering",
+                f"the threshold for leaving, {leave:g}, is below the one for entering, {enter:g}",
+                remedy="Set the threshold for leaving to at least the one for entering",
             )
 
     def margin(self, quantity, before):

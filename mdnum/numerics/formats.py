@@ -83,7 +83,7 @@ def format_of(name: str) -> FloatFormat:
         InputError: no format has this name.
     """
     if name not in FORMATS:
-        raise InputError(f"unknown format {name!r}; known are {', '.join(FORMATS)}")
+        raise InputError(f"unknown format {name!r}; known formats are {', '.join(FORMATS)}")
     return FORMATS[name]
 
 

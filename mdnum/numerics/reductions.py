@@ -145,9 +145,7 @@ class FixedPoint(Reduction):
 
     def __post_init__(self):
         if abs(self.bits) > 1000:
-            raise InputError(
-                f"{self.bits} binary digits after the point", remedy="Give a number from -1000 to 1000."
-            )
+            raise InputError(f"bits = {self.bits} binary places", remedy="Give a number from -1000 to 1000.")
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """Return the sum, computed in one int64 per sum."""
@@ -223,7 +221,7 @@ def segment_sum(
     """
     index = np.asarray(index)
     if len(index) and not (index.min() >= 0 and index.max() < segments):
-        raise InputError(f"a segment index lies outside 0 to {segments - 1}")
+        raise InputError(f"a segment index is outside the range 0 to {segments - 1}")
     order = np.argsort(index, kind="stable")
     counts = np.bincount(index, minlength=segments)
     starts = np.concatenate([[0], np.cumsum(counts)])[:-1]

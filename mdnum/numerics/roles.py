@@ -33,7 +33,7 @@ def carrier(name: str) -> np.dtype:
 
 def _refuse_unknown(role: str, word: str, known: Mapping[str, object], noun: str = "dtype") -> None:
     if word not in known:
-        said = f"unknown {noun} {word!r}; known are {', '.join(known)}"
+        said = f"unknown {noun} {word!r}; expected one of {', '.join(known)}"
         raise InputError(said, where=f"precision.{role}")
 
 
@@ -48,7 +48,7 @@ def check_role(role: str, dtype: str) -> None:
         return
     if dtype in ALL and dtype not in known:
         raise InputError(
-            f"{dtype} cannot be the {role} of molecular dynamics: {_TOO_SHORT[role]}",
+            f"{dtype} is not supported as the {role} precision of molecular dynamics: {_TOO_SHORT[role]}",
             where=f"precision.{role}",
             remedy=f"Use {' or '.join(WIDE)}; pair forces may be {dtype} (precision.force)",
         )
@@ -108,7 +108,7 @@ class RolePrecision:
             _refuse_unknown(role, getattr(self, role), ALL)
         _refuse_unknown("rounding", self.rounding, dict.fromkeys(("nearest", "stochastic")), "rounding")
         if self.seed < 0:
-            raise InputError(f"{self.seed} is negative", remedy="Give 0 or more.", where="precision.seed")
+            raise InputError(f"seed {self.seed} is negative", remedy="Give 0 or more", where="precision.seed")
 
     def dtype(self, role: str) -> np.dtype:
         """Return the numpy dtype of a role ("state", "arithmetic", "decision", "accumulate" or "loss")."""

@@ -31,5 +31,5 @@ def read_mdnum(folder: str, index: Any = -1) -> Iterator[Atoms]:
 
     path = RunFolder.open(folder).path / "trajectory.traj"
     if not path.exists():
-        raise FolderError("holds no frames", where=str(folder), remedy="Run it with --save-every K")
+        raise FolderError("the run stored no frames", where=str(folder), remedy="Run it with --save-every K")
     yield from cast("Iterator[Atoms]", read_traj(path, index))

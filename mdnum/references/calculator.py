@@ -113,11 +113,11 @@ class MdnumCalculator(ClassicalCalculator):
         self._evaluator: Evaluator | None = None
         where = "MdnumCalculator"
         if (system is None) == (potential is None):
-            remedy = "Say MdnumCalculator('argon/liquid-864'), or potential=... and cutoff=..."
+            remedy = "Write MdnumCalculator('argon/liquid-864'), or potential=... and cutoff=..."
             raise InputError("give either a system or a potential", remedy=remedy, where=where)
         if isinstance(system, System | Simulation) and overrides:
             remedy = "Pass the name of the system, or load it with the overrides"
-            raise InputError("overrides change a system while it is loaded", remedy=remedy, where=where)
+            raise InputError("overrides have no effect on a loaded system", remedy=remedy, where=where)
         if system is not None and not isinstance(system, System | Simulation):
             system = systems.load(str(system), overrides, world="md")
         self._recipe = _of_potential(potential, cutoff, units) if system is None else _of_system(system)
@@ -139,7 +139,7 @@ class MdnumCalculator(ClassicalCalculator):
             TypeError: a parameter was given.
         """
         if changes:
-            raise TypeError(f"MdnumCalculator cannot change {', '.join(changes)}; make another calculator")
+            raise TypeError(f"MdnumCalculator cannot change {', '.join(changes)}; create a new calculator")
         return {}
 
     def evaluated(self, atoms, changes):

@@ -116,7 +116,7 @@ class NamedObject:
             if hasattr(module, name):
                 return getattr(module, name)
         names = public(module)
-        lacks = f", which has no {' or '.join(defaults)}" if defaults else ", and not a thing in it"
+        lacks = f", which has no {' or '.join(defaults)}" if defaults else ", not an object in it"
         has = f"Give {self.home}:{names[0]}. It has {', '.join(names[:8])}" if names else "It has no function"
         raise InputError(f"{self.home} is a file{lacks}", remedy=has)
 

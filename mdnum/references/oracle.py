@@ -145,7 +145,7 @@ def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
         if not lengths[axis] > 0.0:
             raise InputError(
                 f"direction {axis} is periodic but has no cell vector",
-                remedy="give the structure a cell, or set pbc to false along it",
+                remedy="Give the structure a cell, or set pbc to false along it",
                 where="pair oracle",
             )
     return completed(cell, pbc)

@@ -382,7 +382,7 @@ def run(
         if system is not given or save_every is not None or overrides:
             raise InputError(
                 "a resumed run keeps its own system, settings and save_every",
-                remedy="Give only the folder and, to go further, steps",
+                remedy="Give only the folder and, to extend the run, steps",
                 where=str(resume),
             )
         finished = _finished(Path(resume), steps, given)

@@ -68,7 +68,7 @@ def take(path: str | Path, layout: Layout) -> RunFolder:
     if folder.kind != layout.kind or not (folder.path / NAME).is_file():
         other = f"Resume it with `mdnum {folder.layout.command} --resume {path}`"
         remedy = other if manifest.resumable(folder.path) else f"Begin a new `mdnum {layout.command}`"
-        raise FolderError(f"holds no `mdnum {layout.command}` to resume", remedy=remedy, where=str(path))
+        raise FolderError(f"no `mdnum {layout.command}` to resume here", remedy=remedy, where=str(path))
     folder.take(layout)
     return folder
 

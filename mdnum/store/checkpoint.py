@@ -64,7 +64,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     except Exception as error:
         seen = " ".join(str(error).split())[:200] or type(error).__name__
         raise FolderError(
-            f"not a readable checkpoint ({seen})", remedy="Run again in a new folder", where=str(path)
+            f"the checkpoint cannot be read ({seen})", remedy="Run again in a new folder", where=str(path)
         ) from error
 
 
@@ -167,8 +167,8 @@ class FrameFile:
             return
         if self.mark()[2] < size:
             raise FolderError(
-                f"trajectory is shorter than its checkpoint says ({frames} frames)",
-                remedy="The folder was changed since; run again in a new folder",
+                f"the trajectory is shorter than its checkpoint says ({frames} frames)",
+                remedy="The folder was changed afterward; run again in a new folder",
                 where=str(self.path),
             )
         with disk_errors(self.path), opened(self.path, "r+b") as file:

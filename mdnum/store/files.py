@@ -163,26 +163,26 @@ def read_text(path: Path) -> str:
         return ""
     except UnicodeDecodeError as error:
         raise FolderError(
-            f"is damaged: not UTF-8 text ({error.reason} at byte {error.start})", where=str(path)
+            f"the file is damaged: not UTF-8 text ({error.reason} at byte {error.start})", where=str(path)
         ) from error
     except OSError as error:
-        raise FolderError(f"cannot be read: {error.strerror}", where=str(path)) from error
+        raise FolderError(f"the file cannot be read: {error.strerror}", where=str(path)) from error
 
 
 def _refuse(seen: os.stat_result, path: Path, in_place: bool) -> None:
     if stat.S_ISLNK(seen.st_mode):
         raise _linked(path)
     if not stat.S_ISREG(seen.st_mode):
-        raise FolderError("is not a regular file", remedy="Remove it, or use another folder", where=str(path))
+        raise FolderError("not a regular file", remedy="Remove it or use another folder", where=str(path))
     if in_place and seen.st_nlink > 1:
-        seen_so = "has a second name (a hard link), under which it would be changed too"
-        raise FolderError(seen_so, remedy="Replace it by a copy", where=str(path))
+        seen_so = "the file has a second name (a hard link), and would change there too"
+        raise FolderError(seen_so, remedy="Replace the file by a copy", where=str(path))
 
 
 def _linked(path: Path) -> FolderError:
     return FolderError(
-        "is a link; files of a result folder must lie in the folder itself",
-        remedy="Replace the link by a copy of the file if it is yours",
+        "the file is a link; files of a result folder must lie in the folder itself",
+        remedy="If the file is yours, replace the link by a copy",
         where=str(path),
     )
 
@@ -255,7 +255,7 @@ def load(root: Path) -> Manifest | None:
         return Manifest(layout, bool(held["finished"]), files, str(held.get("version", "")))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FolderError(
-            "is damaged, so the other files cannot be verified",
+            "the manifest is damaged, so the other files cannot be verified",
             remedy="Restore the folder from a copy; its parquet files can still be read one at a time",
             where=str(path),
         ) from error

@@ -76,7 +76,7 @@ def _parsed(file: Path, text: str) -> Any:
         return json.loads(text) if is_json else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         kind = "JSON" if is_json else "TOML"
-        raise FolderError(f"is damaged: not valid {kind} ({error})", where=str(file)) from error
+        raise FolderError(f"the file is damaged: not valid {kind} ({error})", where=str(file)) from error
 
 
 class RunFolder:
@@ -137,7 +137,7 @@ class RunFolder:
             folder.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise FolderError(
-                f"cannot be created: {error.strerror}", remedy="Choose another folder", where=str(path)
+                f"the folder cannot be created: {error.strerror}", remedy="Choose another", where=str(path)
             ) from error
         with disk_errors(folder.path):
             folder._take_lock()
@@ -600,7 +600,7 @@ class RunFolder:
     def _stream(self, name: str) -> TableStream:
         if name not in self._streams:
             if not self.layout.columns(name):
-                raise ValueError(f"a folder of {self.kind} is declared without a table {name!r}")
+                raise ValueError(f"folders of kind {self.kind!r} have no table {name!r}")
             own = self.layout.described
             describe = lambda schema: described(schema, name, self.about, own)  # noqa: E731
             args = (self.path, name, self.layout)
@@ -680,7 +680,7 @@ class RunFolder:
 
     def _read_checkpoint(self) -> tuple[dict[str, Any], dict[str, Any]]:
         if not self.has_checkpoint():
-            raise FolderError("has no checkpoint to resume from", remedy=self.again, where=str(self.path))
+            raise FolderError("the folder has no checkpoint", remedy=self.again, where=str(self.path))
         self.check("checkpoint.npz")
         path = self.path / "checkpoint.npz"
         state, store = checkpoint.read(path)
@@ -692,7 +692,7 @@ class RunFolder:
             or not all(isinstance(count, int) and count >= 0 for count in (*rows.values(), *mark, log))
         ):
             raise FolderError(
-                "counts rows of a table that mdnum does not write",
+                "the checkpoint counts rows of a table that mdnum does not write",
                 remedy="Run again in a new folder",
                 where=str(path),
             )
@@ -727,7 +727,7 @@ class RunFolder:
         text = manifest.read_text(self.path / name)
         held = _parsed(self.path / name, text) if text else {}
         if not isinstance(held, dict):
-            raise FolderError("is damaged: it does not contain a JSON object", where=str(self.path / name))
+            raise FolderError("the file is damaged: it has no JSON object", where=str(self.path / name))
         return held
 
 
@@ -743,7 +743,7 @@ def restoring(path: Path) -> Iterator[None]:
     except _OF_WRONG_VALUES as error:
         seen = " ".join(str(error).split())[:200]
         raise FolderError(
-            f"has content that mdnum does not write there ({type(error).__name__} {seen})",
+            f"the file has content that mdnum does not write there ({type(error).__name__} {seen})",
             remedy="Restore the file from a copy, or start in a new folder",
             where=str(path),
         ) from error
@@ -782,7 +782,7 @@ def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
         remedy = f"{_again(path)}, or choose another folder"
     elif made is not None and not made.finished:
         remedy = _again(path)
-    raise FolderError("already holds a run", remedy=remedy, where=str(path))
+    raise FolderError("the folder already holds a run", remedy=remedy, where=str(path))
 
 
 def _again(path: Path) -> str:

@@ -56,12 +56,12 @@ class Layout:
         matched = (_KIND.fullmatch(self.kind), _COMMAND.fullmatch(self.command))
         if not all(matched) or self.resumes_from not in ("", "checkpoint.npz", "answers.json"):
             raise ValueError(
-                f"not a valid kind of folder: {self.kind!r}, {self.command!r}, {self.resumes_from!r}"
+                f"invalid kind {self.kind!r}, command {self.command!r} or resumes_from {self.resumes_from!r}"
             )
         if len(self.further) > _MOST_COLUMNS:
-            raise ValueError(f"names of files: {self.further[:100]!r}")
+            raise ValueError(f"the names of files are too long: {self.further[:100]!r}")
         if len(self.tables) > _MOST_TABLES or not all(map(_TABLE.fullmatch, self.tables)):
-            raise ValueError(f"names of tables: {list(self.tables)[:3]}")
+            raise ValueError(f"too many tables, or invalid names of tables: {list(self.tables)[:3]}")
         _ = self._columns
         for table, texts in (self.described or {}).items():
             for column, said in texts.items():
@@ -96,7 +96,7 @@ class Layout:
             words = text.split()
             matches = [_COLUMN.fullmatch(word) for word in words]
             if len(words) > _MOST_COLUMNS or not all(matches):
-                raise ValueError(f"columns of table {table!r}: {text[:100]!r}")
+                raise ValueError(f"invalid columns of table {table!r}: {text[:100]!r}")
             found[table.rstrip("?")] = {
                 one[1]: (one[3] or "float64", bool(one[2])) for one in matches if one is not None
             }

@@ -127,7 +127,7 @@ class TableStream:
         missing = [name for name in schema.names if name not in columns and name not in self._usual]
         unknown = [name for name in columns if name not in schema.names]
         if missing or unknown:
-            raise ValueError(f"table {self.name!r}: columns missing {missing}, not expected {unknown}")
+            raise ValueError(f"table {self.name!r}: missing columns {missing}, unexpected columns {unknown}")
         lengths = {name: len(one) for name, one in columns.items() if not isinstance(one, str)}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"table {self.name!r}: columns of different length: {lengths}")
@@ -326,7 +326,7 @@ class TableStream:
         if other or missing:
             seen = f"column {other[0]!r} holds {found[other[0]]}" if other else f"no column {missing[0]!r}"
             raise FolderError(
-                f"is not a valid table {self.name!r} ({seen})",
+                f"the file is not a valid table {self.name!r} ({seen})",
                 remedy="Run again in a new folder",
                 where=str(path),
             )
@@ -439,7 +439,7 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
     except (OSError, pa.ArrowException, MemoryError) as error:
         seen = " ".join(str(error).split())[:200]
         raise FolderError(
-            f"is damaged: not a readable parquet file ({seen})",
+            f"the file is damaged: not a readable parquet file ({seen})",
             where=str(path),
             remedy=_RESTORE,
         ) from error

@@ -70,7 +70,7 @@ def parse(text: str) -> Axis:
     if found := _RANGE.fullmatch(rest):
         return Axis(key, _range(text, *map(scalar, found.groups())))
     if re.fullmatch(r"[-+.\deE]+(:[-+.\deE]*)+", rest):
-        raise InputError(f"--over {text!r} is no range", remedy=_REMEDY)
+        raise InputError(f"--over {text!r} is not a range", remedy=_REMEDY)
     # lists of a file ([4, 4, 4]) have commas of their own
     parts = re.split(r",(?![^\[]*\])", rest)
     return checked(Axis(key, tuple(scalar(part.strip()) for part in parts)))
@@ -86,22 +86,22 @@ def checked(axis: Axis) -> Axis:
     if not seen or "" in axis.values:
         raise InputError(f"{axis.key} has no values", remedy=_REMEDY)
     if bad := [one for one in axis.values if isinstance(one, float) and not math.isfinite(one)]:
-        raise InputError(f"{axis.key} = {bad[0]} is no finite number", remedy=_REMEDY)
+        raise InputError(f"{axis.key} = {bad[0]} is not finite", remedy=_REMEDY)
     if len({*seen}) < len(seen):
         again = next(one for one in seen if seen.count(one) > 1)
-        raise InputError(f"{axis.key} has {again} twice", remedy="Give each value once")
+        raise InputError(f"{axis.key} has the value {again} twice", remedy="Give each value once")
     return axis
 
 
 def _range(text: str, low: Any, high: Any, step: Any) -> tuple[Any, ...]:
     numbers = [low, high, step]
     if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers):
-        raise InputError(f"--over {text!r} is no range of numbers", remedy=_REMEDY)
+        raise InputError(f"--over {text!r} is not a range of numbers", remedy=_REMEDY)
     if not all(map(math.isfinite, numbers)) or step <= 0 or high < low:
-        raise InputError(f"--over {text!r}: from {low} to {high} by {step}", remedy=_REMEDY)
+        raise InputError(f"--over {text!r} is not an ascending range", remedy=_REMEDY)
     count = math.floor((high - low) / step + 1e-9) + 1
     if count > _MOST_VALUES:
-        raise InputError(f"--over {text!r} has {count:,} values", remedy=f"{_MOST_VALUES:,} are possible")
+        raise InputError(f"--over {text!r} has {count:,} values", remedy=f"Give at most {_MOST_VALUES:,}")
     if all(isinstance(one, int) for one in numbers):
         return tuple(range(low, high + 1, step))
     # the decimals that were written, not what adding steps makes of them
@@ -141,7 +141,7 @@ def points(
         count = math.prod(len(axis.values) for axis in axes)
         if count * len(seeds) > MOST_POINTS:
             raise InputError(
-                f"{count * len(seeds):,} points", remedy="Give fewer values, or leave out factorial"
+                f"the design has {count * len(seeds):,} points", remedy="Give fewer values or another design"
             )
         chosen = [dict(zip(keys, values, strict=True)) for values in product(*(axis.values for axis in axes))]
     elif design == "space-filling":
@@ -151,7 +151,7 @@ def points(
         for axis in axes:
             chosen += [{**base, axis.key: value} for value in axis.values if value != base[axis.key]]
     if len(chosen) * len(seeds) > MOST_POINTS:
-        raise InputError(f"{len(chosen) * len(seeds):,} points", remedy=f"{MOST_POINTS:,} are possible")
+        raise InputError(f"a sweep of {len(chosen) * len(seeds):,} points; expected at most {MOST_POINTS:,}")
     return [Point(choices, seed) for seed in seeds for choices in chosen]
 
 
@@ -160,7 +160,7 @@ def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
     from scipy.stats import qmc
 
     if samples < 2 or samples & (samples - 1):
-        raise InputError(f"{samples} samples", remedy="Give a power of two, 16 for instance")
+        raise InputError(f"{samples} samples were requested", remedy="Give a power of two, such as 16")
     unit = qmc.Sobol(len(axes), rng=np.random.default_rng(0)).random(samples)
     rows = []
     for row in unit:

@@ -142,7 +142,7 @@ def _dask(address: str, workers: int | None) -> _Engine:
         engine = _Engine(make, 1, 1, lambda _: clients[0].close(timeout=5))
     except OSError as error:
         remedy = "Start it: dask scheduler; dask worker tcp://host:port"
-        raise InputError(f"no dask scheduler answers: {error}", where=address, remedy=remedy) from None
+        raise InputError(f"no dask scheduler responds: {error}", where=address, remedy=remedy) from None
     of_each: Any = clients[0].nthreads()
     threads = list(of_each.values())
     engine.width, engine.threads = workers or max(sum(threads), 1), max(threads, default=1)
@@ -228,7 +228,7 @@ def opened(on: str | Executor | None, workers: int | None) -> Iterator[_Engine]:
     elif on.endswith(".toml"):
         engine = _executorlib(on, workers)
     else:
-        raise InputError(f"--on {on!r}", remedy="Give tcp://host:port of a dask scheduler, or a .toml file")
+        raise InputError(f"unknown --on {on!r}", remedy="Give tcp://HOST:PORT of dask, or a .toml file")
     try:
         yield engine
     finally:
@@ -302,7 +302,7 @@ def computed(
                 idle += 1
                 if idle > _IDLE or (broken and engine.end is None):
                     remedy = "Is it running, and does its environment have mdnum?"
-                    raise InputError(f"no worker answers: {failed[:300]}", where="the engine", remedy=remedy)
+                    raise InputError(f"no worker responds: {failed[:300]}", where="the engine", remedy=remedy)
                 sleep(min(idle - 1, 10))
                 if broken:
                     waiting.extend(running.values())

@@ -416,11 +416,11 @@ def chosen(words: Sequence[str], world: str) -> list[Measure]:
         InputError: no such measure in this world, or a measure is repeated.
     """
     if twice := [word for word in words if list(words).count(word) > 1]:
-        raise InputError(f"--measure has {twice[0]} twice", remedy="Give each once")
+        raise InputError(f"--measure names {twice[0]} twice", remedy="Give each measure once")
     measures = [_named(word) for word in words]
     if other := [measure.name for measure in measures if measure.world != world]:
         known = ", ".join(name for name in MEASURES.shipped if MEASURES[name].world == world)
-        raise InputError(f"{other[0]} is no measure of this world", remedy=f"Known are {known}")
+        raise InputError(f"{other[0]} is no measure of such a system", remedy=f"Its measures are {known}")
     return measures
 
 
@@ -456,8 +456,8 @@ def _of_file(word: str) -> Measure:
             top = one.partition(".")[0]
             if not top or any((file.parent / end).exists() for end in (f"{top}.py", f"{top}/__init__.py")):
                 raise InputError(
-                    f"the file imports {one}, which lies beside it and which no digest covers",
-                    where=str(file), remedy="Put everything that it needs into one file",
+                    f"the file imports {one} from its folder, which no digest covers",
+                    where=str(file), remedy="Put everything that the measure needs into one file",
                 )  # fmt: skip
 
     def value(run: Sample) -> Value:

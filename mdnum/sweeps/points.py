@@ -138,9 +138,9 @@ class Workspace:
         except FileNotFoundError:
             return None
         except (OSError, ValueError) as error:
-            message = f"is no result of a point: {error}"
+            message = f"the file is not the result of a point: {error}"
             raise FolderError(
-                message, where=str(file), remedy="Delete its folder: it is computed again"
+                message, where=str(file), remedy="Delete its folder; the point is then computed again"
             ) from None
 
     def nearest(self, point: Mapping[str, Any]) -> list[str] | None:

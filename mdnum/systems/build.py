@@ -103,7 +103,7 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
     if isinstance(system, Simulation):
         if overrides:
             raise InputError(
-                "overrides change a system while it is loaded", where=system.name, remedy=_CHANGE_OBJECTS
+                "overrides have no effect on a loaded system", where=system.name, remedy=_CHANGE_OBJECTS
             )
         return system
     system = load(system, overrides, world="md")
@@ -140,7 +140,7 @@ def again(folder: Path, given: Simulation | None = None) -> Simulation:
     """
     if not (folder / SIMULATION_FILE).is_file():
         if given is not None:
-            message = "this run came from a system file and keeps it"
+            message = "this run uses the system file in its folder"
             raise InputError(message, where=str(folder), remedy="Omit the simulation")
         return build(load(folder / SYSTEM_FILE))
     if given is None:

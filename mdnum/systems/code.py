@@ -68,15 +68,15 @@ def function(place: str, folder: Path, where: str = "potential.function") -> Cal
             remedy="Read the code, then add --allow-code, or allow_code=True in Python",
         )
     if not file.is_file():
-        raise InputError("no such file", where=str(file), remedy=f"Correct {where}")
+        raise InputError("no such file", where=str(file), remedy=f"Correct the file name in {where}")
     own = f"mdnum_code_{file.stem}"
     # anew each time: inspect reads the source of what is defined there now
     sys.modules.pop(own, None)
     try:
         module = executed(file, own)
     except Exception as error:
-        raise InputError(f"cannot be executed: {in_a_line(error)}", where=str(file)) from error
+        raise InputError(f"the file cannot be executed: {in_a_line(error)}", where=str(file)) from error
     found = getattr(module, name, None)
     if not callable(found):
-        raise InputError(f"has no function {name!r}", where=str(file), remedy=f"Correct {where}")
+        raise InputError(f"the file has no function {name!r}", where=str(file), remedy=f"Correct {where}")
     return found

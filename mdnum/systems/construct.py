@@ -280,18 +280,18 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
     if not (ends := np.abs(u[-1] - u[-2]) <= _STEEP * _INSIDE * np.max(np.abs(u[-4:]), axis=0)).all():
         kind = int(np.argmin(ends))
         raise InputError(
-            f"u of {pairs_of[kind]} is {u[-2, kind]:.6g} at its cutoff {r_cut[kind]:g} and "
+            f"u of the pair {pairs_of[kind]} is {u[-2, kind]:.6g} at its cutoff {r_cut[kind]:g}, but "
             f"{u[-1, kind]:.6g} just inside; expected a function that continues smoothly across the cutoff",
             where=potential.name,
-            remedy="Leave the truncation to the cutoff; the function need not include it",
+            remedy="Remove the truncation from the function: the cutoff truncates it",
         )
     differs = ~np.isclose(u, swapped, rtol=_SYMMETRIC, atol=_SYMMETRIC * scale, equal_nan=True)
     if differs.any():
         k, kind = np.unravel_index(np.argmax(differs), u.shape)
         first, second = pairs_of[kind].split("-")
         raise InputError(
-            f"u of {first}, {second} is {u[k, kind]:.6g} at r = {r[k, kind]:.6g}, and of {second}, {first} "
-            f"{swapped[k, kind]:.6g}; expected the same in either order",
+            f"u is {u[k, kind]:.6g} for {first}, {second} at {r[k, kind]:.6g}, but {swapped[k, kind]:.6g} "
+            f"for {second}, {first}; expected the same value in either order",
             where=potential.name,
             remedy="Combine the values of both species symmetrically, as (a + b) / 2",
         )
@@ -306,8 +306,8 @@ def common(terms: Mapping[str, Term]) -> Cut:
     compared = {name: term.cutoff.compare for name, term in terms.items()}
     if len(set(compared.values())) != 1:
         seen = ", ".join(f"{name} {compare!r}" for name, compare in compared.items()) or "no term"
-        message = f"one convention is needed for all terms, and there is {seen}"
-        raise InputError(message, where="cutoff.compare", remedy="Give every term the same")
+        message = f"all terms must use the same comparison; found {seen}"
+        raise InputError(message, where="cutoff.compare", remedy="Give all terms the same comparison")
     return next(iter(terms.values())).cutoff
 
 
@@ -360,11 +360,11 @@ def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, 
         for key, number in value.items():
             if given.setdefault(pair_key(*key.split("-")), number) != number:
                 message = f"{key} is given in both orders, with different numbers"
-                raise InputError(message, where=what, remedy="Give one number for a pair")
+                raise InputError(message, where=what, remedy="Give one number for each pair")
         missing = [one for one in names if pair_key(*one.split("-")) not in given]
         if missing:
             remedy = "Give one for every pair of species, or one number for all"
-            raise InputError(f"no value for {', '.join(missing)}", where=what, remedy=remedy)
+            raise InputError(f"no value was given for {', '.join(missing)}", where=what, remedy=remedy)
         value = [given[pair_key(*one.split("-"))] for one in names]
     return np.broadcast_to(_finite(value, what), (len(names),)).copy()
 
@@ -377,7 +377,7 @@ def by_species(value: Mapping[str, Any], symbols: Sequence[str], what: str) -> F
     """
     if missing := [symbol for symbol in symbols if symbol not in value]:
         remedy = "Give a number for every species"
-        raise InputError(f"no value for {', '.join(missing)}", where=what, remedy=remedy)
+        raise InputError(f"no value was given for {', '.join(missing)}", where=what, remedy=remedy)
     return _finite([value[symbol] for symbol in symbols], what)
 
 
@@ -495,10 +495,10 @@ def in_fixed_point(simulation: Simulation) -> Simulation:
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(
-            'state = "lattice" decides and sums in fixed-point arithmetic with float64 forces, so no '
-            "other precision applies",
+            'state = "lattice" needs float64 forces, and decides and sums in fixed-point arithmetic; '
+            "no other precision can be given",
             where="precision",
-            remedy="Omit force, decision and accumulate",
+            remedy="Omit the keys force, decision and accumulate",
         )
     kT = units.k_B * simulation.draw.temperature
     own = masses * np.linalg.norm(simulation.velocities, axis=1)

@@ -74,7 +74,7 @@ def find(name: str | Path) -> tuple[str, Path]:
         return path.resolve().name, path / SYSTEM_FILE
     if path.is_dir() and (path / SIMULATION_FILE).is_file():
         raise InputError(
-            "was made from Python objects, and no file describes how to recreate them",
+            "this run was made from Python objects, which no file can recreate",
             where=text,
             remedy=GIVE_OBJECTS,
         )
@@ -335,8 +335,8 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
         raise InputError(f"variant {name!r}: {error.message}", remedy=error.remedy, where=where) from None
     if spec.balls != base.balls:
         raise InputError(
-            f"variant {name!r} has {spec.balls} balls and the system {base.balls}: "
-            "decisions of different balls cannot be compared",
+            f"variant {name!r} has {spec.balls} balls, but the system has {base.balls}; "
+            "their decisions cannot be compared",
             where=where,
             remedy="Keep the number of balls",
         )
@@ -354,7 +354,7 @@ def copy(name: str | Path, folder: str | Path) -> Path:
     """
     system: System | BallSystem = load(name)
     if system.path is None:
-        raise TypeError("a loaded system already has a path")
+        raise TypeError("a loaded system must have a path")
     target = Path(folder)
     is_ball = isinstance(system, BallSystem)
     files = [] if is_ball else sorted(system.tables)
@@ -369,7 +369,7 @@ def copy(name: str | Path, folder: str | Path) -> Path:
     there = [path for path in (goal, *(target / file.name for file in files)) if path.exists()]
     there = [path for path in there if path.name != schema_file.name]
     if there:
-        raise InputError("already exists", where=str(there[0]), remedy="Choose another folder")
+        raise InputError("the file already exists", where=str(there[0]), remedy="Choose another folder")
     target.mkdir(parents=True, exist_ok=True)
     for file in files:
         shutil.copyfile(file, target / file.name)
@@ -417,7 +417,7 @@ def load(
     if isinstance(name, System | BallSystem):
         if overrides:
             remedy = "Load it with the overrides, or give its name"
-            raise InputError("overrides change a system while it is loaded", where=name.name, remedy=remedy)
+            raise InputError("overrides have no effect on a loaded system", where=name.name, remedy=remedy)
         _check_world(name.name, isinstance(name, BallSystem), world)
         return name
     found, path = find(name)
@@ -426,7 +426,7 @@ def load(
         text = whole_text(path, where)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"cannot be read ({error})", where=where, remedy="A system file is UTF-8 text"
+            f"the system file cannot be read ({error})", where=where, remedy="Save it as UTF-8 text"
         ) from error
     data = toml.parse(text, where)
     values = read_overrides(overrides)

@@ -49,7 +49,7 @@ def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> 
         raise InputError(
             f"the structure holds {', '.join(species)}, but [potential] has no parameters for "
             f"{', '.join(missing)} (it has {known})",
-            remedy=f"Add [potential.pairs.{missing[0]}] and the like, or correct the structure's species",
+            remedy=f"Add the table [potential.pairs.{missing[0]}], or correct the species of the structure",
         )
     return {
         name: np.array([getattr(row, name) for row in rows.values()], np.float64)
@@ -79,7 +79,7 @@ def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tu
     radius = np.array([given.get(name, own) for name, own in zip(names, radius.tolist(), strict=True)])
     if np.isnan(radius).any():
         message = f"no radius for {names[np.isnan(radius).argmax()]} (it has {', '.join(given)})"
-        remedy = "Add it, or give a radius for every other pair as cutoff.radius"
+        remedy = "Add it, or give a radius for every other pair as the key cutoff.radius"
         raise InputError(f"[cutoff.pairs] has {message}", remedy=remedy)
     if not cutoff.switches:
         return radius, None

@@ -292,7 +292,7 @@ def _heated(simulation: Simulation, new: float) -> Simulation:
     if np.array_equal(_drawn(simulation).velocities, simulation.velocities):
         return _drawn(heated)
     if not (new > 0 and old.temperature > 0):
-        seen = f"temperature {old.temperature:g} to {new:g}"
+        seen = f"a change of temperature from {old.temperature:g} to {new:g}"
         raise InputError(f"{seen}; expected both above 0", where="dynamics")
     return replace(heated, velocities=simulation.velocities * np.sqrt(new / old.temperature))
 
@@ -368,9 +368,9 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
             raise InputError(several, remedy="Give the full name of one of them")
     if entry(simulation, word).index:
         return word
-    hint = meant(word, [*known, *(name.rpartition(".")[2] for name in known)])
+    hint = meant(word, [*known, *(name.rpartition(".")[2] for name in known)]) + "Choose from "
     listed = ", ".join((*known, "position.ATOM.x", "velocity.ATOM.x"))
-    raise InputError(f"unknown parameter {word!r}", where=simulation.name, remedy=f"{hint}There are {listed}")
+    raise InputError(f"unknown parameter {word!r}", where=simulation.name, remedy=f"{hint}{listed}")
 
 
 # --- keys of system files, words among them ------------------------------------------------------------
@@ -427,8 +427,8 @@ def _changed(simulation: Simulation, key: str, given: Any) -> Simulation:
     if table == "precision":
         policy = replace(simulation.policy, **{name: given})
         if simulation.fixed_point is not None:
-            message = "a fixed-point state cannot become another"
-            raise InputError(message, where=key, remedy="Make it again")
+            message = "a fixed-point state cannot be converted to another type"
+            raise InputError(message, where=key, remedy="Create the simulation again")
         other = simulation.with_policy(policy)
         return in_fixed_point(other) if policy.state == FIXED_POINT else other
     if key == "neighbors.builder":

@@ -283,7 +283,7 @@ class CutoffTable(TomlTable):
         if self.onset is None:
             return self
         if not self.switches:
-            raise ValueError(f"onset has no meaning for the kind {self.kind}, which does not switch")
+            raise ValueError(f"onset has no meaning for the kind {self.kind}, which has no switching range")
         if self.base is None:
             raise ValueError(
                 "onset needs radius or in_sigma as well; for pairs it scales with the radius of each pair"
@@ -551,7 +551,7 @@ def check_interaction(potential: Any, cutoff: CutoffTable | None) -> None:
         if cutoff is None:
             raise ValueError(f"the table [cutoff] is missing; {kind} needs one")
         if cutoff.in_sigma is not None and "sigma" not in potential.constants:
-            raise ValueError(f"cutoff.in_sigma needs a potential with a sigma; {kind} has none, give radius")
+            raise ValueError(f"cutoff.in_sigma needs a potential with a sigma; {kind} has none")
     elif cutoff is not None:
         raise ValueError(f"[cutoff] is given, but {kind} includes its own cutoff; remove the table")
 

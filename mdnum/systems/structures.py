@@ -115,7 +115,7 @@ def _read(path: Path, index: int) -> Atoms:
     from ase import Atoms
 
     if not path.is_file():
-        raise InputError("no such structure file", where=str(path), remedy="Correct structure.file")
+        raise InputError("no such structure file", where=str(path), remedy="Correct the key structure.file")
     if path.suffix == ".extxyz" and index in (0, -1) and (ours := _from_extxyz(path)) is not None:
         return ours
     with reading(path, by="ASE", remedy=CHECK_STRUCTURE):
@@ -124,7 +124,7 @@ def _read(path: Path, index: int) -> Atoms:
         raise InputError(
             "the structure holds no atoms",
             where=str(path),
-            remedy="Correct structure.file or structure.index",
+            remedy="Correct the key structure.file or structure.index",
         )
     if found.constraints:
         raise InputError(
@@ -239,7 +239,7 @@ def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
         worst = int(np.argmax(places))
         raise InputError(
             f"atom {worst} ({atoms.symbols[worst]}) has a coordinate of {places[worst]:g} {length}, where "
-            f"two neighboring numbers lie {np.spacing(places[worst]):.2g} {length} apart; expected at most "
+            f"adjacent numbers differ by {np.spacing(places[worst]):.2g} {length}; expected at most "
             f"{farthest:.3g} {length}, {_FARTHEST:g} cutoffs",
             remedy="Correct the structure: its numbers, its unit, or its rattle",
         )
@@ -264,7 +264,7 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
     raise InputError(
         f"r_cut + skin = {r_cut:g} + {skin:g} = {r_cut + skin:.6g} {length}, but half the smallest "
         f"perpendicular width of the box (along {axis}) is {half:.6g} {length}; beyond it a pair has "
-        "two images",
+        "two images in range",
         remedy=f"This box allows {allowed}; or repeat the structure {repeats(cell, r_cut + skin)}",
     )
 

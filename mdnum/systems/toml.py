@@ -62,7 +62,7 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
         line = lines[number - 1].strip() if 0 < number <= len(lines) else ""
         shown = f" in `{line}`" if line else ""
         raise InputError(
-            f"not TOML: {what}{shown}",
+            f"this is not valid TOML: {what}{shown}",
             where=f"{where}:{number}",
             remedy='Write text in "double quotes", table names in [brackets] and arrays as [1, 2, 3]',
         ) from None
@@ -259,7 +259,7 @@ class TomlTable(BaseModel):
                 if number and name != "tol" and not _SMALLEST <= abs(number) <= 1 / _SMALLEST:
                     raise ValueError(
                         f"{name} = {number:g}; expected 0 or a size from {_SMALLEST:g} to {1 / _SMALLEST:g}, "
-                        "whose square is representable, too"
+                        "so that its square is representable"
                     )
         return self
 

@@ -177,7 +177,7 @@ class NeighborFlips(AnalysisBase):
             self._residues = ByResidue.make(table, groups, hydrogens, self.rules)
             self._first, self._second = self._residues.groups
         elif by != "atom":
-            raise InputError(f"by = {by!r}", remedy="Give 'atom' or 'residue'")
+            raise InputError(f"by = {by!r}; expected 'atom' or 'residue'")
         seen = atoms_of((self._first, self._second))
         self._check = FrameCheck(seen, radius=smallest_radius(self.rules), bits=32)
         if bound is not None and not (math.isfinite(bound) and bound >= 0):

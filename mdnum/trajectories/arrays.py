@@ -46,7 +46,7 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
         expected = "float32 or float64" if "f" in kinds else "integers"
         held = next((one for one in ("position", "positions") if hasattr(values, one)), None)
         remedy = f"Give state.{held}" if held else "Convert them"
-        raise InputError(f"{name} of dtype {found.dtype}; expected {expected}", remedy=remedy, where=name)
+        raise InputError(f"{name} has dtype {found.dtype}; expected {expected}", remedy=remedy, where=name)
     return found
 
 
@@ -96,7 +96,7 @@ class ArrayFrames(Trajectory):
         v = None if v is None else np.array(host(v, "velocities"), float)
         if v is not None and v.shape != x.shape:
             raise InputError(
-                f"velocities of shape {v.shape}, positions of {x.shape}",
+                f"velocities have shape {v.shape}, but positions {x.shape}",
                 remedy="Give velocities of all atoms",
             )
         x = x @ here.matrix if self._fractional else x
@@ -142,7 +142,7 @@ class ArrayFrames(Trajectory):
         words = ["X"] * len(x) if self.named is None else list(map(str, np.asarray(self.named).tolist()))
         if len(words) != len(x):
             raise InputError(
-                f"{len(words)} species were given for {len(x)} atoms", remedy="Give one for each atom"
+                f"{len(words)} species were given for {len(x)} atoms", remedy="Give one species for each atom"
             )
         self.table, self.bits = AtomTable.plain(words, self.named is not None), bits
         self.format = f"{'fractional coordinates' if fractional else 'positions'} in float{bits}"
@@ -204,7 +204,7 @@ def one_by_one(frames: Any, given: dict[str, Any]) -> Iterator[tuple[Any, dict[s
     rows = {name for name, one in given.items() if isinstance(one, list) or name in ("energy", "velocities")}
     rows |= {name for name in given if name in ("cell", "box") and np.shape(given[name]) not in _SINGLE}
     if wrong := [name for name in sorted(rows) if len(given[name]) != len(frames)]:
-        message = f"{len(given[wrong[0]])} of {wrong[0]} for {len(frames)} frames"
-        raise InputError(message, remedy="Give one for each frame", where=wrong[0])
+        message = f"{wrong[0]} has {len(given[wrong[0]])} entries for {len(frames)} frames"
+        raise InputError(message, remedy="Give one entry for each frame", where=wrong[0])
     for k, frame in enumerate(frames):
         yield frame, {name: one[k] if name in rows else one for name, one in given.items()}

@@ -337,7 +337,7 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
     bins, away, step = grid_for(lattice, reach + placed.rounding, atoms, extent)
     wrapped, home, bin_of = wrap(positions, lattice, bins, step)
     if (away // bins * lattice.periodic).max() >= MOST_IMAGES - 1:
-        message = f"a box of widths {np.round(lattice.widths, 6).tolist()} for pairs within {reach:g}"
+        message = f"a box of widths {np.round(lattice.widths, 6).tolist()} cannot hold pairs within {reach:g}"
         raise InputError(message, remedy="Check the unit of the cutoff, and check the box", where="cutoff")
     total, half = int(np.prod(bins)), who.centers is who.others
     start, order = _sorted_by_bin(bin_of, who.others, total)

@@ -96,7 +96,7 @@ def open_trajectory(
     with reading(file, by=getattr(reader, "reader", "mdnum")):
         opened = reader(file, atoms, frames)
     if not opened.atoms:
-        raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
+        raise InputError("the frames have no atoms", remedy="Check how the file was written", where=str(file))
     return opened
 
 

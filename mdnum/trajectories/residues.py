@@ -53,7 +53,7 @@ class ByResidue:
         """
         if len(table) and not any(table.residue_names):
             remedy = "Give a topology that has residues with -s TOPOLOGY"
-            raise InputError("the file has no residues to look for contacts between", remedy=remedy)
+            raise InputError("the file has no residues, so no contacts between residues", remedy=remedy)
         if directed := [one.name for one in rules if one.directed]:
             remedy = "Use --cutoff, or --pairs for cutoffs by species"
             raise InputError(f"{directed[0]} is a rule for atoms, not for residues", remedy=remedy)
@@ -63,7 +63,7 @@ class ByResidue:
         sides = [None if side is None else side[kept[side]] for side in (every, groups[1])]
         if any(side is not None and not len(side) for side in sides):
             remedy = "Add --hydrogens, or select other atoms"
-            raise InputError("no atom is left without hydrogens and virtual sites", remedy=remedy)
+            raise InputError("all selected atoms are hydrogens or virtual sites", remedy=remedy)
         chosen = np.union1d(every, every if groups[1] is None else groups[1])
         counts = {"hydrogens": light[chosen], "virtual sites": virtual[chosen]}
         told = {} if hydrogens else {name: int(some.sum()) for name, some in counts.items() if some.any()}

@@ -40,7 +40,7 @@ def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
             remedy = "Give a topology that has it with -s TOPOLOGY, or select by index"
             raise InputError(message, remedy=remedy, where=where) from error
         except (SelectionError, ValueError, TypeError) as error:
-            message = f"{words!r} is no selection ({first_line(error)})"
+            message = f"{words!r} is not a valid selection ({first_line(error)})"
             raise InputError(message, remedy=_LANGUAGE, where=where) from error
     if len(found) == 0:
         raise InputError(

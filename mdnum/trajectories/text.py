@@ -366,7 +366,7 @@ class LammpsDump(TextTrajectory):
                 atoms = _whole_number(block[-1], "the number of atoms")
             elif line.startswith("ITEM: ATOMS"):
                 if atoms is None:
-                    raise ValueError("atoms are listed before their number")
+                    raise ValueError("the atoms are listed before the number of atoms")
                 return block + _rows(lines, 0, atoms)
         if block:
             raise ValueError("the file ends in the header of a frame")
@@ -450,7 +450,7 @@ class GroTrajectory(TextTrajectory):
     def decoded(self, number: int, raw: list[str]) -> Frame:
         rows = [line.rstrip("\n") for line in raw[2:-1]]
         if not rows:
-            raise ValueError("no atoms")
+            raise ValueError("the frame has no atoms")
         points = [k for k, letter in enumerate(rows[0]) if letter == "." and k >= _HEAD]
         if len(points) < 3:
             raise ValueError(f"expected three numbers; found {rows[0]!r}")
@@ -498,7 +498,7 @@ def _gro_box(line: str) -> Box:
     """Return the box from three diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros: no box."""
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
-        raise ValueError(f"the box line has {len(values)} numbers")
+        raise ValueError(f"the box line has {len(values)} numbers; expected 3 or 9")
     if not any(values):
         return Box()
     xx, yy, zz, xy, xz, yx, yz, zx, zy = values if len(values) == 9 else [*values, *[0.0] * 6]

@@ -185,7 +185,7 @@ class Tracker:
             if not self.rule.directed:
                 self._who = _by_place(self._who, frame)
         if atoms != self._atoms:
-            message = f"{atoms} atoms, {self._atoms} in the frames before"
+            message = f"this frame has {atoms} atoms, the frames before it {self._atoms}"
             raise InputError(message, remedy="Split the trajectory where the number of atoms changes")
         positions, largest = _taken(frame.positions, self._who.labels)
         if not np.isfinite(largest):
@@ -312,7 +312,7 @@ def _participants(
     for name, chosen in (("first", first), ("second", second)):
         if len(chosen) and chosen.max() >= atoms:
             message = f"atom {int(chosen.max())} is selected, but frames have {atoms} atoms (from 0)"
-            raise InputError(message, remedy="Select atoms from this trajectory", where=name)
+            raise InputError(message, remedy="Select atoms that the trajectory has", where=name)
     if species is not None and len(species) != atoms:
         message = f"{len(species)} species for frames of {atoms} atoms"
         raise InputError(message, remedy="Use the topology that belongs to the trajectory", where="species")

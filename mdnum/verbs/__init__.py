@@ -39,11 +39,11 @@ def _check(module: Any) -> None:
     if lacking := [one for one in calls if not callable(getattr(module, one, None))]:
         raise TypeError(f"{name} has no function {lacking[0]}, which its text file names")
     if {*texts.get("kinds", ())} != {*getattr(module, "KINDS", ())}:
-        raise TypeError(f"KINDS of {name} are not the kinds of its text file")
+        raise TypeError(f"KINDS of {name} differ from the kinds in its text file")
     for kind, said in texts.get("kinds", {}).items():
         Layout(kind, **said)
         if VERBS.place(home(kind)) != name:
-            raise ValueError(f"mdnum or another package has folders of kind {kind!r}")
+            raise ValueError(f"mdnum or another package already has folders of kind {kind!r}")
 
 
 #: Modules by command, with the subcommand if a command has several.

@@ -282,8 +282,8 @@ def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
     if not callable(calculator):
         raise InputError(
             f"the calculator is a {type(calculator).__name__}; expected its name, or a function that "
-            "makes it",
-            remedy="Give lambda: LennardJones(), so that each check can make a new one",
+            "returns a new calculator",
+            remedy="Give for example `lambda: LennardJones()`",
         )
     name = getattr(calculator, "__name__", type(calculator).__name__)
     name = "calculator" if name == "<lambda>" else name
@@ -295,7 +295,7 @@ def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: P
     if calculator is None and not state.named:
         raise InputError(
             "the calculator of this audit was an object without a name",
-            remedy="Give it again",
+            remedy="Give the calculator again",
             where=str(path),
         )
     if isinstance(calculator, str) and state.named and calculator != state.name:

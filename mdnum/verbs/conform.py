@@ -63,10 +63,10 @@ class Options:
         """
         if not 0 <= self.cases <= MOST_CASES:
             raise InputError(
-                f"{self.cases:,} random cases were requested", remedy=f"Request 0 to {MOST_CASES:,}"
+                f"{self.cases:,} random cases were requested", remedy=f"Give 0 to {MOST_CASES:,}"
             )
         if self.precision not in (None, *PRECISIONS):
-            raise InputError(f"precision = {self.precision!r}", remedy=f"Give one of {', '.join(PRECISIONS)}")
+            raise InputError(f"unknown precision {self.precision!r}", remedy=f"Use {', '.join(PRECISIONS)}")
         unknown = [word for word in self.limits if word not in LIMITS]
         if unknown:
             raise InputError(f"unknown limit {unknown[0]!r}", remedy=f"Choose from {', '.join(LIMITS)}")
@@ -165,8 +165,8 @@ def conform(
         name = tested.name, tested.version
         if state is not None and state.tested != name:
             was, now = (" ".join(filter(None, words)) for words in (state.tested, name))
-            remedy = "Begin in a new folder"
-            raise InputError(f"the folder was begun with {was}, not {now}", where=str(resume), remedy=remedy)
+            remedy = "Start in a new folder"
+            raise InputError(f"this folder was begun with {was}, not {now}", where=str(resume), remedy=remedy)
         # scripts of what is known already need its conventions
         opening = deadline if state is None else Deadline(time and max(time, 0.2))
         examiner = Examiner(tested, reuse=True, apart=True, deadline=opening)

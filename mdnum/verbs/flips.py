@@ -123,7 +123,7 @@ def flips(
     if window < 1:
         raise InputError(f"window = {window}; expected at least 1 frame")
     if by not in ("atom", "residue"):
-        raise InputError(f"by = {by!r}", remedy="Write atom or residue")
+        raise InputError(f"by = {by!r}; expected atom or residue")
     if by == "atom":
         refuse({"hydrogens": hydrogens}, "of contacts between residues", "Add --by residue, or leave it out")
     files = {"other": other is not None, "topology": topology is not None, "format": format is not None}
@@ -266,7 +266,7 @@ def rules(
     if most is not None and not cutoffs:
         raise InputError(
             "--most keeps the nearest neighbors inside a cutoff, but no cutoff is given",
-            remedy="Add --cutoff R; for the K nearest without a cutoff write --nearest K",
+            remedy="Add --cutoff R; for the K nearest neighbors without a cutoff write --nearest K",
         )
     radii, species, counts = map(_listed, (cutoffs, pairs, nearest))
     if wrong := [one for one in (*radii, *counts) if not isinstance(one, Real)]:

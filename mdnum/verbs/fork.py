@@ -215,8 +215,8 @@ def fork_folders(
         return answer.outcome
     if found.world != "md":
         remedy = "Vary the choice in which they differ: mdnum fork SYSTEM --vary CHOICE"
-        message, remedy = ("frames", "Leave out replay") if frames else ("runs of a ball", remedy)
-        raise InputError(f"{message} are not followed again", where=str(found.a), remedy=remedy)
+        message, remedy = ("frames", "Omit the option `replay`") if frames else ("runs of a ball", remedy)
+        raise InputError(f"{message} cannot be simulated again", where=str(found.a), remedy=remedy)
     question = PairQuestion(**asked)
     check(question)
     last = min(found.steps, question.steps or found.steps)

@@ -244,7 +244,7 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
         text = json.dumps([__version__, verb, held], sort_keys=True)
     except TypeError as error:
         raise InputError(
-            f"the folder cannot be named by the content of its input: {error}",
+            f"the folder cannot be named after a digest of its input: {error}",
             remedy="Give the folder a name with --out",
         ) from error
     return digest_of(text.encode())[:16]

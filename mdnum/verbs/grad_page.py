@@ -101,10 +101,10 @@ def closeness(row: Mapping[str, Any]) -> str:
     """Format a relative difference as a phrase."""
     relative = row["relative"]
     if relative is None:
-        return "not finite" if row["size"] else "where the other is 0"
+        return "not finite" if row["size"] else "nonzero, but the other is 0"
     if relative == 0:
         return "the same"
-    return percent(relative) + " off" if relative >= 1e-3 else f"{number(relative, 2)} off"
+    return f"different by {percent(relative) if relative >= 1e-3 else number(relative, 2)}"
 
 
 # -- sentences ---------------------------------------------------------------------------------------

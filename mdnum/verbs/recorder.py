@@ -76,9 +76,7 @@ class Recorder:
         **arrays: Any,
     ) -> None:  # fmt: skip
         if compare not in ("r2 <", "r2 <=", "r <", "r <="):
-            raise InputError(
-                f"unknown comparison compare = {compare!r}", remedy="Write r2 <, r2 <=, r < or r <="
-            )
+            raise InputError(f"unknown comparison {compare!r}", remedy="Write r2 <, r2 <=, r < or r <=")
         if compare.endswith("="):
             r_cut = np.nextafter(np.atleast_1d(np.asarray(r_cut, float)), np.inf).tolist()
         self._rules = rules(r_cut, pairs, nearest, most)
@@ -128,7 +126,7 @@ class Recorder:
             raise self._failed or InputError("the recorder is closed", remedy="Make another one")
         frame = self._source.read(step, positions, cell, box, pbc, velocities)
         if len(frame.positions) != self._source.atoms:
-            message = f"{len(frame.positions)} atoms at step {step}, and {self._source.atoms} before"
+            message = f"step {step} has {len(frame.positions)} atoms; earlier steps had {self._source.atoms}"
             raise InputError(
                 message, remedy="Record each set of atoms with its own recorder", where="positions"
             )
@@ -176,7 +174,7 @@ class Recorder:
             self.see_atoms(*(args or (self._atoms,)))
         else:
             raise InputError(
-                "the recorder was called without a frame", remedy="Give Recorder(atoms=...), or call see"
+                "the recorder was called without a frame", remedy="Use Recorder(atoms=...), or call `see`"
             )
 
     def hook(self, step: Any, positions: Any, **given: Any) -> None:
@@ -221,7 +219,7 @@ class Recorder:
         if self._one is None and self._failed is None and self._given:
             self._advance()
         if self._one is None:
-            raise self._failed or InputError("no frame was recorded", remedy="Call see at least once")
+            raise self._failed or InputError("no frame was recorded", remedy="Call `see` at least once")
         one, folder = self._one, self._one.answer.folder
         with self._stack:
             self._add("lost", self._check.ended(self._done, one.found.rules[0].tracker.bound))

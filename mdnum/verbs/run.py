@@ -101,7 +101,7 @@ def run(
         raise InputError("this system is a ball", where=system.name, remedy="Use mdnum.bounce")
     if resume is not None and Path(resume).is_dir() and (folder := RunFolder.open(resume)).kind != "md":
         remedy = f"`mdnum report {resume}` shows it" if folder.summary else folder.again
-        seen = f"is the folder of `mdnum {folder.layout.command}`, and no run"
+        seen = f"this is a folder of `mdnum {folder.layout.command}`, not of a run"
         raise InputError(seen, where=str(resume), remedy=remedy)
     frames: SimpleQueue[tuple[Simulation, np.ndarray] | None] = SimpleQueue()
     compared: list[Future[_Beside]] = []

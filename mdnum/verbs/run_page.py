@@ -46,7 +46,7 @@ class RunView(View):
         series = self.table("series")
         if not len(series["step"]):
             remedy, where = self.folder.again, str(self.folder.path)
-            raise FolderError("the folder holds no step of a run", remedy=remedy, where=where)
+            raise FolderError("no step of the run was stored", remedy=remedy, where=where)
         return series
 
     @property

@@ -38,7 +38,7 @@ def _date(run: Sample, argument: str, name: str) -> Value:
     found = _pair(run, argument)
     step = getattr(found.dates, name)
     if step is None:
-        raise InputError(f"no {name} within {found.steps} steps", remedy="Run longer")
+        raise InputError(f"the runs do not {name} within {found.steps} steps", remedy="Run longer")
     return Value(float(step * found.twin.a.timestep))
 
 
@@ -107,7 +107,7 @@ def horizon(run: Sample, argument: str) -> Value:
     if found.trust.verdict == "trusted":
         raise InputError("the gradient is trusted to the end of the run", remedy="Run longer")
     if found.trust.verdict != "limited":
-        raise InputError(f"undecided: {', '.join(found.trust.unknown)} were not examined")
+        raise InputError(f"the horizon is undecided without a test of {', '.join(found.trust.unknown)}")
     return Value(float(found.trust.horizon * run.simulation.integrator.timestep))
 
 

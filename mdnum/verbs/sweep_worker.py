@@ -62,9 +62,9 @@ def work(task: Task) -> list[dict[str, Any]]:
     for point in task.points:
         if point["state"]["code"] != code():
             raise InputError(
-                "a worker has another mdnum, jax or numpy than the sweep",
+                "a worker has another version of mdnum, jax or numpy than the sweep",
                 where=f"{sys.prefix} on {socket.gethostname()}",
-                remedy="Give it the same environment: points are stored by the code that computes them",
+                remedy="Use the environment of the sweep: stored points depend on these versions",
             )
         address, status, why = point["address"], "there", ""
         if not enough(place.result(address), task.measures):

@@ -74,7 +74,7 @@ def test_what_is_no_audit_names_the_verb_that_resumes_it(kind, kept, remedy, cop
     assert call("audit", "--resume", kind) == 2
     line = capsys.readouterr().err
     assert line.startswith(f"mdnum: {kind}: ") and line.endswith(f" {remedy}.\n") and line.count("\n") == 1
-    assert "holds no `mdnum audit`" in line
+    assert "no `mdnum audit` to resume" in line
 
 
 def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):

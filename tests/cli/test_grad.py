@@ -38,7 +38,7 @@ grad: Any = importlib.import_module("mdnum.verbs.grad")
             "with respect to dynamics.seed",
         ),
         ((WELL, "--of", "msd", "--wrt", "sigma", "--methods", "symetric"), "Did you mean symmetric?"),
-        ((WELL, "--of", "pressure", "--wrt", "sigma"), "is not defined here"),
+        ((WELL, "--of", "pressure", "--wrt", "sigma"), "is not defined for this system"),
         ((WELL, "--of", "potential:first=9", "--wrt", "sigma", "--steps", "8"), "no step up to 8"),
         ((WELL, "--of", "potential:evry=2", "--wrt", "sigma"), "write for example potential:every=10"),
         ((WELL, "--of", "potential:every=x", "--wrt", "sigma"), "not a whole number"),
@@ -291,7 +291,7 @@ PRIMAL = {"first state": 3, "first decision": None}
           "flips": {"flips": 100, "grazing": 0, "total": {EPSILON: None}, "half": {}, "share": {}}},
          "NOT_FINITE", "error", {"names": EPSILON}),
         ({"comparisons": [row("symmetric", EPSILON, 0.1, "unexplained", values={"explained": 1e-9})]},
-         "UNEXPLAINED", "warning", {"closeness": "10 % off"}),
+         "UNEXPLAINED", "warning", {"closeness": "different by 10 %"}),
         ({"function": {"places": [{"order": 0, "pair": "X-X", "distance": 1.3, "jump": 1e-3, "what": "x"}]}},
          "FUNCTION_BREAKS", "warning", {"distance": 1.3}),
         ({"methods": [{**AWARE, "details": {**DETAILS, "grazing": 2, "weight left out": 0.5}}]}, "GRAZING",
@@ -305,7 +305,7 @@ PRIMAL = {"first state": 3, "first decision": None}
         ({"exact": {"y0": 2.0}, "reference": "closed form", "contact_kind": "impact", "flips": None,
           "integrator": "semi-implicit-euler", "growth": None, "force_jump": None,
           "comparisons": [row("event-aware", "y0", 0.1)]}, "NOT_THE_MOTION", "warning",
-         {"each": "event-aware (y0 10 % off)"}),
+         {"each": "event-aware (y0 different by 10 %)"}),
     ],
 )  # fmt: skip
 def test_findings_follow_the_numbers(tmp_path, changes, code, severity, values):

@@ -200,7 +200,7 @@ def hover() -> BallProblem:
     [
         ("implicit", relaxation(1e-2, k=1e-13, most=3), "k", {}, "condition number 2e\\+13"),
         ("event-aware", hover(), "y0", {}, "graze"),
-        ("smoothed", bouncing(1e-2, 1.0), "y0", {"eps": 1e-3}, "does not resolve"),
+        ("smoothed", bouncing(1e-2, 1.0), "y0", {"eps": 1e-3}, "too fast"),
         ("smoothed", bouncing(1e-2, 1.0), "y0", {"eps": 0.0}, "width"),
         ("randomized", relaxation(1e-3), "k", {"samples": 1}, "2 samples"),
         ("unrolled", relaxation(1e-2), "damping", {}, "parameter 'damping'"),

@@ -37,7 +37,7 @@ def test_the_table_says_what_the_dtypes_say():
         assert form.bits == info.bits
     assert FORMATS["tf32"].unit_roundoff == 2.0**-11
     assert FORMATS["tf32"].largest == (2 - 2.0**-10) * 2.0**127
-    with pytest.raises(InputError, match=r"unknown format 'fp8'; known are float64, float32, tf32"):
+    with pytest.raises(InputError, match=r"unknown format 'fp8'; known formats are float64, float32, tf32"):
         format_of("fp8")
 
 
@@ -219,7 +219,7 @@ def test_every_role_can_have_its_own_dtype_and_no_other():
     assert seen == [np.float16, ml_dtypes.bfloat16, np.float32, np.float64, np.float16]
     assert RolePrecision.all("bfloat16") == RolePrecision(*["bfloat16"] * 5)
     for wrong, message in (
-        ({"decision": "half"}, r"precision\.decision.*'half'.*known are.*bfloat16"),
+        ({"decision": "half"}, r"precision\.decision.*'half'.*expected one of.*bfloat16"),
         ({"rounding": "up"}, r"precision\.rounding.*'up'.*nearest, stochastic"),
         ({"seed": -1}, r"precision\.seed"),
     ):
@@ -235,5 +235,5 @@ def test_sixteen_bits_are_for_pair_forces_alone():
     for role in ("state", "decision", "accumulate"):
         with pytest.raises(InputError, match=rf"precision\.{role}.*bfloat16 cannot be.*precision.force"):
             PrecisionPolicy(**{role: "bfloat16"})
-    with pytest.raises(InputError, match=r"precision\.force.*'half'.*known are.*bfloat16"):
+    with pytest.raises(InputError, match=r"precision\.force.*'half'.*expected one of.*bfloat16"):
         PrecisionPolicy(force="half")

@@ -45,7 +45,7 @@ def test_an_exception_of_the_work_is_an_answer():
 
 def test_a_worker_of_other_code_computes_nothing(tmp_path):
     point = {"address": "0" * 32, "state": {"code": "another", "system": {}}, "settings": {}}
-    with pytest.raises(InputError, match="another mdnum"):
+    with pytest.raises(InputError, match="another version of mdnum"):
         work(Task(str(tmp_path), (point,), "argon/crystal-108", {}, {"energy": ""}, False, False))
     assert not list((tmp_path / "workspace").iterdir())
 

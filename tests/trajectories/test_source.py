@@ -280,7 +280,7 @@ def test_selections_are_one_language(tmp_path):
     salt = open_trajectory(tmp_path / "salt.traj")
     np.testing.assert_array_equal(select(salt, "element Na or name Cl"), [0, 1])
     np.testing.assert_array_equal(select(salt, "around 2 element Na"), [1])
-    for words, said in (("element O", "names Cl, Na"), ("nam O", "no selection")):
+    for words, said in (("element O", "names Cl, Na"), ("nam O", "not a valid selection")):
         with pytest.raises(InputError, match=said):
             select(salt, words)
 

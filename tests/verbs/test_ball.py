@@ -119,7 +119,7 @@ def test_a_folder_of_the_ball_is_complete_and_its_own(three: Outcome):
     assert list(load(three.folder).variants) == ["stop.rule=per-instance"]
     with pytest.raises(FolderError, match="already holds a run"):
         bounce("ball/drop", out=three.folder)
-    with pytest.raises(InputError, match="is the folder of `mdnum ball`"):
+    with pytest.raises(InputError, match="is a folder of `mdnum ball`"):
         run(None, resume=three.folder)
 
 
@@ -208,7 +208,7 @@ def test_systems_that_cannot_be_bounced_or_run(tmp_path: Path):
     """A loaded system takes no overrides; each world has its own verb."""
     drop, crystal, out = load("ball/drop"), load("argon/crystal-108"), tmp_path / "x"
     asked: list[tuple[Any, Any, dict[str, Any], str]] = [
-        (bounce, drop, {"overrides": {"contact.k": 1.0}}, "overrides change a system while it is loaded"),
+        (bounce, drop, {"overrides": {"contact.k": 1.0}}, "overrides have no effect on a loaded system"),
         (bounce, drop, {"against": ["contact.k"]}, "not of the form key=value"),
         *((run, system, {}, "this system is a ball") for system in ("ball/drop", drop)),
         *((bounce, system, {}, "molecular dynamics") for system in ("argon/crystal-108", crystal)),

@@ -286,7 +286,7 @@ def test_what_is_refused_leaves_no_folder(tmp_path, system, vary, options, words
 
 def test_overrides_of_a_loaded_system_and_used_folders_are_refused(tmp_path, file):
     for system in (load("pair/at-cutoff"), load(file)):
-        with pytest.raises(InputError, match="while it is loaded"):
+        with pytest.raises(InputError, match="no effect on a loaded"):
             mdnum.fork(system, "precision", overrides={"dynamics.steps": 3})
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(FolderError, match="already holds"):
@@ -438,7 +438,7 @@ def test_two_finished_runs_of_a_ball(tmp_path, monkeypatch):
     assert flip["margin"] == a["margin"][0]
     same = mdnum.fork_folders("a", "c", report=False)
     assert same.summary["first_bit"] is same.summary["fork"] is None and same.verdict.tone == "good"
-    with pytest.raises(InputError, match="not followed again"):
+    with pytest.raises(InputError, match="cannot be simulated again"):
         mdnum.fork_folders("a", "b", replay=True)
 
 

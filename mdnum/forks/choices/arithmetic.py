@@ -72,7 +72,7 @@ class PrecisionChoice(Choice):
             "precision",
             "Write precision, or precision.state=bfloat16",
         )
-        check(self.dtype in ALL, f"unknown dtype {self.dtype!r}; known are {', '.join(ALL)}", self.name)
+        check(self.dtype in ALL, f"unknown dtype {self.dtype!r}; expected one of {', '.join(ALL)}", self.name)
 
     @property
     def name(self) -> str:

@@ -142,9 +142,9 @@ def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> 
     except AttributeError as error:
         if error.name != "spec":
             raise
-        message = f"{type(choice).__module__} reads the tables of a system file, and is given a Simulation"
+        message = f"{type(choice).__module__} reads the tables of a system file, but was given a Simulation"
         raise InputError(
-            message, where=choice.name, remedy="Read about `mdnum.choices` in docs/extending.md"
+            message, where=choice.name, remedy="See `mdnum.choices` in docs/extending.md"
         ) from error
     except InputError as error:
         # the choice is named where this is printed
@@ -160,9 +160,9 @@ def twin_of(choice: Choice, system: Simulation | System | BallSystem) -> Twin:
     made = twin_or_reason(choice, system)
     if isinstance(made, str):
         raise InputError(
-            f"does not apply to {system.name}: {made}",
+            f"the choice does not apply to {system.name}: {made}",
             where=choice.name,
-            remedy="Choose another; `mdnum fork choices` lists all",
+            remedy="Use another choice; `mdnum fork choices` lists all",
         )
     return made
 

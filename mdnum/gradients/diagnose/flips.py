@@ -89,8 +89,8 @@ def flips(
     if not kept:
         raise InputError(
             f"the contributions of flips to the derivative with respect to {', '.join(full)} need a tangent "
-            f"for each of {sizes[full[0]]} entries",
-            remedy="Add a scalar parameter",
+            f"for each of {sizes[full[0]]} entries, which are too many",
+            remedy="Give a scalar parameter",
         )
     if made is None:
         made = passed(problem, full, guard=guard, progress=progress)
@@ -190,13 +190,13 @@ def edges(
     if here.shape:
         raise InputError(
             f"{full} has {here.size} entries; boundaries are located along a scalar parameter",
-            remedy="Search along a scalar parameter",
+            remedy="Give a scalar parameter",
         )
     value = float(here)
     if value == 0 or not 0 < reach < 1:
         raise InputError(
-            f"{full} = {value:g} and reach = {reach:g}; expected a finite value and a reach "
-            "(relative) below 1"
+            f"{full} = {value:g} and reach = {reach:g}; expected a nonzero value and a "
+            "relative reach between 0 and 1"
         )
     program = MdProgram(problem.simulation)
 

@@ -418,7 +418,7 @@ def spectrum(
     timestep = float(simulation.integrator.timestep)
     jacobian = Jacobian(tape, CLOCK_STEPS * timestep)
     if not 1 <= values <= jacobian.coordinates or rounds < 1:
-        raise InputError(f"{values} singular values of {jacobian.coordinates} coordinates, {rounds} rounds")
+        raise InputError(f"{values = }, {rounds = }; expected 1 to {jacobian.coordinates}, and 1 or more")
     vectors = min(values + extra, jacobian.coordinates)
     rng = np.random.default_rng(seed)
     start, _ = np.linalg.qr(rng.standard_normal((jacobian.coordinates, vectors)))
@@ -437,7 +437,7 @@ def spectrum(
         residual = _residual(jacobian, there.basis @ left, start @ right, log_s)
     except FloatingPointError as error:
         raise NumericalError(
-            f"singular values: {error}", remedy="Examine the growth of the gradient with diagnose()"
+            f"no singular values: {error}", remedy="Examine the growth of the gradient with diagnose()"
         ) from error
     exponents = log_s[:values] / tape.steps
     steps, curve = np.arange(tape.steps + 1), there.stretches[:, :values]

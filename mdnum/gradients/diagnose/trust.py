@@ -299,15 +299,15 @@ def trust(
     kept = [name for name in full if np.size(parameters.value(simulation, name)) <= MOST]
     if not kept:
         raise InputError(
-            f"the trust horizon with respect to {', '.join(full)} would need a tangent for each entry",
-            remedy="Add a scalar parameter, such as dynamics.temperature",
+            f"the trust horizon with respect to {', '.join(full)} needs too many tangents",
+            remedy="Give a scalar parameter, such as dynamics.temperature",
         )
     if replicas == 1 or replicas < 0:
         raise InputError(
-            f"replicas = {replicas}; a single start has no standard error", remedy="Give 2 or more"
+            f"replicas = {replicas}; a standard error needs at least 2", remedy="Give 0, or 2 or more"
         )
     if not 0 < tolerance < 1:
-        raise InputError(f"tolerance = {tolerance:g}; expected between 0 and 1")
+        raise InputError(f"tolerance = {tolerance:g}; expected a number between 0 and 1")
     at = spread(problem, points)
     if made is None or growth is None:
         near = Near(simulation, pace_of(problem.loss, problem.steps)) if saltation else None

@@ -367,7 +367,7 @@ class Failed:
 
     def __post_init__(self) -> None:
         if not self.failures or any(failure.step >= self.case.steps for failure in self.failures):
-            raise ValueError("no failure is recorded at a step of its case")
+            raise ValueError("a failed case needs a failure at one of its steps")
 
     @property
     def worst(self) -> Failure:
@@ -399,9 +399,9 @@ class CaseAnswers:
         steps += [result.refused[0]] if result.refused is not None else []
         if result.case != case.name or any(step >= case.steps for step in steps):
             raise InputError(
-                f"case {number} was {result.case!r} when this folder was begun and is {case.name!r} "
-                f"now, with {case.steps} steps",
-                remedy="Begin again in a new folder: this version of mdnum has other cases",
+                f"case {number} is {result.case!r} in this folder, but {case.name!r} with "
+                f"{case.steps} steps in this version of mdnum",
+                remedy="Start again in a new folder",
             )
         return result
 

@@ -185,8 +185,8 @@ def from_object(made: Any, name: str | None = None, source: str | None = None) -
         message = f"{name} is neither a function nor an object with allocate and update"
         raise InputError(message, remedy=_WANTED)
     if lacks and inspect.isclass(made):
-        remedy = "A list that is kept needs allocate and update" if len(lacks) < 2 else _WANTED
-        raise InputError(f"{name} is a class without {' and '.join(lacks)}", remedy=remedy)
+        remedy = "A persistent neighbor list needs allocate and update" if len(lacks) < 2 else _WANTED
+        raise InputError(f"the class {name} has no {' and '.join(lacks)}", remedy=remedy)
     _check_signatures(made, name, not lacks)
     declared = {
         word: getattr(made, word)
@@ -223,7 +223,7 @@ def _check_signatures(made: Any, name: str, kept: bool) -> None:
             signature.bind(*given)
         except TypeError as error:
             order = (
-                "Let it take these, in this order" if given else "Give a class that is made without arguments"
+                "Accept these arguments, in order" if given else "Give a class that is made without arguments"
             )
             raise InputError(
                 f"{name}{word}{signature} cannot be called with ({', '.join(given)}): {error}",

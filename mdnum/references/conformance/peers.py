@@ -317,7 +317,7 @@ class JaxMdList:
         import numpy as np
 
         if bool(self.found.did_buffer_overflow):
-            raise ValueError("jax-md says that its list overflowed as it was allocated")
+            raise ValueError("jax-md reports that its list overflowed during allocation")
         i, j = np.asarray(self.found.idx)
         real = (i < len(positions)) & (j < len(positions))
         return {"i": i[real], "j": j[real]}
@@ -408,7 +408,7 @@ def load(word: str) -> PairList:
     where = place(word)
     if where is None:
         further = f"Give {', '.join(sorted(by_name))}, package.module:function or file.py:function"
-        message = f"{word!r} is no list that is known here"
+        message = f"{word!r} is not a known neighbor list"
         raise InputError(message, remedy=meant(word, by_name) + further)
     made = where.find()
     lines, call = where.source()
