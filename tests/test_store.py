@@ -417,7 +417,7 @@ def test_rows_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(ValueError, match="different length"):
         folder.append("series", short | {"kinetic": np.zeros(4)})
     folder.append("series", short | {"extra": np.arange(5)})
-    with pytest.raises(ValueError, match=r"missing \['extra'\]"):
+    with pytest.raises(ValueError, match=r"missing columns \['extra'\]"):
         folder.append("series", short)
     with pytest.raises(TypeError, match="dtype object"):
         folder.checkpoint({"bad": np.array([object()])}, force=True)
@@ -522,7 +522,7 @@ def test_json_holds_what_json_has_and_broken_files_are_named(tmp_path):
     assert json.loads((folder.path / "summary.json").read_text()) == {"a": 0.1, "b": [0, 1, 2], "c": None,
                                                                      "d": [True, None]}  # fmt: skip
     assert folder.provenance == {}
-    with pytest.raises(FolderError, match="run: has no checkpoint"):
+    with pytest.raises(FolderError, match="run: the folder has no checkpoint"):
         folder.load_checkpoint()
     (folder.path / "checkpoint.npz").write_bytes(b"PK nonsense")
     with pytest.raises(FolderError, match=r"checkpoint\.npz"):

@@ -145,7 +145,7 @@ def test_a_checkpoint_names_tables_and_no_files(tmp_path, killed, name):
     state, store = checkpoint.read(killed / "checkpoint.npz")
     # a checkpoint is listed as it is written
     checkpoint.write(killed / "checkpoint.npz", state, {**store, "rows": {**store["rows"], name: 0}}, {})
-    with pytest.raises(FolderError, match=r"checkpoint\.npz: counts rows of a table"):
+    with pytest.raises(FolderError, match=r"checkpoint\.npz: the checkpoint counts rows of a table"):
         RunFolder.open(killed).resume()
     assert (tmp_path / "precious.parquet").read_bytes() == PRECIOUS
 
@@ -171,7 +171,7 @@ def test_a_flipped_bit_is_told_with_what_is_left(finished, name):
     (finished / name).write_bytes(data)
     folder = RunFolder.open(finished)
     assert list(folder.damaged()) == [name]
-    with pytest.raises(FolderError, match=rf"{name}: is damaged.*; .*epochs\.parquet.* read"):
+    with pytest.raises(FolderError, match=rf"{name}: the .*is damaged.*; .*epochs\.parquet.* read"):
         folder.resume() if name == "checkpoint.npz" else folder.summary and folder.read(Path(name).stem)
     assert len(folder.read("epochs")["epoch"]) == 4
 
@@ -187,7 +187,7 @@ def test_a_flipped_bit_of_a_page_is_told_where_there_is_no_manifest(tmp_path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
-    with pytest.raises(FolderError, match=r"separations\.parquet: is damaged"):
+    with pytest.raises(FolderError, match=r"separations\.parquet: the file is damaged"):
         RunFolder.open(folder.path).read("separations")
 
 
@@ -206,7 +206,7 @@ def test_what_is_gone_or_foreign_is_told(finished):
         RunFolder.open(finished).read("epochs")
     for text in ("[]", "3", "[" * 50_000, "\x00"):
         (finished / "summary.json").write_text(text)
-        with pytest.raises(FolderError, match=r"summary\.json: is damaged"):
+        with pytest.raises(FolderError, match=r"summary\.json: the file is damaged"):
             _ = RunFolder.open(finished).summary
 
 
@@ -214,11 +214,11 @@ def test_the_manifest_is_told_when_it_is_damaged_and_lists_nothing_elsewhere(fin
     path = finished / "manifest.json"
     text = path.read_text()
     path.write_text(text.replace('"finished": true', '"finished": false'))
-    with pytest.raises(FolderError, match=r"manifest\.json: is damaged"):
+    with pytest.raises(FolderError, match=r"manifest\.json: the .* is damaged"):
         RunFolder.open(finished)
     made = manifest.Manifest(MD, True, {"../precious": ["0"]})
     manifest.save(finished, made)
-    with pytest.raises(FolderError, match=r"manifest\.json: is damaged"):
+    with pytest.raises(FolderError, match=r"manifest\.json: the .* is damaged"):
         RunFolder.open(finished)
     path.unlink()
     assert "manifest.json" in RunFolder.open(finished).noted()[0]
@@ -247,7 +247,7 @@ def test_an_odd_layout_with_a_right_digest_is_one_line(finished, odd):
     held.pop("digest")
     text = json.dumps(held, sort_keys=True, separators=(",", ":"))
     path.write_text(json.dumps({**held, "digest": manifest.digest_of(text.encode())}))
-    with pytest.raises(FolderError, match=r"manifest\.json: is damaged"):
+    with pytest.raises(FolderError, match=r"manifest\.json: the .* is damaged"):
         RunFolder.open(finished)
     code, _, err = called("report", str(finished))
     assert code == 2 and err.count("\n") == 1 and "manifest.json" in err
@@ -367,7 +367,7 @@ def test_answers_are_listed_as_soon_as_they_are_written(tmp_path):
             atomic.write_text(folder.path / name, text)
             folder.check(name)
         (folder.path / name).write_text('{"a": 1, "b": 3}')
-        with pytest.raises(FolderError, match=rf"{name}: is damaged"):
+        with pytest.raises(FolderError, match=rf"{name}: the .*is damaged"):
             folder.check(name)
 
 

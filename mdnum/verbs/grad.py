@@ -134,7 +134,7 @@ def _problem(
     from mdnum.gradients.losses import LOSSES, NOT_REAL, parse
 
     if of is None:
-        remedy = f"Add --of LOSS. There are {', '.join(LOSSES)}"
+        remedy = f"Add --of LOSS. Choose from {', '.join(LOSSES)}"
         raise InputError("no loss to differentiate was given", where=simulation.name, remedy=remedy)
     last = last_step(simulation, steps, FEW_STEPS)
     loss = parse(of, simulation, last)

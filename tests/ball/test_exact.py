@@ -162,17 +162,17 @@ def test_no_time_is_lost_on_the_way_to_rest():
 @pytest.mark.parametrize(
     ("motion", "message"),
     [
-        (lambda: ExactImpact(y0=-1.0), "y0 is -1"),
+        (lambda: ExactImpact(y0=-1.0), "y0 = -1"),
         (lambda: ExactImpact(y0=0.0), "at rest"),
-        (lambda: ExactImpact(y0=1.0, restitution=1.1), "restitution is 1.1"),
-        (lambda: ExactImpact(y0=1.0, gravity=0.0), "gravity is 0"),
-        (lambda: ExactImpact(y0=np.nan), "y0 is nan"),
+        (lambda: ExactImpact(y0=1.0, restitution=1.1), "restitution = 1.1"),
+        (lambda: ExactImpact(y0=1.0, gravity=0.0), "gravity = 0"),
+        (lambda: ExactImpact(y0=np.nan), "y0 = nan"),
         (lambda: ExactImpact(1.0, restitution=1.0).rest_time(), "never comes to rest"),
         (lambda: ExactImpact(1.0).impact_time(0), "integer of at least 1"),
         (lambda: ExactImpact(1.0).height(-0.1), "before the start"),
-        (lambda: ExactPenalty(1.0, k=-1.0), "k is -1"),
+        (lambda: ExactPenalty(1.0, k=-1.0), "k = -1"),
         (lambda: ExactPenalty(1.0, k=25.0, damping=10.0), "critical damping"),
-        (lambda: ExactPenalty(1.0, damping=-1.0), "damping is -1"),
+        (lambda: ExactPenalty(1.0, damping=-1.0), "damping = -1"),
     ],
 )
 def test_what_has_no_exact_motion_is_refused(motion, message):

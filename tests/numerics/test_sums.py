@@ -367,7 +367,7 @@ def test_a_fixed_point_sum_is_a_sum_of_rounded_integers():
     # out of range is said, never wrapped
     assert np.isnan(float(FixedPoint(40)(jnp.asarray([2.0**21, 1.0]) * 2)))
     assert float(FixedPoint(40)(jnp.asarray([2.0**21, 1.0]))) == 2.0**21 + 1
-    with pytest.raises(InputError, match="2000 binary digits"):
+    with pytest.raises(InputError, match="2000 binary places"):
         FixedPoint(2000)
 
 
@@ -489,7 +489,7 @@ def test_the_derivative_of_a_segment_sum_gathers():
 
 
 def test_entries_outside_are_refused():
-    with pytest.raises(InputError, match=r"outside 0 to 2"):
+    with pytest.raises(InputError, match=r"outside the range 0 to 2"):
         segment_sum(jnp.ones(2), np.array([0, 3]), 3)
 
 

@@ -54,7 +54,7 @@ def write(folder: Path, text: str, **files: str) -> Path:
         # values that cannot be computed with
         ("steps = 4", "steps = " + "[" * 50 + "]" * 50, "nested more than 20 deep"),
         ("steps = 4", "steps = " + "[" * 50_000 + "]" * 50_000, "nested more than 20 deep"),
-        ("steps = 4", "steps = " + "9" * 5000, "not TOML"),
+        ("steps = 4", "steps = " + "9" * 5000, "not valid TOML"),
         ("steps = 4", "steps = 9223372036854775808", "at most 2^62"),
         ("timestep = 0.002", "timestep = 1e-300", "timestep = 1e-300; expected 0 … from 1e-150"),
         ("sigma = 3.405", "sigma = 1e-300", "sigma = 1e-300"),

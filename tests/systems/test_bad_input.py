@@ -77,8 +77,8 @@ OWN, PAIR = "epsilon = 0.0103235", "{ sigma = 1.0, epsilon = 1.0 }"
 @pytest.mark.parametrize(
     ("old", "new", "line", "words"),
     [
-        ("radius = 8.0", "radius = 8.0.1", 14, "not TOML … radius = 8.0.1"),
-        ("[cutoff]", "[cutoff", 12, "not TOML"),
+        ("radius = 8.0", "radius = 8.0.1", 14, "not valid TOML … radius = 8.0.1"),
+        ("[cutoff]", "[cutoff", 12, "not valid TOML"),
         ("radius = 8.0", "radus = 8.0", 14, "key 'radus' … [cutoff] … mean radius?"),
         ("[neighbors]", "[neighbours]", 16, "unknown key 'neighbours' … mean neighbors?"),
         ("radius = 8.0", "radius = 8.0\nonset = 7.0", 12, "onset … no meaning … hard"),

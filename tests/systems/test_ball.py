@@ -175,7 +175,7 @@ LEAST = "smallest usable tolerance is 8.9e-308"
         ("penalty", {"variants.low": "3"}, "variants.low = 3 … a table"),
         ("penalty", {"variants.x.contact.k": "0"}, "--set variants.x … variant 'x': contact.k = 0"),
         ("penalty", {"variants.x.contact.kk": "0"}, "variant 'x': unknown key 'kk' … mean k?"),
-        ("penalty", {"variants.x.start.balls": "4"}, "variant 'x' … 4 balls … system 3"),
+        ("penalty", {"variants.x.start.balls": "4"}, "variant 'x' … 4 balls … system has 3"),
         ("penalty", {"variants.x.integrator.steps": "4"}, "variant 'x' changes integrator.steps"),
         ("penalty", CONTROL, "2 numbers for 100 steps"),
         ("projection", {"contact.k": "4"}, "alpha k = 0.5 × 4 = 2 … 1 - alpha k = -1 … alpha below 0.5"),

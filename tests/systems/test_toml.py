@@ -68,5 +68,5 @@ def test_the_line_of_a_key():
     }  # fmt: skip
     assert {key: toml.line_of(TEXT, tuple(key.split("."))) for key in lines} == lines
     # an error without a line is at the end
-    with pytest.raises(InputError, match=r"^file:2: not TOML"):
+    with pytest.raises(InputError, match=r"^file:2: this is not valid TOML"):
         toml.parse('a = 1\nb = """open', "file")

@@ -200,7 +200,7 @@ def test_a_damaged_table_is_one_line(returned, tmp_path, damage):
         middle = len(data) // 2
         flipped = data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
         file.write_bytes({"cut": data[:middle], "bits": flipped, "other": b"PAR1"}[damage])
-    with pytest.raises(FolderError, match=r"flips\.parquet: is (damaged|missing)") as caught:
+    with pytest.raises(FolderError, match=r"flips\.parquet: .*(damaged|missing)") as caught:
         outcome.table("flips")
     assert "\n" not in str(caught.value)
     assert outcome.table("series").num_rows == 61
