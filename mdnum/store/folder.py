@@ -651,7 +651,7 @@ class RunFolder:
                 # a run that goes on replaced the file meanwhile
                 allowed, found = now, manifest.digest(path)
             edited = "was changed since it was written"
-            wrong = edited if name in _EDITED else "is damaged: its bytes are not those that were written"
+            wrong = edited if name in _EDITED else "the file is damaged: its bytes have changed"
             self._checked[name] = (state, "" if found in allowed else wrong)
         return self._checked[name][1]
 
