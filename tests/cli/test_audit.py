@@ -32,7 +32,7 @@ def copper(tmp_path: Path, monkeypatch) -> Path:
         ((EMT, "--checks", "curls"), "Did you mean curl?"),
         ((EMT, "-s", "no.xyz"), "no.xyz"),
         ((EMT, "-s", "cu.extxyz@7"), "cu.extxyz@7"),
-        ((EMT, "-s", "cu.extxyz@:"), "one structure"),
+        ((EMT, "-s", "cu.extxyz@:"), "tests only one"),
         ((EMT, "-s", "cu.extxyz", "--timestep", "0", "--checks", "dynamics"), "expected a value above 0"),
     ],
 )

@@ -118,7 +118,7 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
         (("broken.py:pairs",), "(broken.py, line 1)"),
         (("mine.py:np",), "neither … with allocate and"),
         (("mine.py:without_pbc",), "without_pbc … with (positions, cell, pbc, r_cut)"),
-        (("mine.py:Half",), "a class without update"),
+        (("mine.py:Half",), "has no update"),
         (("mine.py:Sized",), "Sized(size) cannot be called with ()"),
         (("mine.py:Sized(1, 2)",), "could not be constructed: TypeError"),
         (("mine.py:Short",), ".update(positions) … with (positions, cell)"),
