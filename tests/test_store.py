@@ -522,7 +522,7 @@ def test_json_holds_what_json_has_and_broken_files_are_named(tmp_path):
     assert json.loads((folder.path / "summary.json").read_text()) == {"a": 0.1, "b": [0, 1, 2], "c": None,
                                                                      "d": [True, None]}  # fmt: skip
     assert folder.provenance == {}
-    with pytest.raises(FolderError, match="run: the folder has no checkpoint"):
+    with pytest.raises(FolderError, match="has no checkpoint"):
         folder.load_checkpoint()
     (folder.path / "checkpoint.npz").write_bytes(b"PK nonsense")
     with pytest.raises(FolderError, match=r"checkpoint\.npz"):

@@ -145,7 +145,7 @@ def test_a_checkpoint_names_tables_and_no_files(tmp_path, killed, name):
     state, store = checkpoint.read(killed / "checkpoint.npz")
     # a checkpoint is listed as it is written
     checkpoint.write(killed / "checkpoint.npz", state, {**store, "rows": {**store["rows"], name: 0}}, {})
-    with pytest.raises(FolderError, match=r"checkpoint\.npz: the checkpoint counts rows of a table"):
+    with pytest.raises(FolderError, match=r"checkpoint\.npz: .*counts rows"):
         RunFolder.open(killed).resume()
     assert (tmp_path / "precious.parquet").read_bytes() == PRECIOUS
 
@@ -160,7 +160,7 @@ def test_a_checkpoint_unpacks_to_no_more_than_itself(tmp_path):
     data = path.read_bytes()
     for claim in (b"(99999999999999999,), ", b"(7, 9999999999999999),"):
         path.write_bytes(data.replace(b"(7,), }" + b" " * (len(claim) - 6), claim + b"}"))
-        with pytest.raises(FolderError, match="the checkpoint cannot be read"):
+        with pytest.raises(FolderError, match="checkpoint cannot be"):
             checkpoint.read(path)
 
 

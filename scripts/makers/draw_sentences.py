@@ -22,10 +22,11 @@ ROOT = Path(__file__).resolve().parents[2]
 #: Sentences of each kind, and letters that a sentence has at least: shorter ones are labels.
 EACH, SHORTEST = 8, 30
 _END = re.compile(r"(?<=[.?!:])\s+(?=[A-Z`\[*-])")
-_FIELD = re.compile(r"\{(?:[a-z_]*:\?) (\w+) \w+\}|\{(\w+)(?::#? ?([^}]*))?\}")
+_FIELD = re.compile(r"\{[a-z_]*:\? \w+ (\w+)\}|\{([\w.\[\]]+)(?::#? ?([^}]*))?\}")
 #: Keys whose texts are no sentences of a finding.
 _NO_SENTENCE = (
     "severity", "section", "help", "metavar", "type", "of", "kind", "unit", "calls", "name", "shares",
+    "kinds", "further", "placeholder", "bib", "script", "digest_code", "imports_code",
 )  # fmt: skip
 
 
@@ -48,8 +49,8 @@ def main() -> None:
 
 
 def findings() -> Iterator[tuple[str, str]]:
-    """Sentences of the text files, fields by an example: a count as 3, a number as its name."""
-    for file in sorted((ROOT / "mdnum").rglob("*.toml")):
+    """Sentences of the text files, fields by an example: a count as 3, another number as its name."""
+    for file in sorted({*(ROOT / "mdnum").rglob("*.toml")} - {*(ROOT / "mdnum").rglob("reproduction.toml")}):
         for text in _texts(tomllib.loads(file.read_text())):
             yield from _split(file, _FIELD.sub(_example, text))
 
@@ -96,7 +97,7 @@ def documents() -> Iterator[tuple[str, str]]:
 def _texts(tables: Any, only: str = "") -> Iterator[str]:
     for key, value in tables.items() if isinstance(tables, dict) else enumerate(tables):
         if isinstance(value, dict | list):
-            yield from _texts(value, only)
+            yield from _texts(value, only) if only or key not in _NO_SENTENCE else ()
         elif isinstance(value, str) and (key == only if only else key not in _NO_SENTENCE):
             yield value
 
@@ -104,10 +105,11 @@ def _texts(tables: Any, only: str = "") -> Iterator[str]:
 def _example(field: re.Match[str]) -> str:
     word, name, form = field.groups()
     if word:
-        return word
-    if form and form[0].isalpha() and "{n:#" in field[0].replace(name, "n"):
-        return f"3 {form.split()[0].replace('_', ' ')}s"
-    return f"<{name}>"
+        return word.replace("_", " ")
+    if form and form[0].isalpha() and ":#" in field[0]:
+        one, *several = (part.replace("_", " ") for part in form.split())
+        return f"3 {several[0] if several else one + 's'}"
+    return f"<{name.replace('[', ' ').rstrip(']')}>"
 
 
 def _literal(node: ast.expr) -> str:

@@ -403,7 +403,7 @@ def test_the_order_of_a_batch_is_heard_by_its_sum_alone():
         ("order", "narrow", "order@exact must hold"),
         ("ulps=contact.mass", "batch", "no number contact.mass; there are .*contact.k"),
         ("ulps=start.velocity", "spring", "start.velocity is 0"),
-        ("ulps=contact.eps", "batch", "no number contact.eps. Choose"),
+        ("ulps=contact.eps", "batch", "no number contact.eps. Use"),
         ("start=7", "batch", "no ball 7 among 3"),
         ("start=1:2:+1", "batch", "no coordinate 2"),
         ("max_iter=+1", "spring", "no iteration to add"),

@@ -201,7 +201,7 @@ def test_bad_input_is_refused():
         ("is zero", lambda: forecast(crystal(), 10, dx=zero)),
         ("shape of the positions", lambda: forecast(crystal(), 10, dx=zero[:5])),
         ("many-body", lambda: forecast(build("copper/eam-500"), 10)),
-        ("too few", lambda: lyapunov(crystal(), 40)),
+        ("too small", lambda: lyapunov(crystal(), 40)),
     ):
         with pytest.raises(InputError, match=words):
             call()

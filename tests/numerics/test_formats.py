@@ -37,7 +37,7 @@ def test_the_table_says_what_the_dtypes_say():
         assert form.bits == info.bits
     assert FORMATS["tf32"].unit_roundoff == 2.0**-11
     assert FORMATS["tf32"].largest == (2 - 2.0**-10) * 2.0**127
-    with pytest.raises(InputError, match=r"unknown format 'fp8'; known formats are float64, float32, tf32"):
+    with pytest.raises(InputError, match=r"'fp8'.*float64, float32, tf32"):
         format_of("fp8")
 
 

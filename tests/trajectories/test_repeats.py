@@ -91,7 +91,7 @@ def test_overlaps_copies_and_standstills_of_any_file(tmp_path, kind, timed):
         False, True, False,
     ]  # fmt: skip
     text = finding(found)["text"]
-    for words in ("5 to 6 are frames 3 to 4", "frames 9 to 11 are frame 8", "frame 14 is frame 2"):
+    for words in ("5 to 6 repeat frames 3 to 4", "frames 9 to 11 repeat frame 8", "frame 14 repeats frame 2"):
         assert words in text
     left, whole = flips(path, tmp_path / "b", drop_repeats=True), flips(clean, tmp_path / "c")
     assert left["rules"][0]["flips"] == whole["rules"][0]["flips"] != found["rules"][0]["flips"]

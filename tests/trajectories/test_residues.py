@@ -145,7 +145,7 @@ def test_what_has_no_residues_has_no_contacts_between_them(pair, tmp_path):
     bare = universe_of(*PROTEIN)
     for given, word in (
         ({"nearest": 3}, "nearest"),
-        ({"cutoffs": 4.5, "between": ("name HA", "name CA")}, "no atom is left"),
+        ({"cutoffs": 4.5, "between": ("name HA", "name CA")}, "all selected atoms"),
         ({"cutoffs": 4.5, "other": pair}, "by"),
     ):
         with pytest.raises(InputError, match=word):
