@@ -219,7 +219,7 @@ class Integrator(eqx.Module):
 
     @property
     def anisotropic(self) -> bool:
-        """True if the integrator needs the virial tensor, which takes a sixth more time per pair."""
+        """True if the integrator needs the virial tensor, which adds a tenth to the time of the forces."""
         return False
 
     @property

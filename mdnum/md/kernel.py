@@ -68,12 +68,23 @@ class PairSums(NamedTuple):
 
     # of each term over the slots of each atom, first slot first, shape (terms, atoms)
     sums: Float[Array, "terms atoms"]
+    # of each further term over all slots, shape (totals,)
+    totals: Float[Array, "totals"]
     # None where no margin is asked for. Their nearest margin is that of a listed pair, and inf where there is
     # none.
     decisions: Decisions | None
 
 
 _Pair = Callable[..., Sequence[Any]]
+
+
+class Near(NamedTuple):
+    """A cheaper function of a pair, which the loop evaluates for a vector of pairs none of which is far."""
+
+    # whether a pair is far, from the arguments of a function of a pair
+    far: Callable[..., Any]
+    # terms of a pair that is not far, equal to those of the other function but without totals, and its margin
+    pair: _Pair
 
 
 def over_pairs(
@@ -85,6 +96,8 @@ def over_pairs(
     margins: str | None = None,
     inverses: bool = False,
     potential: Any = None,
+    near: Near | None = None,
+    totals: int = 0,
 ) -> PairSums | None:
     """Sum a function of pairs over the slots of every atom; inside jit, on a CPU.
 
@@ -100,6 +113,9 @@ def over_pairs(
         inverses: whether several quotients by powers of one number are replaced by products with its inverse,
             because divisions are slow.
         potential: name under which an unsupported operation is reported (`left_out`).
+        near: a cheaper function that replaces `pair` for vectors without a far pair.
+        totals: number of terms that are summed over all slots of all atoms; `pair` returns them after the
+            others.
 
     Returns:
         None if the function has an operation without a vector form.
@@ -109,7 +125,9 @@ def over_pairs(
     """
     atoms, words = columns.shape[1], tables.index.shape[0]
     try:
-        written = _written(pair, columns.shape[0], len(flags), margins, tables.types is not None, inverses)
+        written = _written(
+            pair, near, columns.shape[0], len(flags), margins, tables.types is not None, inverses, totals
+        )
     except _NotKnown as unknown:
         if potential is not None and left_out(potential) != str(unknown):
             text = "%s goes through XLA's loop, in twice the time: the compiled one has no counterpart of %s"
@@ -120,6 +138,7 @@ def over_pairs(
         jax.ShapeDtypeStruct((written.terms, atoms), np.float64),
         jax.ShapeDtypeStruct((words if margins else 0, atoms), np.uint8),
         jax.ShapeDtypeStruct((1,), np.float64),
+        jax.ShapeDtypeStruct((totals, _WIDE * -(-atoms // _BLOCK)), np.float64),
     ]
     with _ONE:
         name = _registered(written.loop)
@@ -127,8 +146,8 @@ def over_pairs(
     index = tables.index.astype(jnp.int32).reshape(-1, atoms)
     bits = jnp.stack(tuple(flags)) if flags else jnp.zeros((0, words, atoms), jnp.uint8)
     kinds = jnp.zeros((0, 1), jnp.uint8) if tables.types is None else tables.types.reshape(-1, atoms)
-    sums, decided, nearest = call(index, columns, bits, written.constants, kinds)
-    return PairSums(sums, Decisions(decided, nearest[0]) if margins else None)
+    sums, decided, nearest, whole = call(index, columns, bits, written.constants, kinds)
+    return PairSums(sums, whole.sum(axis=1), Decisions(decided, nearest[0]) if margins else None)
 
 
 def left_out(potential: Any) -> str | None:
@@ -211,19 +230,28 @@ def _whole_power(equation: Any, inputs: list[Any]) -> int:
 
 
 def _written(
-    pair: _Pair, columns: int, flags: int, margins: str | None, types: bool, inverses: bool
+    pair: _Pair,
+    near: Near | None,
+    columns: int,
+    flags: int,
+    margins: str | None,
+    types: bool,
+    inverses: bool,
+    totals: int,
 ) -> _Written:
     """Return the loop over eight slots of the atoms of a block, as a function `word`.
 
     Its arguments are the number of atoms, the constants, the distance in atoms from one slot to the next, and
-    the addresses of rows: the columns of the atoms, flags, sums, decisions, types and neighbors of the first
-    slot, nearest margins so far, and the table with the data of all atoms, one atom after the other.
+    the addresses of rows: the columns of the atoms, flags, sums, totals, decisions, types and neighbors of
+    the first slot, nearest margins so far, and the table with the data of all atoms, one after the other.
     """
     number, truth = jax.ShapeDtypeStruct((), np.float64), jax.ShapeDtypeStruct((), np.bool_)
     kind = jax.ShapeDtypeStruct((), np.uint8) if types else None
-    program = jax.make_jaxpr(pair)([number] * columns, [number] * columns, kind, *[truth] * flags)
-    terms = len(program.out_avals) - bool(margins)
-    rows = columns + flags + terms + 5
+    functions = [pair] if near is None else [pair, near.pair, near.far]
+    arguments = [number] * columns, [number] * columns, kind, *[truth] * flags
+    program, *others = (jax.make_jaxpr(one)(*arguments) for one in functions)
+    terms = len(program.out_avals) - bool(margins) - totals
+    rows = columns + flags + terms + totals + 5
     constants: dict[int, Any] = {}
     lines: list[str] = []
     names = count()
@@ -350,22 +378,49 @@ def _written(
         given.append(put(f"uitofp BYTE {load(rows - 4, 'BYTE', 'i8', '%from.WIDE').name} to VEC"))
     bits = [put(f"and LONG {byte}, %bit.WIDE").name for byte in told]
     given += [put(f"icmp ne LONG {bit}, zeroinitializer", "BOOL") for bit in bits]
-    results = list(map(text, interpreted(program, given, rule)))
-    if inverses:
-        _divide_once(lines, quotients, powers)
-    after = [put(f"fadd VEC %kept{k}.WIDE, {results[k]}").name for k in range(terms)]
-    if margins:
-        margin, nearest, byte = results[-1], f"%kept{terms}.WIDE", f"%kept{terms + 1}.WIDE"
-        size = put(f"call VEC @llvm.fabs.vWIDEf64(VEC {margin})").name
-        # a slot of padding has none
-        nearer = put(f"fcmp olt VEC {size}, {nearest}").name
-        after.append(put(f"select BOOL {nearer}, VEC {size}, VEC {nearest}").name)
-        inside = put(f"fcmp {_COMPARISONS[margins]} VEC {margin}, {_number(0)}").name
-        bit = put(f"select BOOL {inside}, LONG %bit.WIDE, LONG zeroinitializer").name
-        after.append(put(f"or LONG {byte}, {bit}").name)
-    held, ends = [], []
-    for k, ((kind, single, row, first), last) in enumerate(zip(kept, after, strict=True)):
-        held.append(f"%kept{k}.WIDE = phi {kind} [{first}, %some.WIDE], [{last}, %slot.WIDE]")
+    if near is None:
+        each = [*lines, "br label %far.WIDE"]
+    else:
+        far = text(interpreted(others[1], given, rule)[0], "BOOL")
+        each = [*lines, f"%distant.WIDE = call i1 @llvm.vector.reduce.or.vWIDEi1(BOOL {far})"]
+        each.append("br i1 %distant.WIDE, label %far.WIDE, label %near.WIDE")
+
+    def body(program: Any, place: str, totals: int) -> list[str]:
+        """Write a function of a pair as a block of its own; returns the names of the sums after the pair."""
+        nonlocal lines
+        before, lines = dict(made), []
+        quotients.clear()
+        results = list(map(text, interpreted(program, given, rule)))
+        if inverses:
+            _divide_once(lines, quotients, powers, place)
+        after = [put(f"fadd VEC %kept{k}.WIDE, {results[k]}").name for k in range(terms)]
+        for k in range(terms, terms + totals):
+            row = columns + flags + k
+            whole = put(f"fadd VEC {load(row, 'VEC', 'double', '0').name}, {results[k]}").name
+            lines.append(f"store VEC {whole}, ptr %r{row}, align 1")
+        if margins:
+            margin, nearest, byte = results[-1], f"%kept{terms}.WIDE", f"%kept{terms + 1}.WIDE"
+            size = put(f"call VEC @llvm.fabs.vWIDEf64(VEC {margin})").name
+            # a slot of padding has none
+            nearer = put(f"fcmp olt VEC {size}, {nearest}").name
+            after.append(put(f"select BOOL {nearer}, VEC {size}, VEC {nearest}").name)
+            inside = put(f"fcmp {_COMPARISONS[margins]} VEC {margin}, {_number(0)}").name
+            bit = put(f"select BOOL {inside}, LONG %bit.WIDE, LONG zeroinitializer").name
+            after.append(put(f"or LONG {byte}, {bit}").name)
+        each.extend([f"{place}.WIDE:", *lines, "br label %last.WIDE"])
+        made.clear()
+        made.update(before)
+        return after
+
+    after = {"far": body(program, "far", totals)}
+    if near is not None:
+        after["near"] = body(others[0], "near", 0)
+    held, merged, ends = [], [], []
+    for k, (kind, single, row, first) in enumerate(kept):
+        ways = ", ".join(f"[{values[k]}, %{place}.WIDE]" for place, values in after.items())
+        last = f"%then{k}.WIDE"
+        merged.append(f"{last} = phi {kind} {ways}")
+        held.append(f"%kept{k}.WIDE = phi {kind} [{first}, %some.WIDE], [{last}, %last.WIDE]")
         ends.append(f"%end{k}.WIDE = getelementptr {single}, ptr %r{row}, i64 %k.WIDE")
         if kind == "LONG":
             ends.append(f"%byte{k}.WIDE = trunc LONG {last} to BYTE")
@@ -394,7 +449,8 @@ def _written(
                 held="\n  ".join(held),
                 listed="\n  ".join(_listed(rows, bool(margins))),
                 others="\n  ".join(_others(wide, columns, rows)),
-                each="\n  ".join(lines),
+                each="\n  ".join(each),
+                merged="\n  ".join(merged),
                 ends="\n  ".join(ends),
             ),
             wide,
@@ -423,9 +479,16 @@ def _written(
 
 
 def _divide_once(
-    lines: list[str], quotients: Sequence[tuple[int, str, str]], powers: dict[str, tuple[str, int]]
+    lines: list[str],
+    quotients: Sequence[tuple[int, str, str]],
+    powers: dict[str, tuple[str, int]],
+    block: str,
 ) -> None:
-    """Replace several quotients by powers of one number by products with its inverse; see `_written`."""
+    """Replace several quotients by powers of one number by products with its inverse; see `_written`.
+
+    Args:
+        block: name of the block to which the lines belong; names of inverse powers contain it.
+    """
     divisors = [powers.get(divisor, (divisor, 1)) for _, _, divisor in quotients]
     uses, known = Counter(base for base, _ in divisors), dict.fromkeys((base for base, _ in divisors), 0)
     for (place, dividend, _), (base, n) in zip(quotients, divisors, strict=True):
@@ -433,11 +496,11 @@ def _divide_once(
             continue
         before = []
         for k in range(known[base] + 1, n + 1):
-            line = f"fmul VEC {base}.{k // 2}, {base}.{k - k // 2}"
-            before.append(f"{base}.{k} = " + (line if k > 1 else f"fdiv VEC {_number(1)}, {base}"))
+            line = f"fmul VEC {base}.{block}{k // 2}, {base}.{block}{k - k // 2}"
+            before.append(f"{base}.{block}{k} = " + (line if k > 1 else f"fdiv VEC {_number(1)}, {base}"))
         known[base] = max(known[base], n)
         name = lines[place].split(" = ")[0]
-        lines[place] = "\n  ".join([*before, f"{name} = fmul VEC {dividend}, {base}.{n}"])
+        lines[place] = "\n  ".join([*before, f"{name} = fmul VEC {dividend}, {base}.{block}{n}"])
 
 
 def _same(single: str, value: str, name: str, kind: str) -> str:
@@ -555,14 +618,16 @@ some.WIDE:
   {once}
   br label %slot.WIDE
 slot.WIDE:
-  %slot.WIDE.k = phi i64 [0, %some.WIDE], [%later.WIDE, %slot.WIDE]
-  %bit.WIDE = phi LONG [ALL[i64 1], %some.WIDE], [%nextbit.WIDE, %slot.WIDE]
+  %slot.WIDE.k = phi i64 [0, %some.WIDE], [%later.WIDE, %last.WIDE]
+  %bit.WIDE = phi LONG [ALL[i64 1], %some.WIDE], [%nextbit.WIDE, %last.WIDE]
   {held}
   %nextbit.WIDE = add LONG %bit.WIDE, %bit.WIDE
   %row.WIDE = mul i64 %slot.WIDE.k, %atoms
   %from.WIDE = add i64 %row.WIDE, %k.WIDE
   {others}
   {each}
+last.WIDE:
+  {merged}
   %later.WIDE = add nuw nsw i64 %slot.WIDE.k, 1
   %again.WIDE = icmp ult i64 %later.WIDE, 8
   br i1 %again.WIDE, label %slot.WIDE, label %end.WIDE
@@ -657,9 +722,10 @@ def _work(job):
     types_of, _, _ = buffer(operands, 4)
     sums, terms, _ = buffer(results, 0)
     bits, _, _ = buffer(results, 1)
+    whole, totals, _ = buffer(results, 3)
 
     # where the rows begin that the loop over a word is given, and the nearest margins
-    named = columns + flags + terms + 5
+    named = columns + flags + terms + totals + 5
     room = malloc(8 * (named + _BLOCK))
     rows = carray(pointer(room), (named,), np.int64)
     closest = room + 8 * named
@@ -672,6 +738,9 @@ def _work(job):
         for row in range(terms):
             rows[columns + flags + row] = sums + 8 * (row * atoms + start)
             _filled(sums + 8 * (row * atoms + start), n, 0.0)
+        for row in range(totals):
+            rows[columns + flags + terms + row] = whole + 8 * _WIDE * (row * blocks + block)
+            _filled(whole + 8 * _WIDE * (row * blocks + block), _WIDE, 0.0)
         _filled(closest, n, np.inf)
         for word in range(slots // 8):
             for flag in range(flags):

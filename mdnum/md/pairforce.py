@@ -107,10 +107,11 @@ class PairForce(eqx.Module):
         """The decisions of a list at given positions, without forces."""
         if self.in_one_loop(tables):
 
-            def pair(own, other, types):
-                return (self._geometry(own, other, types)[3],)
+            def pair(own, other, types, near=False):
+                return (self._geometry(own, other, types, near)[4],)
 
-            made = kernel.over_pairs(pair, positions.astype(np.float64), tables, margins=self._inside)
+            columns, near = positions.astype(np.float64), self._near(pair, False)
+            made = kernel.over_pairs(pair, columns, tables, margins=self._inside, near=near)
             if made is not None and made.decisions is not None:
                 return made.decisions
         return self.judge(positions).decide(tables)
@@ -120,14 +121,30 @@ class PairForce(eqx.Module):
         """The comparison of the margin with 0 that holds for a pair inside the cutoff."""
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
-    def _geometry(self, own, other, types):
-        """Return displacement, squared distance, decision and margin of a pair in double precision."""
-        d = self.cell.minimum_image(*(b - a for a, b in zip(own, other, strict=True)))
+    def _near(self, pair: Callable[..., Any], tensor: bool) -> kernel.Near | None:
+        """Return the function for pairs without a minimum image; None if it would save no time."""
+        if not any(self.cell.pbc) or (self.cell.orthorhombic and not tensor):
+            return None
+
+        def far(own, other, *_):
+            d = [b - a for a, b in zip(own[:3], other[:3], strict=True)]
+            return d[0] * d[0] + d[1] * d[1] + d[2] * d[2] >= self.cell.nearby2
+
+        return kernel.Near(far, partial(pair, near=True))
+
+    def _geometry(self, own, other, types, near: bool):
+        """Return displacement, difference of positions, squared distance, decision and margin of a pair.
+
+        Args:
+            near: whether the difference of positions is known to be the displacement to the nearest image.
+        """
+        apart = [b - a for a, b in zip(own, other, strict=True)]
+        d = apart if near else self.cell.minimum_image(*apart)
         r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
         quantity = jnp.sqrt(r2) if self.decider.space == "r" else r2
         # compared as what is recorded: once for both, and differences of unequal numbers are not zero
         margin = of_type(self.thresholds, types) - quantity
-        return d, r2, margin >= 0 if self._inside == ">=" else margin > 0, margin
+        return d, apart, r2, margin >= 0 if self._inside == ">=" else margin > 0, margin
 
     def __call__(
         self,
@@ -305,26 +322,44 @@ def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) 
 @eqx.filter_custom_jvp
 def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, decisions: bool, tensor: bool):
     """Compute the result of `PairForce.in_blocks` in one compiled loop; None if this is not possible."""
-    terms_of = force._terms(tensor)
+    terms_of = force._terms(False)
 
-    def pair(own, other, types, *bits):
-        d, r2, inside, margin = force._geometry(own[:3], other[:3], types)
+    def pair(own, other, types, *bits, near=False):
+        d, apart, r2, inside, margin = force._geometry(own[:3], other[:3], types, near)
         if bits:
             inside = bits[0] if where is None else jnp.where(bits[1], bits[0], inside)
         others = factors(force.model, map(mul, own[3:], other[3:]))
         # a slot of padding is nowhere, and no number times nothing is no number
         located = [jnp.where(inside, c, 0) for c in d]
-        terms = terms_of(located, r2, inside, types, *others)
-        return (*terms, margin) if decisions else terms
+        terms = list(terms_of(located, r2, inside, types, *others))
+        if tensor:
+            # only the share of lattice vectors in the virial: see `_virial`
+            shift = [jnp.where(inside, a - b, 0) for a, b in zip(apart, d, strict=True)]
+            terms[4:] = [] if near else [terms[a] * shift[b] for a, b in VOIGT]
+        return (*terms, margin) if decisions else tuple(terms)
 
     flags = [one for one in (given, where) if one is not None]
     columns, margins = positions.astype(np.float64), force._inside if decisions else None
     if rows := force.weights(tables):
         columns = jnp.concatenate([columns, jnp.stack(rows)])
     made = kernel.over_pairs(
-        pair, columns, tables, flags=flags, margins=margins, inverses=True, potential=force.model.potential
-    )
-    return None if made is None else _forces(tuple(made.sums), made.decisions)
+        pair, columns, tables, flags=flags, margins=margins, inverses=True, potential=force.model.potential,
+        near=force._near(pair, tensor), totals=len(VOIGT) * tensor,
+    )  # fmt: skip
+    if made is None:
+        return None
+    virial = _virial(made, columns[:3]) if tensor else tuple(made.sums[4:])
+    return _forces((*made.sums[:4], *virial), made.decisions)
+
+
+def _virial(made: kernel.PairSums, x: Float[Array, "3 atoms"]) -> list[Float[Array, ""]]:
+    """Return force times displacement in Voigt's order, summed over both ends of all pairs.
+
+    A displacement is x_j - x_i minus lattice vectors. Force times position is summed over atoms; the loop
+    over pairs adds force times lattice vectors, for the few pairs that have some.
+    """
+    whole = made.sums[:3] @ x.T
+    return [-2 * whole[a, b] - total for (a, b), total in zip(VOIGT, made.totals, strict=True)]
 
 
 @_in_one_loop.def_jvp
