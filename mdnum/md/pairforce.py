@@ -358,8 +358,8 @@ def _virial(made: kernel.PairSums, x: Float[Array, "3 atoms"]) -> list[Float[Arr
     A displacement is x_j - x_i minus lattice vectors. Force times position is summed over atoms; the loop
     over pairs adds force times lattice vectors, for the few pairs that have some.
     """
-    whole = made.sums[:3] @ x.T
-    return [-2 * whole[a, b] - total for (a, b), total in zip(VOIGT, made.totals, strict=True)]
+    force, totals = made.sums, made.totals
+    return [-2 * jnp.sum(force[a] * x[b]) - total for (a, b), total in zip(VOIGT, totals, strict=True)]
 
 
 @_in_one_loop.def_jvp
