@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mdnum.errors import InputError
-from mdnum.md.cell import Cell
+from mdnum.md.cell import Cell, transformed
 from mdnum.md.integrators import AtStep, Integrator, Masses, Number, Vector, quantity
 from mdnum.md.pairforce import VOIGT, symmetric
 from mdnum.md.thermostats import Chain, rescaled
@@ -81,11 +81,17 @@ def matrix(a: Rate) -> Float[Array, "3 3"]:
     return a if a.ndim else a * jnp.eye(3)
 
 
-def acted(x: Vector, a: Rate) -> Vector:
-    """Return the product of vectors (as rows) and a rate, in float64."""
+def acted(x: Vector, a: Rate, *, fused: bool = False) -> Vector:
+    """Return the product of vectors (as rows) and a rate, in float64.
+
+    Args:
+        fused: whether to write sums, which XLA fuses with the operations around them. That is faster unless
+            the vectors are expensive to compute, since each row computes them again.
+    """
     x = x.astype(jnp.float64)
-    # sums, which XLA fuses with the operations around them; products of matrices take more time
-    return a[0, :, None] * x[0] + a[1, :, None] * x[1] + a[2, :, None] * x[2] if a.ndim else x * a
+    if a.ndim == 0:
+        return x * a
+    return a[0, :, None] * x[0] + a[1, :, None] * x[1] + a[2, :, None] * x[2] if fused else transformed(x, a)
 
 
 class Barostat(Integrator):
@@ -216,8 +222,8 @@ class MTK(Barostat):
         """Return velocities after the forces, and the friction caused by the rate of the box, have acted."""
         rate = extra.rate
         slow = -time * (rate + trace(rate) / self.freedom(at.masses) * unit(rate))
-        kick = acted(at.acceleration, time * growth(slow))
-        return (acted(v, exponential(slow)) + kick).astype(v.dtype)
+        kick = acted(at.acceleration, time * growth(slow), fused=True)
+        return (acted(v, exponential(slow), fused=True) + kick).astype(v.dtype)
 
     def finish(self, v, extra, at, time):
         time = time.astype(jnp.float64)
@@ -233,7 +239,7 @@ class MTK(Barostat):
         v = self._kicked(v, extra, at, half)
         # the box still has to grow, with all that is in it
         way = self.timestep * growth(-self.timestep * extra.rate)
-        return x + acted(v, way), v, extra, jnp.zeros(())
+        return x + acted(v, way, fused=True), v, extra, jnp.zeros(())
 
     def deform(self, v, extra, at):
         return matrix(exponential(self.timestep * extra.rate)), v, extra
