@@ -316,6 +316,8 @@ _STRAIN_RULES = {
     "motion in the box alone": lambda by, first: 1.0,
     "strain by volume": lambda by, first: abs(np.linalg.det(by)) ** (1 / 3),
     "strain since the first box": lambda by, first: np.linalg.svd(first, compute_uv=False)[-1],
+    # of a length r_cut in place of r_cut and the skin, which is three tenths of it
+    "strain of the cutoff": lambda by, first: 1 - (1 - np.linalg.svd(by, compute_uv=False)[-1]) / 1.3,
 }
 
 

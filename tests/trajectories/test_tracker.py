@@ -205,6 +205,36 @@ def test_a_list_in_use_misses_nothing(mover, bound):
     assert used > 18 and (flipped > 0 or mover in ("drift", "resting"))
 
 
+@pytest.mark.parametrize("forgets", [False, True])
+def test_a_list_that_forgets_the_strain_of_its_box_misses_pairs(monkeypatch, forgets):
+    """Two layers at rest meet through a face of a box that shrinks: no atom moves, and only strain counts."""
+    right = tiles.Tiles.serve
+
+    def serve(self, before, now, radius, clear):
+        if forgets:
+            self.vectors = now.lattice.vectors
+        return right(self, before, now, radius, clear)
+
+    monkeypatch.setattr(tiles.Tiles, "serve", serve)
+    rng = np.random.default_rng(7)
+    low, high = rng.uniform([0, 0, 1.6], [9, 8, 1.8], (2, 32, 3))
+    x, tracker, before, used, missed = (
+        np.concatenate([low, 20.0 - high]),
+        Tracker(CutoffRule(2.2)),
+        set(),
+        0,
+        0,
+    )
+    for k in range(30):
+        matrix, held = np.diag([9.0, 8.0, 20.0 - 0.05 * k]), tracker._list
+        flips = tracker.step(Frame(k, 0.0, x, Box(matrix, PERIODIC)))
+        i, j, d = oracles.all_pairs(x, matrix, PERIODIC)
+        now = {(*pair, 0, True) for pair in np.transpose([i, j])[(d * d).sum(axis=1) < 2.2**2].tolist()}
+        missed += len(now - before - {row for row in rows(flips) if row[3]}) if k else 0
+        used, before = used + (held is not None and tracker._list is held), now
+    assert bool(missed) == forgets and used > 5 and len(now) > 100, (missed, used, len(now))
+
+
 def test_a_box_that_becomes_too_narrow_for_a_list():
     rng, radius, before, used = np.random.default_rng(5), 2.2, None, []
     x, everyone = rng.uniform(0, 5, (12, 3)), range(12)

@@ -230,6 +230,9 @@ def motions(padding: float | None = None) -> Iterator[Case]:
     for share in _SHARES:
         words = f"the smallest motions of a pair, {share:.0%} by its first atom"
         yield _sequence(words, (_walk(room, way, share, edge, n) for n, way in numbered), edge)
+    for along, words in ((False, "along all axes"), (True, "along one direction")):
+        paths = (_squeezed(room, way, edge, n, along) for n, way in numbered)
+        yield _sequence(f"the smallest strains, a box that shrinks {words} with its atoms", paths, edge)
     some = [(n, ways[k]) for n, k in enumerate((0, 2, 5, 9, 13))]
     for share in (0.5, 1.0):
         paths = (_walk(room, way, share, edge, n, np.linspace(0, 1, 8)) for n, way in some)
@@ -293,6 +296,17 @@ def _walk(
     start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
+
+
+def _squeezed(room: float, way: ndarray, edge: float, n: int, along: bool) -> list[tuple[ndarray, ndarray]]:
+    """Return a path in which the strain of the box alone brings two atoms together.
+
+    The box shrinks along the direction between the atoms only, or along all axes.
+    """
+    (start, _), cell = _walk(room, way, 0.5, edge, n), edge * np.eye(3)
+    loss = _closing(room) / (_R + (1 + HAIR) * room)
+    strain = np.eye(3) - loss * (np.outer(way, way) if along else np.eye(3))
+    return [(start, cell), (start @ strain, cell @ strain)]
 
 
 def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
@@ -389,7 +403,7 @@ def _places(count: int, edge: float, n: int) -> ndarray:
     return edge * np.random.default_rng(200 + n).permutation((grid(side) + 0.5) / side)[:count]
 
 
-def _sequence(name: str, paths: Iterable[list[ndarray]], cell: float | ndarray, skin: float = _SKIN) -> Case:
+def _sequence(name: str, paths: Iterable[list[Any]], cell: float | ndarray, skin: float = _SKIN) -> Case:
     """Return a test case of successive motions, with far moves in between that make any rule rebuild."""
     paths = list(paths)
     case = sequence(name, "rule", [still for path in paths for still in path], cell, _R, skin)

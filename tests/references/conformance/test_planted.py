@@ -112,6 +112,12 @@ def test_a_rule_that_lets_pairs_through_is_found_out(defect: str):
     assert [failed.code for failed in report.failed] == ["MISSING"], f"{report.calls} calls"
 
 
+def test_a_rule_that_counts_three_quarters_of_the_strain_is_found_out():
+    """A bound of r_cut (1 - s) in place of (r_cut + skin) (1 - s), of the smallest stretch s of the box."""
+    report = _examined(planted_lists.kept("strain of the cutoff"), rule=True, stop=True)
+    assert [failed.code for failed in report.failed] == ["MISSING"], f"{report.calls} calls"
+
+
 @pytest.mark.parametrize("skinless", [False, True])
 @pytest.mark.parametrize("defect", ["", *planted_lists.UPDATE_DEFECTS])
 def test_several_images_of_a_pair_are_asked_of_a_list_in_use(defect: str, skinless: bool):
