@@ -296,6 +296,10 @@ class CellRescaling(Barostat):
         return Move(no, jnp.ones(()), none, none, no, none)
 
     @property
+    def noise_belongs_to(self):
+        return ("axes",) if self.anisotropic else ()
+
+    @property
     def _mobility(self):
         """Return the mobility of the square root of the volume."""
         return self.compressibility / (4 * self.pressure_relaxation)

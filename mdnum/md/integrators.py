@@ -147,6 +147,12 @@ class Integrator(eqx.Module):
         field = self.keys().get("seed")
         return None if field is None else getattr(self, field.name)
 
+    @property
+    def noise_belongs_to(self) -> tuple[str, ...]:
+        """Whether atoms and axes have noise of their own: after a permutation of "atoms" or "axes" they have
+        that of others."""
+        return () if self.random is None else ("atoms", "axes")
+
     def number(self, key: str, units: Units) -> float:
         """Return the number of a field by its key, in the units of a system file."""
         field = self.keys()[key]

@@ -151,6 +151,7 @@ class CSVR(Integrator):
     """
 
     name = "csvr"
+    noise_belongs_to = ()
     kT: Float[Array, ""] = quantity("temperature")
     relaxation: Float[Array, ""] = quantity("time")
     key: Array = quantity("seed")

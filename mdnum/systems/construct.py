@@ -128,7 +128,8 @@ def simulation(
         friction: friction coefficient of Langevin dynamics, 1/time; default constant energy.
         pressure: pressure of a barostat, in GPa or reduced units.
         integrator: name ("nose-hoover", "csvr", "mtk", "cell-rescaling") or class of another integrator, or
-            an integrator object, whose numbers are in internal units (time is length * sqrt(mass / energy)).
+            an integrator object, which has its own numbers, in internal units (time is length * sqrt(mass /
+            energy)).
         dynamics: further options of the integrator, by the keys and in the units of a system file.
         seed: random seed of drawn velocities and of a thermostat's noise.
         remove_drift: whether the velocity of the center of mass is removed at the start.
@@ -143,7 +144,8 @@ def simulation(
 
     Raises:
         InputError: the structure cannot be simulated, the parameters do not fit its species, the box is too
-            small for cutoff and skin, or the cutoff is missing or not applicable.
+            small for cutoff and skin, the cutoff is missing or not applicable, or the integrator has a number
+            that a system file could not have.
     """
     system = unit_systems.get(units)
     atoms = atoms.copy()
@@ -173,14 +175,19 @@ def simulation(
     r_cut = float(np.max(model.r_cut))
     skin = DEFAULT_SKIN[units] if skin is None else float(skin)
     check(atoms, r_cut, skin, closest(model, units), system.length)
-    if not isinstance(integrator, Integrator):
+    optional = {"friction": friction, "pressure": pressure}
+    given = {key: one for key, one in optional.items() if one is not None} | dict(dynamics or {})
+    if isinstance(integrator, Integrator):
+        if also := [*given, *(["timestep"] if timestep is not None else [])]:
+            message = f"the integrator is an object, and {', '.join(also)} was given as well"
+            raise InputError(message, where=name, remedy="Leave it out, or give the integrator by its name")
+        _check_instance(integrator, system, name)
+    else:
         if timestep is None:
             raise InputError("no time step was given", where=name, remedy="Add timestep=...")
         kind = integrator or (VelocityVerlet if friction is None else Langevin)
-        numbers = {"timestep": timestep, "temperature": temperature, "seed": seed}
-        optional = {"friction": friction, "pressure": pressure}
-        numbers |= {key: one for key, one in optional.items() if one is not None}
-        integrator = _integrator(kind, {**numbers, **(dynamics or {})}, system, name)
+        numbers = {"timestep": timestep, "temperature": temperature, "seed": seed} | given
+        integrator = _integrator(kind, numbers, system, name)
     drawn = not atoms.has("momenta") if drawn is None else drawn
     made = assembled(
         Origin(name, about), atoms, system, model, model.compare if cutoff is None else cutoff.compare,
@@ -199,11 +206,38 @@ def _integrator(
 ) -> Integrator:
     """Create an integrator from its name or class; options of built-in integrators are validated."""
     made = INTEGRATORS[kind] if isinstance(kind, str) else kind
-    if made in (INTEGRATORS[one] for one in INTEGRATORS.shipped):
-        table = {key: one.item() if hasattr(one, "item") else one for key, one in numbers.items()}
-        data = {"dynamics": {"kind": made.name, **table}}
-        numbers = checked(DynamicsAlone, data, Source(where, Path(), where)).dynamics.model_dump()
-    return made.of_file(numbers, units)
+    return made.of_file(_validated(made, numbers, where), units)
+
+
+def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+    """Return the numbers of an integrator in units of a file; those of a built-in one are checked."""
+    if kind not in (INTEGRATORS[one] for one in INTEGRATORS.shipped):
+        return numbers
+    table = {key: one.item() if hasattr(one, "item") else one for key, one in numbers.items()}
+    data = {"dynamics": {"kind": kind.name, **table}}
+    return checked(DynamicsAlone, data, Source(where, Path(), where)).dynamics.model_dump()
+
+
+def _check_instance(integrator: Integrator, units: Units, where: str) -> None:
+    """Check the numbers of an integrator object, as those of a system file are checked, and in its units.
+
+    Raises:
+        InputError: a number is not a finite float64 scalar or out of range.
+    """
+    keys, numbers = integrator.keys(), {}
+    for key in integrator.numbers():
+        value = getattr(integrator, keys[key].name)
+        if np.shape(value) or getattr(value, "dtype", None) != np.float64 or not np.isfinite(value):
+            seen = (
+                f"{value!r} in {type(integrator).__name__}; expected a finite number, jax.numpy.float64(...)"
+            )
+            raise InputError(seen, where=f"dynamics.{key}")
+        numbers[key] = integrator.number(key, units)
+    if numbers["timestep"] <= 0:
+        message = f"a time step of {numbers['timestep']:.6g} {units.time}; expected a number above 0"
+        raise InputError(message, where="dynamics.timestep")
+    words = {key: getattr(integrator, one.name) for key, one in keys.items() if one.metadata.get("static")}
+    _validated(type(integrator), numbers | words, where)
 
 
 def of_atoms(atoms: Atoms, model: Any, compare: str = "r <", units: str = "metal") -> Simulation:

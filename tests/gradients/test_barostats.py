@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase.build import bulk
+from ensembles import kinds
 from gradient_problems import everything
 from moving_box import Piston, Sheared, Strained
 from rollout.harness import liquid
@@ -25,16 +26,7 @@ from mdnum.gradients.recorded import EventAware, Symmetric
 from mdnum.systems import build
 from mdnum.systems.simulation import Simulation
 
-TAU: dict[str, Any] = {"relaxation": 0.2}
-BOX = TAU | {"pressure_relaxation": 0.5, "pressure": 5.0}
-SOFT = BOX | {"compressibility": 0.05}
-KINDS: dict[str, tuple[Any, dict[str, Any]]] = {
-    "nose-hoover": ("nose-hoover", TAU),
-    "csvr": ("csvr", TAU),
-    "mtk": ("mtk", BOX),
-    "mtk full": ("mtk", BOX | {"box": "full"}),
-    "cell-rescaling": ("cell-rescaling", SOFT),
-    "cell-rescaling full": ("cell-rescaling", SOFT | {"box": "full"}),
+KINDS: dict[str, tuple[Any, dict[str, Any]]] = kinds(0.2, 0.5, 0.05, pressure=5.0) | {
     "strained": (Strained, {"stretch": -0.25, "shear": 0.4}),
     "sheared": (Sheared, {"pressure": 8.0, "stiffness": 0.02}),
 }

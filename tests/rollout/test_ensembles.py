@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from ase.md.nose_hoover_chain import MTKNPT, IsotropicMTKNPT, NoseHooverChainNVT
 from ase.units import kB
+from ensembles import kinds
+from forks.harness import made as made_of
 from rollout.harness import run
 from rollout.test_resume import assert_goes_on
 from scipy import stats
@@ -18,6 +20,7 @@ from scipy.linalg import expm
 
 import mdnum
 from mdnum.errors import InputError
+from mdnum.forks.choices import parse, unavailable
 from mdnum.md.barostats import exponential, growth
 from mdnum.md.integrators import Integrator, quantity
 from mdnum.md.thermostats import rescaled
@@ -28,18 +31,7 @@ from mdnum.store import RunFolder
 
 ARGON = mdnum.LennardJones(sigma=3.405, epsilon=0.0103235)
 CUT = mdnum.Cut("quintic", 6.0)
-TAU: dict[str, Any] = {"relaxation": 0.1}
-BOX = TAU | {"pressure_relaxation": 0.3}
-SOFT = BOX | {"compressibility": 2.0}
-#: Each integrator, with its numbers.
-KINDS = {
-    "nose-hoover": ("nose-hoover", TAU),
-    "csvr": ("csvr", TAU),
-    "mtk": ("mtk", BOX),
-    "mtk full": ("mtk", BOX | {"box": "full"}),
-    "cell-rescaling": ("cell-rescaling", SOFT),
-    "cell-rescaling full": ("cell-rescaling", SOFT | {"box": "full"}),
-}
+KINDS = kinds(0.1, 0.3, 2.0)
 
 
 def fluid(repeat: int = 3, seed: int = 1, tilt: float = 0.0):
@@ -99,6 +91,34 @@ def by_ase(kind: str, simulation: mdnum.Simulation, atoms, steps: int):
             dynamics.step()
         v = atoms.get_velocities()
         yield atoms.positions, v, atoms.cell.array, dynamics.get_conserved_energy()
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("csvr", ("relabel", "rotate=y-zx")),
+        pytest.param("cell-rescaling", ("relabel", "rotate=y-zx"), marks=pytest.mark.nightly),
+        pytest.param("cell-rescaling full", ("relabel",), marks=pytest.mark.nightly),
+    ],
+)
+def test_noise_that_all_atoms_share_leaves_a_relabeled_or_rotated_run_the_same(kind, words):
+    """Velocities and heat of ten steps, to rounding."""
+    a = rows(held(kind), 10)
+    largest = np.abs(a["v"]).max()
+    assert np.ptp(a["heat"]) > 0.01
+    for word in words:
+        twin = made_of(word, held(kind))
+        b = rows(twin.b.simulation, 10)
+        assert np.abs(b["v"][0] - a["v"][0]).max() > largest
+        back = twin.b.frame.vectors(b["v"].transpose(0, 2, 1)).transpose(0, 2, 1)
+        assert np.abs(back - a["v"]).max() < 1e-11 * largest
+        assert b["heat"] == pytest.approx(a["heat"], abs=1e-9)
+
+
+def test_noise_of_a_full_box_belongs_to_its_axes():
+    reason = unavailable(parse("rotate=y-zx"), held("cell-rescaling full"))
+    assert reason is not None and "belongs to axes" in reason
+    assert unavailable(parse("relabel"), held("cell-rescaling full")) is None
 
 
 @pytest.mark.parametrize("kind", ["nose-hoover", "mtk", "mtk full"])
@@ -255,7 +275,7 @@ NUMBERS: dict[str, Any] = {"relaxation": 0.1, "pressure_relaxation": 0.3}
         ({"dynamics": NUMBERS | {"chain": 0}}, "dynamics.chain"),
         ({"temperature": 0.0}, "dynamics.temperature"),
         ({"integrator": "mkt"}, "mtk"),
-        ({"integrator": "csvr", "dynamics": TAU}, "'pressure'"),
+        ({"integrator": "csvr", "dynamics": KINDS["csvr"][1]}, "'pressure'"),
         ({"pbc": (True, True, False)}, "mtk .*c is free"),
         ({"precision": PrecisionPolicy(state="lattice")}, "not mtk"),
     ],

@@ -22,6 +22,23 @@ from numba import njit
 SIGMAS = 5.0
 
 
+def kinds(
+    relaxation: float, pressure_relaxation: float, compressibility: float, **numbers: float
+) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Each thermostat and barostat: its name and its keys, with further numbers of the barostats."""
+    tau: dict[str, Any] = {"relaxation": relaxation}
+    box = tau | {"pressure_relaxation": pressure_relaxation} | numbers
+    soft, full = box | {"compressibility": compressibility}, {"box": "full"}
+    return {
+        "nose-hoover": ("nose-hoover", tau),
+        "csvr": ("csvr", tau),
+        "mtk": ("mtk", box),
+        "mtk full": ("mtk", box | full),
+        "cell-rescaling": ("cell-rescaling", soft),
+        "cell-rescaling full": ("cell-rescaling", soft | full),
+    }
+
+
 class Judgment(NamedTuple):
     """A number of a run beside the one that it should be."""
 

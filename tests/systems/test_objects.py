@@ -17,7 +17,9 @@ from command_line import call
 import mdnum
 from mdnum import systems
 from mdnum.errors import InputError
+from mdnum.md.integrators import Langevin, VelocityVerlet
 from mdnum.md.potentials import CutPotential
+from mdnum.md.thermostats import CSVR, NoseHooverChain
 from mdnum.store import RunFolder
 from mdnum.systems import load, toml
 from mdnum.systems.describe import by_pair, described, reduction_word
@@ -55,6 +57,19 @@ temperature = 900
 def morse(r, depth, alpha, r0):
     e = jnp.exp(-alpha * (r - r0))
     return depth * (e * e - 2 * e)
+
+
+class Own(mdnum.Integrator):
+    """One of a user, with a number that may be negative."""
+
+    name = "own"
+    wind: jax.Array
+
+    def finish(self, v, extra, at, time):
+        return v + time * at.acceleration, extra
+
+    def begin(self, x, v, extra, at):
+        return x, v + self.wind, extra, jnp.zeros(())
 
 
 def same(a, b):
@@ -235,6 +250,43 @@ def test_what_does_not_fit_together_is_one_line(change, message):
     atoms = bulk("Cu", "fcc", a=3.615, cubic=True).repeat(5)
     with pytest.raises(InputError, match=message):
         mdnum.simulation(atoms, given["potential"](), given["cutoff"], timestep=given["timestep"])
+
+
+def object_of(kind, timestep=0.2, **numbers):
+    """An integrator object with plain numbers, in internal units."""
+    numbers = {"timestep": timestep} | numbers
+    numbers = {key: jnp.float64(one) if isinstance(one, float) else one for key, one in numbers.items()}
+    return kind(**numbers, **({"key": jax.random.key(0)} if kind in (Langevin, CSVR) else {}))
+
+
+@pytest.mark.parametrize(
+    ("kind", "numbers", "message"),
+    [
+        (VelocityVerlet, {"timestep": -0.2}, r"timestep: .*-0\.00203\d* ps.*above 0"),
+        (VelocityVerlet, {"timestep": np.nan}, r"timestep: .*nan.*finite"),
+        (VelocityVerlet, {"timestep": np.float32(0.2)}, r"timestep: .*0\.2.*float64"),
+        (Langevin, {"friction": -1.0, "kT": 0.01}, r"friction = -98\.2.*above 0"),
+        (NoseHooverChain, {"kT": 0.0, "relaxation": 1.0}, r"temperature = 0.0.*above 0"),
+        (NoseHooverChain, {"kT": np.ones(2), "relaxation": 1.0}, r"temperature: .*1\., 1.*finite number"),
+        (NoseHooverChain, {"kT": 0.01, "relaxation": 1.0, "chain": 0}, r"chain = 0.*at least 1"),
+        (CSVR, {"kT": 0.01, "relaxation": -1.0}, r"relaxation = -0\.0101.*above 0"),
+        (Own, {"timestep": 0.0, "wind": 3.0}, r"timestep: .* 0 ps.*above 0"),
+        (Own, {"wind": np.inf}, r"wind: .*inf.*finite"),
+        (Own, {"wind": -3.0}, None),
+        (CSVR, {"kT": 0.01, "relaxation": 1.0}, None),
+    ],
+)
+def test_the_numbers_of_an_integrator_object_are_checked_as_those_of_a_file(kind, numbers, message):
+    atoms = bulk("Cu", "fcc", a=3.615, cubic=True).repeat(5)
+    given = (atoms, mdnum.Morse(**MORSE), mdnum.Cut("switched", 6.0))
+    made = object_of(kind, **numbers)
+    if message is None:
+        assert isinstance(mdnum.simulation(*given, integrator=made).integrator, kind)
+        with pytest.raises(InputError, match="pressure, timestep"):
+            mdnum.simulation(*given, integrator=made, timestep=0.002, pressure=1.0)
+    else:
+        with pytest.raises(InputError, match=rf"dynamics\.{message}"):
+            mdnum.simulation(*given, integrator=made)
 
 
 def test_a_potential_of_many_bodies_follows_the_periodicity_of_the_atoms_and_the_precision():

@@ -74,8 +74,8 @@ class Relabel(Summed):
         check(self.seed >= 0, f"seed {self.seed} is negative", "relabel")
 
     def make(self, system: Simulation) -> Twin:
-        still = system.integrator.random is None
-        applies(still, "the thermostat's noise belongs to labels: other atoms would get it")
+        shared = "atoms" not in system.integrator.noise_belongs_to
+        applies(shared, "the thermostat's noise belongs to labels: other atoms would get it")
         applies(not (system.pairwise and system.model.weights), "the atoms' weights belong to labels")
         a = summed(system, self.both)
         labels = np.random.default_rng(self.seed).permutation(a.atoms)
@@ -115,8 +115,8 @@ class Rotate(Summed):
         )
 
     def make(self, system: Simulation) -> Twin:
-        still = system.integrator.random is None
-        applies(still, "the thermostat's noise belongs to axes: others would get it")
+        shared = "axes" not in system.integrator.noise_belongs_to
+        applies(shared, "the noise belongs to axes: others would get it")
         known = _SYMMETRIES if self.axes is None else (self.axes,)
         word = next((word for word in known if _is_symmetry(word, system.structure)), "")
         applies(bool(word), f"the box is not the same with axes {self.axes} in place of xyz")
