@@ -276,6 +276,8 @@ class Recorder:
         """Record the program's own data on an examined frame, in addition to its flips."""
         energy, listed, overflow = self._told.popleft()
         flips, frame = next((rows for rows in new if rows["rule"][0] == 0), _NONE), self._source.now
+        for rows in new:
+            rows["step"] = np.full(len(rows["i"]), frame.index)
         if new and not np.isnan(self._jump):
             flips["energy_jump"] = np.where(flips["entered"], self._jump, -self._jump)
         row: dict[str, Any] = {"listed": -1, "new_list": False, "lost": 0, "deepest": 0.0}
