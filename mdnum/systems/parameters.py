@@ -51,7 +51,7 @@ _UNITS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Parameter:
     """A parameter of a simulation: a number or an array of numbers.
 
@@ -66,6 +66,11 @@ class Parameter:
     value: Float[np.ndarray, "..."]
     unit: str
     by: str
+
+    def __repr__(self) -> str:
+        few = self.value.size <= 3
+        value = f"{self.value.tolist()!r}" if few else f"shape {self.value.shape}"
+        return f"Parameter({value}{self.unit and f' {self.unit}'}{self.by and f', by {self.by}'})"
 
 
 def parameters(simulation: Simulation) -> dict[str, Parameter]:

@@ -483,11 +483,14 @@ def _rule_told(
 
     for part, parts, history in histories(folder, number, found.frames):
         total, stays = Statistics.of(history, labels, one.rule.directed, window, total)
-        append("contacts", vars(stays))
-        if residues is not None:
+        if residues is None:
+            append("contacts", vars(stays))
+        else:
+            times = np.append(frames["time"][frames["rule"] == number], np.nan)
+            when = {"time": times[stays.begin], "time_end": np.where(stays.ended, times[stays.end], np.nan)}
+            append("contacts", {**vars(stays), **when, **_both(table, stays)})
             pairs = Occupancy.of(stays, found.frames)
-            words = {name: _words(table, end) for name, end in (("first", pairs.i), ("second", pairs.j))}
-            append("occupancy", {**vars(pairs), **words})
+            append("occupancy", {**vars(pairs), **_both(table, pairs)})
             begin, now = contacts_over_time(stays, len(table), found.frames)
             moments = now if moments is None else moments + now
         log(part + 1, parts, {"phase": "counting contacts", "unit": "parts"})
@@ -566,9 +569,23 @@ def _counted(
 
 
 def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
-    """Name atoms as "GLY 12 CA" (or by atom name if there are no residues), and residues as "GLY 12"."""
-    rows = ((table.residue_names[at], table.residue_ids[at], table.names[at]) for at in atoms)
-    return [f"{residue} {number} {name}".rstrip() if residue else str(name) for residue, number, name in rows]
+    """Name atoms as "GLY 12 CA" (or by atom name if there are no residues), and residues as "GLY 12".
+
+    Where there are several segments, theirs is in front: "A GLY 12".
+    """
+    several = len(set(table.segments.tolist())) > 1
+    columns = (table.segments, table.residue_names, table.residue_ids, table.names)
+    rows = (tuple(one[at] for one in columns) for at in atoms)
+    return [
+        f"{segment if several else ''} {residue} {number} {name}".strip() if residue else str(name)
+        for segment, residue, number, name in rows
+    ]
+
+
+def _both(table: AtomTable, pairs: Any) -> dict[str, Any]:
+    """Return the columns with the names of both atoms or residues of each pair."""
+    named = np.array(_words(table, np.arange(len(table))), object)
+    return {"first": named[pairs.i], "second": named[pairs.j]}
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:

@@ -128,7 +128,8 @@ def _of_rules(view: FlipsView) -> Iterator[Finding]:
     for code, several in by_code.items():
         worst = min(several, key=lambda one: _ORDER.index(one.severity))
         title = worst.title if len(several) == 1 else f"{worst.title} ({worst.values['rule']})"
-        texts = [*(one.text for one in several), TEXTS.entries[code].get("why", "")]
+        why = ["why", *["why_grid"] * any(one["grid"] for one in view.summary["rules"])]
+        texts = [*(one.text for one in several), *(TEXTS.entries[code].get(one, "") for one in why)]
         yield replace(worst, title=title, text=" ".join(filter(None, texts)))
 
 
@@ -340,12 +341,13 @@ def _rule_sections(view: FlipsView, place: int, one: Rule) -> Iterator[Section]:
     for title, plot in _plots(view, place, one) if place < _DRAWN else ():
         plots.setdefault(title, []).append(plot)
 
-    def section(title: str, *parts: Any, level: Any = 3) -> Section:
-        return Section(_title(title, view, one), [*parts, *plots.get(title, [])], level=level)
+    def section(title: str, *parts: Any, level: Any = 3, terminal: bool = False) -> Section:
+        parts = (*parts, *plots.get(title, []))
+        return Section(_title(title, view, one), list(parts), level=level, terminal=terminal)
 
     yield section("Pairs and flips", pairs(_numbers(view, one)), level=2)
     if view.by_residue and (lasting := _lasting(view, place)) is not None:
-        yield section("Contacts between residues", lasting)
+        yield section("Contacts between residues", lasting, terminal=True)
     yield section("How long contacts last", pairs(_lifetimes(view, one)))
     lost = list(_lost(view, one))
     yield section("Between the frames", *([pairs(lost)] if lost else []))

@@ -123,6 +123,14 @@ def test_hydrogens_and_virtual_sites_are_left_out_unless_they_are_wanted(
     found = mdnum.flips(pair, cutoffs=4.5, by="residue", hydrogens=hydrogens, out=tmp_path / "out")
     stays = found.table("contacts").to_pandas()
     assert (stays.begin.tolist(), stays.end.tolist()) == (formed, last)
+    assert stays[["first", "second"]].drop_duplicates().to_numpy().tolist() == [["ALA 7", "GLY 9"]]
+    times = found.table("frames").to_pandas().time
+    assert stays.time.tolist() == times[formed].tolist()
+    assert stays.time_end.tolist() == [
+        times[end] if end < 7 else pytest.approx(np.nan, nan_ok=True) for end in last
+    ]
+    (printed,) = (one for one in found.page.sections if one.title == "Contacts between residues")
+    assert printed.terminal
     assert found.summary["left_out"] == ({} if hydrogens else {"hydrogens": 2, "virtual sites": 2})
     assert ("2 hydrogens" in " ".join(found.verdict.evidence)) is not hydrogens
     flips = found.table("flips").to_pandas()

@@ -46,7 +46,7 @@ def peer(*names: str, helpers: Sequence[Any] = ()) -> Callable[[Any], Any]:
         for name in names:
             declared = _declared(name)
             given, call = declared.pop("given", {}), made.__name__
-            about = declared.pop("about", (inspect.getdoc(made) or "").partition("\n")[0].rstrip("."))
+            about = declared.pop("about")
             called = functools.partial(made, **given) if given else made
             if given:
                 arguments = ", ".join(f"{word}={value!r}" for word, value in given.items())
