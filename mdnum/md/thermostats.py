@@ -151,10 +151,13 @@ class CSVR(Integrator):
     """
 
     name = "csvr"
-    noise_belongs_to = ()
     kT: Float[Array, ""] = quantity("temperature")
     relaxation: Float[Array, ""] = quantity("time")
     key: Array = quantity("seed")
+
+    @property
+    def noise_belongs_to(self):
+        return ()
 
     def begin(self, x, v, extra, at):
         kinetic, key = self.kinetic(v, at.masses), jax.random.fold_in(self.key, at.step)
