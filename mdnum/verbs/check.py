@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 TEXTS, RUN_TEXTS = Texts(__file__), Texts(Path(__file__).with_name("run.py"))
 # ratio of temperatures from which on the one of a structure is another than the one requested
 _OTHER = 3.0
+# thermal motion along an axis in a time step that is too long, over the mean distance between atoms
+_FAST = 0.1
 
 
 @dataclass(frozen=True)
@@ -106,16 +108,23 @@ def structure_findings(system: System) -> Iterator[Finding]:
     frame = Frame(0, 0.0, atoms.positions, Box(np.asarray(atoms.cell), np.asarray(atoms.pbc)))
     if (far := far_out(frame)) is not None:
         yield TEXTS.finding("ATOM_FAR", atom=far[0], why=far[2])
-    draw = system.draw
+    draw, units, masses = system.draw, system.units, atoms.get_masses()
+    temperature = draw.temperature
     if not draw.drawn:
-        masses = system.atoms.get_masses()
-        velocities = draw.velocities(masses, system.units, system.atoms.get_velocities())
+        velocities = draw.velocities(masses, units, atoms.get_velocities())
         twice = float((masses[:, None] * velocities**2).sum())
-        temperature = twice / (3 * len(masses) * system.units.k_B)
-        unit = system.units.temperature
-        yield from temperature_findings(temperature, draw.temperature, len(masses), unit)
+        temperature = twice / (3 * len(masses) * units.k_B)
+        yield from temperature_findings(temperature, draw.temperature, len(masses), units.temperature)
     elif names := system.ignored:
         yield TEXTS.finding("VELOCITIES_IGNORED", names=listed([f"“{name}”" for name in names]))
+    if all(atoms.pbc):
+        timestep, spacing = system.spec.dynamics.timestep, (atoms.get_volume() / len(atoms)) ** (1 / 3)
+        temperature = max(temperature, draw.temperature)
+        moved = timestep * units.time_factor * math.sqrt(units.k_B * temperature / masses.min())
+        if moved > _FAST * spacing:
+            values = {"timestep": timestep, "temperature": temperature, "moved": moved, "spacing": spacing}
+            names = {"time": units.time, "length": units.length, "degree": units.temperature}
+            yield TEXTS.finding("TIME_STEP_LONG", **values, **names)
 
 
 def temperature_findings(start: float, requested: float, atoms: int, unit: str) -> Iterator[Finding]:

@@ -95,6 +95,19 @@ def test_what_was_not_requested_or_is_chance_is_none(tmp_path: Path) -> None:
     assert "times as large" not in zero.text
 
 
+@pytest.mark.parametrize(("units", "limit"), [("metal", 0.1 * 3.4 / 1.4), ("lj", 0.1 * 1.01)])
+def test_a_time_step_in_which_atoms_fly_too_far_is_a_warning(
+    tmp_path: Path, units: str, limit: float
+) -> None:
+    """Argon at 94.4 K, 1.4 Å/ps along an axis and 3.4 Å apart; at a temperature of one, 1 σ/τ and 1.01 σ."""
+    path = made(tmp_path, units=units, temperature=94.4 if units == "metal" else 1.0)
+    for factor, odd in ((0.7, False), (1.4, True)):
+        found = structure_findings(systems.load(path, {"dynamics.timestep": str(factor * limit)}))
+        assert [one.code for one in found] == ["TIME_STEP_LONG"] * odd
+    for name in systems.names("md") if units == "lj" else ():
+        assert "TIME_STEP_LONG" not in [one.code for one in structure_findings(systems.load(name))]
+
+
 @pytest.mark.parametrize("column", ["velo", "vel", "velocities", "Velocity"])
 def test_velocities_of_another_name_are_said_to_be_ignored(tmp_path: Path, column: str) -> None:
     path = made(tmp_path, actual=94.4, column=column)
