@@ -122,9 +122,10 @@ def structure_findings(system: System) -> Iterator[Finding]:
         temperature = max(temperature, draw.temperature)
         moved = timestep * units.time_factor * math.sqrt(units.k_B * temperature / masses.min())
         if moved > _FAST * spacing:
-            values = {"timestep": timestep, "temperature": temperature, "moved": moved, "spacing": spacing}
-            names = {"time": units.time, "length": units.length, "degree": units.temperature}
-            yield TEXTS.finding("TIME_STEP_LONG", **values, **names)
+            yield TEXTS.finding(
+                "TIME_STEP_LONG", timestep=timestep, temperature=temperature, moved=moved, spacing=spacing,
+                time=units.time, length=units.length, degree=units.temperature,
+            )  # fmt: skip
 
 
 def temperature_findings(start: float, requested: float, atoms: int, unit: str) -> Iterator[Finding]:
