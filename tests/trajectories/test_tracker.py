@@ -362,7 +362,7 @@ def test_positions_that_are_no_numbers():
     # what was read before is still there, and an atom that takes no part may be anywhere
     assert tracker.frames == 1 and tracker.pairs == 1
     assert len(tracker.step(Frame(18, 0.0, shifted(x, (2, 0), np.inf), box))) == 0
-    with pytest.raises(InputError, match="frame 19: .*5 atoms.* 4"):
+    with pytest.raises(InputError, match=r"frame 19: .*5 atoms.* 4"):
         tracker.step(Frame(19, 0.0, np.zeros((5, 3)), box))
 
 
