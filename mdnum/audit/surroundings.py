@@ -489,11 +489,7 @@ def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int)
 def _permuted(
     subject: CalculatorSubject, walk: PairWalk, radius: float, count: int, aside: bool = False
 ) -> tuple[float, float] | None:
-    """Return the changes of energy and force on reordering the atoms; None if rounding explains them.
-
-    Args:
-        aside: move the last neighbor out of reach of all others.
-    """
+    """Return the changes of energy and force on reordering the atoms; None if rounding explains them."""
     atoms, _ = cluster(walk.pair, radius, count)
     if aside:
         atoms.positions[-1] += 3 * (atoms.positions[-1] - atoms.positions[0])

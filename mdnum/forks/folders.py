@@ -316,11 +316,7 @@ def _ball_dates(first: RunFolder, second: RunFolder) -> dict[str, Any]:
 
 
 def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], where: str) -> list[Difference]:
-    """List how the atoms of two runs differ at step 0.
-
-    Raises:
-        InputError: the atoms or the boxes belong to different systems.
-    """
+    """List how the atoms of two runs differ at step 0."""
     from ase import Atoms
     from ase.io import read
 

@@ -426,14 +426,7 @@ def _ask(
     timeout: float | None = None,
     settings: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Run a process that answers a question; return the reason for a failure, or "".
-
-    Args:
-        file: file to which the question is written.
-        heard: called with each line that the process prints.
-        timeout: time limit in seconds.
-        settings: environment variables of the process.
-    """
+    """Run a process that answers a question; return the reason for a failure, or ""."""
     file.write_text(json.dumps(question))
     command, late = python("-m", "mdnum.forks.processes", str(file)), []
     # what it prints on stderr may be long, and nobody reads a pipe meanwhile

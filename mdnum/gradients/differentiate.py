@@ -118,11 +118,7 @@ def _chosen(problem: Problem, names: Sequence[str], word: Method | str) -> tuple
 
 
 def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) -> Gradient:
-    """Compute the gradient, and warn of a derivative that is exactly zero: training loops do not show notes.
-
-    Raises:
-        NumericalError: the gradient is not finite; the error names the first operation at fault, if known.
-    """
+    """Compute the gradient; warn of a derivative that is exactly zero, as training loops show no notes."""
     found = chosen(problem, names)
     for name, value in found.gradient.items():
         if not np.any(np.asarray(value)):
@@ -146,11 +142,7 @@ def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) ->
 
 
 def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return the values of parameters by full name.
-
-    Raises:
-        InputError: a value was given for a parameter that is not among those to differentiate by.
-    """
+    """Return the values of parameters by full name."""
     out = {}
     for word, value in values.items():
         (name,) = parameters.resolve(problem.simulation, [word])

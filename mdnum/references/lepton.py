@@ -190,11 +190,7 @@ class Lepton(ClassicalCalculator):
 
 
 def _ran(script: str, data: str) -> tuple[np.ndarray, np.ndarray]:
-    """Run LAMMPS; return the total energy and pressures, and a table with a row for each atom.
-
-    Raises:
-        InputError: LAMMPS failed; the message includes its error.
-    """
+    """Run LAMMPS; return the total energy and pressures, and a table with a row for each atom."""
     with TemporaryDirectory() as place:
         folder = Path(place)
         (folder / "in.data").write_text(data)

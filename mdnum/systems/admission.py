@@ -87,12 +87,7 @@ def _examine(trial: Trial) -> None:
 
 
 def _resolve(trial: Trial) -> None:
-    """Find which box the function uses, and whether its positions are real or fractional.
-
-    Raises:
-        AdmissionError: values are not finite, the function uses another box than the simulation's or ignores
-            the box, or its input cannot be strained.
-    """
+    """Find which box the function uses, and whether its positions are real or fractional."""
     how = trial.call.how
     words = ("cell",) if how.native else how.keywords
     paired, periodic = ((trial.inside < trial.n).any(), trial.pbc.any())

@@ -289,12 +289,7 @@ def cut(
 
 
 def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequence[str]) -> None:
-    """Check that a user's function can be called, is smooth across its cutoff, and is symmetric in a pair.
-
-    Raises:
-        InputError: a check fails; the message has the function's error, or the pair, a distance and both
-            energies.
-    """
+    """Check that a user's function can be called, is smooth across its cutoff, and is symmetric in a pair."""
     here = potential.typed
     is_pair = lambda leaf: isinstance(leaf, tuple)  # noqa: E731
     other = here.with_leaves(

@@ -393,11 +393,7 @@ def _changed(before: Frame, after: Frame) -> float:
 
 
 def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
-    """Concatenate the results of all parts; frame numbers count from the first frame of the first part.
-
-    Raises:
-        InputError: two processes found different pairs at a shared frame, because the file changed meanwhile.
-    """
+    """Concatenate the results of all parts; frame numbers count from the first frame of the first part."""
     tables, done, last = [FlipTable.none()], 0, None
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):

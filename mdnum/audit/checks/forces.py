@@ -361,9 +361,6 @@ def _two_energies(
 
     All other checks examine `free_energy`, of which the forces are the gradient by ASE's definition; if the
     two energies differ by at most a constant, the findings hold for both.
-
-    Args:
-        along: derivative along `line`, a displacement per Å of a structure away from thresholds.
     """
     free, logged = subject.energies(atoms)
     if logged is None:
