@@ -17,7 +17,7 @@ from mdnum.ball.step import BallDecisions, BallState, EventLocated, ImplicitMidp
 from mdnum.ball.stopping import Reason
 from mdnum.ball.world import World
 from mdnum.bits import changes_in_time
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_at_least
 from mdnum.numerics.events import Ledger
 from mdnum.numerics.forked import check_not_forked
 from mdnum.numerics.rounding import gamma
@@ -139,8 +139,7 @@ def simulate(
         InputError: steps is below 1.
     """
     check_not_forked()
-    if steps < 1:
-        raise InputError(f"steps = {steps}; expected at least 1")
+    expect_at_least(1, steps=steps)
     balls = start.y.shape[0]
     chunk = max(1, min(steps, _CHUNK // max(balls, 1)))
     # one compiled program for runs that decide by themselves, under pins, and under another's decisions

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Inexact
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_at_least
 from mdnum.gradients import parameters
 from mdnum.gradients.losses import ComplexPart, Loss, LossFrame
 from mdnum.gradients.tape import RunTape, surroundings
@@ -50,8 +50,7 @@ class Problem:
     parts: tuple[Problem, ...] = field(default=(), init=False, repr=False, compare=False)
 
     def __post_init__(self):
-        if self.steps < 1:
-            raise InputError(f"steps = {self.steps}; expected at least 1")
+        expect_at_least(1, steps=self.steps)
         # a state that the integrator has no steps for is refused before anything is run
         assert self.simulation.propagator is not None
         if not self.loss.looks_at(np.arange(self.steps + 1), self.steps).any():

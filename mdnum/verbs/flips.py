@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from mdnum.errors import InputError, MdnumError, expect_path
+from mdnum.errors import InputError, MdnumError, expect_at_least, expect_path
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream, as_numpy
 from mdnum.verbs.flips_page import judge, page
@@ -120,8 +120,7 @@ def flips(
     from mdnum.trajectories.arrays import ArrayFrames
     from mdnum.trajectories.readers import open_trajectory
 
-    if window < 1:
-        raise InputError(f"window = {window}; expected at least 1 frame")
+    expect_at_least(1, window=window)
     if by not in ("atom", "residue"):
         raise InputError(f"by = {by!r}; expected atom or residue")
     if by == "atom":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, expect_at_least
 from mdnum.forks.worlds import ROLES, program_of, varied
 from mdnum.numerics.verdicts import Growth, growth
 from mdnum.plain import result
@@ -123,8 +123,7 @@ def certify(
     is_ball = isinstance(system, BallSystem)
     own = system.spec.integrator.steps if isinstance(system, BallSystem) else system.steps
     last = own if steps is None else steps
-    if last < 1:
-        raise InputError(f"steps = {last}; expected at least 1", remedy="Request at least one step")
+    expect_at_least(1, steps=last)
     if policies is None:
         policies = BALL_POLICIES if is_ball else MD_POLICIES
     wide = dict.fromkeys(ROLES["ball" if is_ball else "md"], "float64")
