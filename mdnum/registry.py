@@ -165,7 +165,7 @@ class Registry(Generic[T]):
         """
         name, separator, argument = text.strip().partition(self.separator)
         value: Any = self[name]
-        makes = _makes(value)
+        makes = isinstance(value, type) or inspect.isroutine(value)
         if not makes and not separator:
             return value
         arguments = (argument,) if separator else ()
@@ -190,10 +190,6 @@ class Registry(Generic[T]):
     def package(self, name: str) -> str:
         """Return the package that provides the value of this name."""
         return "mdnum" if name in self._own else _package(self._added()[name])
-
-
-def _makes(value: object) -> bool:
-    return isinstance(value, type) or inspect.isroutine(value)
 
 
 def _package(point: metadata.EntryPoint) -> str:

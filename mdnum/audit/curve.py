@@ -281,9 +281,11 @@ def _outliers(
     sums = np.array([*noise, 2 * noise[0] + (places[1] - places[0]) * noise[1]])
     # (row, interval of its first value, what rounding leaves of it, times the usual that stand out)
     rows = [(row, 3, 64 * least, _OUTLIER) for row, least in zip(_mismatch(curve, places), sums, strict=True)]
-    rows += [
-        (row, 4, 900 * least, _STANDS_OUT) for row, least in zip(_eighth(curve, places), noise, strict=True)
-    ]
+    # eighth differences of energy and force, the smaller of the two centered on an interval's endpoints: on a
+    # repulsive wall they are a hundredth of the mismatch; a step and the rounding error are amplified alike
+    eighth = np.abs(np.lib.stride_tricks.sliding_window_view(curve.many(places), 9, axis=1) @ _EIGHTH)
+    eighth = np.minimum(eighth[:, :-1], eighth[:, 1:])
+    rows += [(row, 4, 900 * least, _STANDS_OUT) for row, least in zip(eighth, noise, strict=True)]
     kept: dict[int, float] = {}
     smallest = np.full(len(places) - 1, np.inf)
     for number, (values, first, least, times) in enumerate(rows):
@@ -298,16 +300,6 @@ def _outliers(
                 kept[first + k] = max(kept.get(first + k, 0.0), value / usual)
     ranked = sorted(((ratio, k) for k, ratio in kept.items()), reverse=True)
     return [(ratio, float(places[k]), float(places[k + 1])) for ratio, k in ranked], smallest
-
-
-def _eighth(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "2 intervals"]:
-    """Eighth differences of energy and force: the smaller of the two centered on an interval's endpoints.
-
-    On a repulsive wall, eighth differences are a hundredth of the mismatch of two cubics; a step and the
-    rounding error are amplified by the same factor.
-    """
-    differences = np.abs(np.lib.stride_tricks.sliding_window_view(curve.many(places), 9, axis=1) @ _EIGHTH)
-    return np.minimum(differences[:, :-1], differences[:, 1:])
 
 
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:

@@ -124,7 +124,7 @@ class _Questions(TyperGroup):
 
 def _of_verb(verb: str) -> Any:
     """Create the command of a verb, or the group of its commands."""
-    texts = {name: declared(name) for name in verbs.of_command(verb)}
+    texts = {name: declared(name) for name in verbs.VERBS if name.split()[0] == verb}
     shared = {**_SHARED, **texts[verb].get("shared", {})}
     if "group" not in texts[verb]:
         return _command(verb, verb, texts[verb]["command"], shared)
@@ -266,11 +266,7 @@ def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any
 
 
 def _refuse_new(said: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-    """Raise an error for values that a resumed folder already contains.
-
-    Raises:
-        InputError: an argument or option that is only for a new run was given.
-    """
+    """Raise an error for values that a resumed folder already contains."""
     from mdnum.verbs.frame import refuse
 
     labels = {name: one["metavar"].strip("[]") for name, one in said["arguments"].items() if "new" in one}

@@ -61,15 +61,6 @@ def known(name: str) -> bool:
     return name.startswith(("potential.", "cutoff.")) or name == "box.scale"
 
 
-def energy_of_forces(simulation: Simulation) -> Simulation:
-    """Return the system whose energy has the given system's forces as its gradient everywhere.
-
-    A hard cutoff has the same forces as a shifted cutoff, because its energy jump at the cutoff exerts no
-    force: a run samples the ensemble of the shifted energy, whatever energy is reported.
-    """
-    return simulation.with_cutoff("shifted") if isinstance(simulation.cutoff, Hard) else simulation
-
-
 def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], None] | None = None) -> Frames:
     """Evaluate the loss of a recorded run in each frame, with derivatives by the named parameters.
 
@@ -82,7 +73,9 @@ def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], N
     simulation = tape.simulation
     assert isinstance(simulation.force, PairForce)
     onto_total = jax.grad(lambda total: tape.loss.value(total, tape.frames))(tape.total)
-    smooth = energy_of_forces(simulation).force
+    # a hard cutoff has the forces of a shifted one, since its energy jump exerts none: a run samples the
+    # ensemble of the shifted energy, whatever energy is reported
+    smooth = (simulation.with_cutoff("shifted") if isinstance(simulation.cutoff, Hard) else simulation).force
     assert isinstance(smooth, PairForce)
     found: list[Any] = []
     steps, where = [], []

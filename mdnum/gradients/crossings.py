@@ -185,7 +185,9 @@ def onto_crossings(
         pull = met.push.astype(dtype) * _along(met, (onto_v + half * onto_x) / masses.astype(dtype))
         onto_potential, onto_virial = onto_sums
         if squeeze is not None:
-            onto_virial = onto_virial + _of_tensor(squeeze, met.normal)
+            # n · S n for each normal n, where S is a tensor or a number times the unit tensor
+            along = jnp.sum(met.normal * (squeeze @ met.normal), axis=0) if squeeze.ndim else squeeze
+            onto_virial = onto_virial + along
         pull = pull + (onto_potential * met.potential + onto_virial * met.virial).astype(dtype)
     applied = jnp.where(met.kind >= 0, pull, 0)
     along = applied * met.normal.astype(dtype)
@@ -194,11 +196,6 @@ def onto_crossings(
     by_radius = jnp.zeros(types, jnp.float64).at[kind].add(-applied.astype(jnp.float64))
     by_matrix = -(met.images.astype(jnp.float64) @ along.T.astype(jnp.float64))
     return push, -pull.astype(jnp.float64), by_radius, by_matrix
-
-
-def _of_tensor(squeeze, normal):
-    """Return n · S n for each normal n, where S is a tensor or a number times the unit tensor."""
-    return jnp.sum(normal * (squeeze @ normal), axis=0) if squeeze.ndim else squeeze
 
 
 def of_energy(

@@ -34,11 +34,6 @@ class FloatFormat:
         return 2 - 2 ** (self.exponent - 1)
 
     @property
-    def emax(self) -> int:
-        """Exponent of the largest number."""
-        return 1 - self.emin
-
-    @property
     def top(self) -> int:
         """The exponent field of infinity."""
         return 2**self.exponent - 1
@@ -46,7 +41,7 @@ class FloatFormat:
     @property
     def largest(self) -> float:
         """The largest finite number."""
-        return 2.0**self.emax * (2.0 - 2.0 ** (1 - self.significand))
+        return 2.0 ** (1 - self.emin) * (2.0 - 2.0 ** (1 - self.significand))
 
     @property
     def smallest_normal(self) -> float:
@@ -87,15 +82,6 @@ def format_of(name: str) -> FloatFormat:
     return FORMATS[name]
 
 
-def _spacing(x: Float[Array, "..."], form: FloatFormat) -> Float[Array, "..."]:
-    """Return the spacing of the numbers of a format around x, a power of two; x is float64."""
-    # jnp.frexp has no derivative rule for its exponent; the bits say the same
-    field = (lax.bitcast_convert_type(x, jnp.int64) >> 52) & 0x7FF
-    exponent = jnp.maximum(field - 1023, form.emin) + 1 - form.significand
-    # a power of two from its bits: exact, where exp2 need not be
-    return lax.bitcast_convert_type((jnp.maximum(exponent, -1022) + 1023) << 52, jnp.float64)
-
-
 @jax.custom_jvp
 def _identity_slope(x, rounded):
     return rounded
@@ -112,7 +98,11 @@ def _rounded(x: Float[Array, "..."], name: str, whole: Callable[[Array], Array])
     if form.significand >= 53:
         return x
     wide = lax.stop_gradient(x).astype(jnp.float64)
-    spacing = _spacing(wide, form)
+    # the format's spacing around x: jnp.frexp has no derivative rule for its exponent; the bits say the same
+    field = (lax.bitcast_convert_type(wide, jnp.int64) >> 52) & 0x7FF
+    exponent = jnp.maximum(field - 1023, form.emin) + 1 - form.significand
+    # a power of two from its bits: exact, where exp2 need not be
+    spacing = lax.bitcast_convert_type((jnp.maximum(exponent, -1022) + 1023) << 52, jnp.float64)
     rounded = whole(wide / spacing) * spacing
     rounded = jnp.where(jnp.abs(rounded) > form.largest, jnp.sign(wide) * jnp.inf, rounded)
     return _identity_slope(x, jnp.where(jnp.isfinite(wide), rounded, wide).astype(x.dtype))

@@ -37,7 +37,10 @@ Add = Callable[[jax.Array, jax.Array], jax.Array]
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _summed(reduction: Reduction, terms, zero):
     if zero is None and terms.dtype.itemsize == 2:
-        zero = _data_zero(terms)
+        # a zero that XLA cannot fold: the sign bit of an absolute value
+        integer = integer_of(terms.dtype)
+        bits = lax.bitcast_convert_type(jnp.abs(terms.reshape(-1)[0]), integer)
+        zero = lax.shift_right_logical(bits, jnp.asarray(8 * terms.dtype.itemsize - 1, integer))
     if zero is None:
         return reduction.sum_of(terms, jnp.add)
     return reduction.sum_of(fence(terms, zero), lambda a, b: fence(a + b, zero))
@@ -51,13 +54,6 @@ def _summed_jvp(reduction, primals, tangents):
 
 # called outside of jit, a sum is one program all the same: operation by operation it would take seconds
 _compiled = partial(jax.jit, static_argnums=0)(_summed)
-
-
-def _data_zero(terms: jax.Array) -> jax.Array:
-    """Return a zero that XLA cannot fold: the sign bit of an absolute value."""
-    integer = integer_of(terms.dtype)
-    bits = lax.bitcast_convert_type(jnp.abs(terms.reshape(-1)[0]), integer)
-    return lax.shift_right_logical(bits, jnp.asarray(8 * terms.dtype.itemsize - 1, integer))
 
 
 class Reduction:
@@ -448,14 +444,11 @@ def _place(x: Any) -> int:
     return max(exponent, int(info.minexp)) - info.nmant
 
 
-def _lowest(value: Fraction) -> int:
-    """Return the exponent of the lowest binary digit of a dyadic rational."""
-    numerator, denominator = abs(value.numerator), value.denominator
-    return (numerator & -numerator).bit_length() - denominator.bit_length()
-
-
 def _lost(true: Fraction, kept: Fraction, place: int) -> int:
-    return 0 if true == kept else max(1, place - _lowest(true))
+    numerator = abs(true.numerator)
+    # the exponent of the lowest binary digit of a dyadic rational
+    lowest = (numerator & -numerator).bit_length() - true.denominator.bit_length()
+    return 0 if true == kept else max(1, place - lowest)
 
 
 def _loop(terms: np.ndarray, order: Sequence[int]) -> Iterator[Addition]:

@@ -89,7 +89,7 @@ def reference(subject: Simulation | System) -> Reference:
     if known is None:
         return independent(simulation)
     label, conversion, made = known
-    forms = _forms(simulation)
+    forms = pair_forms(model, simulation.symbols, simulation.decider.compare)
     if len(species) == 1:
         return Reference(label, True, conversion, lambda: made(forms[species[0], species[0]]))
     return Reference(
@@ -128,10 +128,6 @@ def _written_again(model: Any) -> StillingerWeberModel | TersoffModel:
 
 def _objects(subject: Simulation | System) -> Simulation:
     return subject if isinstance(subject, Simulation) else build(subject.without_skin)
-
-
-def _forms(simulation: Simulation) -> dict[tuple[str, str], PairForm]:
-    return pair_forms(simulation.model, simulation.symbols, simulation.decider.compare)
 
 
 #: (label, conversion, calculator) by potential and cutoff.

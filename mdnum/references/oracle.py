@@ -66,19 +66,6 @@ def rounding_bound(
     return 8.0 * unit_roundoff * largest
 
 
-def exact_squared_distance(
-    positions: Positions, cell: Vectors, i: int, j: int, shift: Shift = (0, 0, 0)
-) -> Fraction:
-    """Compute |x_j - x_i + shift @ cell|² of the stored numbers without any rounding."""
-    total = Fraction(0)
-    for axis in range(3):
-        component = Fraction(float(positions[j, axis])) - Fraction(float(positions[i, axis]))
-        for row in range(3):
-            component += int(shift[row]) * Fraction(float(cell[row, axis]))
-        total += component * component
-    return total
-
-
 def exactly_inside(
     positions: Positions, cell: Vectors, i: int, j: int, shift: Shift, r_cut: float, *, closed: bool = False
 ) -> bool:
@@ -86,7 +73,12 @@ def exactly_inside(
 
     In exact arithmetic r < r_cut and r² < r_cut² are equivalent: they differ only through rounding.
     """
-    squared, threshold = exact_squared_distance(positions, cell, i, j, shift), Fraction(float(r_cut)) ** 2
+    squared, threshold = Fraction(0), Fraction(float(r_cut)) ** 2
+    for axis in range(3):
+        component = Fraction(float(positions[j, axis])) - Fraction(float(positions[i, axis]))
+        for row in range(3):
+            component += int(shift[row]) * Fraction(float(cell[row, axis]))
+        squared += component * component
     return squared <= threshold if closed else squared < threshold
 
 

@@ -139,21 +139,17 @@ def _force_loop(system: Simulation) -> Callable[..., Any]:
     def search(positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> Any:
         key = (len(positions), pbc.tobytes(), r_cut)
         if key not in built:
-            built[key] = _variant(system, positions, cell, pbc, r_cut)
+            species = system.structure.numbers
+            if len(positions) != system.atoms:
+                # the pair of species whose radius r_cut is; a pair at the cutoff is far from any core
+                a, b = np.argwhere(_radii(system) == r_cut)[0]
+                species = [system.symbols[a], system.symbols[b]]
+            atoms = Atoms(species, positions=positions, cell=cell, pbc=pbc)
+            built[key] = with_atoms(system, atoms, skin=0.0)
         evaluation = built[key].evaluate(positions, cell, stress=False)
         return np.asarray(evaluation.i), np.asarray(evaluation.j)
 
     return search
-
-
-def _variant(system: Simulation, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> Simulation:
-    """Return the simulation, or one of two atoms with cutoff r_cut, without a skin."""
-    species = system.structure.numbers
-    if len(positions) != system.atoms:
-        # the pair of species whose radius r_cut is; a pair at the cutoff is far from any core
-        a, b = np.argwhere(_radii(system) == r_cut)[0]
-        species = [system.symbols[a], system.symbols[b]]
-    return with_atoms(system, Atoms(species, positions=positions, cell=cell, pbc=pbc), skin=0.0)
 
 
 def _radii(system: Simulation) -> ndarray:

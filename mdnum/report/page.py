@@ -47,7 +47,8 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
             write_text(subfolder(folder.path, "figures") / f"{part.name}.svg", drawing.standalone(image))
             pictures[part.name] = Markup(drawing.inline(image, typeset(part.alt)))
             notes[part.name] = drawing.notes(part)
-    anchors = {section.title: _anchor(section.title) for section in page.sections}
+    titles = [section.title for section in page.sections]
+    anchors = {one: "section-" + re.sub(r"[^a-z0-9]+", "-", one.lower()).strip("-") for one in titles}
     contents = [(each.title, anchors[each.title]) for each in page.sections if each.level == 2]
     names = sorted(each.name for each in folder.path.iterdir() if each.suffix in _LINKED)
     path = folder.path / "report.html"
@@ -84,10 +85,6 @@ def brief(page: Page, verdict: Verdict, path: Path, verb: str) -> str:
 _LINKED = (".parquet", ".py", ".json", ".toml", ".extxyz", ".npz", ".traj")
 
 
-def _anchor(title: str) -> str:
-    return "section-" + re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
-
-
 def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Finding]]]:
     """Return the findings without a cause among the others, each with the findings that it causes."""
     findings = list(findings)
@@ -109,23 +106,20 @@ def _render(template: str, **content: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    # a page may display itself and run only its own script
+    digest = base64.b64encode(hashlib.sha256(_text("report.js").encode()).digest()).decode()
+    policy = (
+        "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; style-src 'unsafe-inline'; "
+        f"script-src 'sha256-{digest}'"
+    )
     environment.filters |= {"typeset": typeset, "heading": heading, "cell": cell}
     environment.filters |= {"kind": lambda part: type(part).__name__}
     environment.globals |= {
         "many": many, "static": STATIC_ROWS, "style": Markup(_text("report.css")),
-        "script": Markup(_text("report.js")), "policy": _policy(), "light": drawing.LIGHT,
+        "script": Markup(_text("report.js")), "policy": policy, "light": drawing.LIGHT,
         "dark": drawing.DARK, "font": Markup(drawing.FONT),
     }  # fmt: skip
     return environment.get_template(template).render(**content)
-
-
-def _policy() -> str:
-    """Return the content security policy: a page may display itself and run only its own script."""
-    digest = base64.b64encode(hashlib.sha256(_text("report.js").encode()).digest()).decode()
-    return (
-        "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; style-src 'unsafe-inline'; "
-        f"script-src 'sha256-{digest}'"
-    )
 
 
 def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:

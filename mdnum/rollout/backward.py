@@ -169,9 +169,10 @@ class BackwardRun:
                 self._leaves, self._structure, tables, self.back, record
             )
             count = int(rows)
-            yield Stretched(
-                last - count + 1, count, _rolled(record, count), table, np.asarray(x_before), self.back
-            )
+            # rows were filled from the end
+            columns: list[Any] = [np.roll(np.asarray(column), count, axis=0) for column in record[:-2]]
+            first, made = last - count + 1, EpochRecord(*columns)
+            yield Stretched(first, count, made, table, np.asarray(x_before), self.back)
             self._engine.give(0, record)
         self._check_bath()
 
@@ -193,9 +194,3 @@ class BackwardRun:
                 f"the reversed run did not retrace the forward run: at step {step} the store of "
                 "discarded bits is not empty"
             )
-
-
-def _rolled(record: EpochRecord, rows: int) -> EpochRecord:
-    """Move the rows that were filled from the end to the front; return a copy on the host."""
-    columns: list[Any] = [np.roll(np.asarray(column), rows, axis=0) for column in record[:-2]]
-    return EpochRecord(*columns)

@@ -213,12 +213,8 @@ class CrossRecorder:
 
 def _times_before(keys: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     """For each key, count its earlier occurrences in the array."""
-    order = np.argsort(keys, kind="stable")
-    ranked = keys[order]
-    starts = np.flatnonzero(np.append(True, ranked[1:] != ranked[:-1])) if len(keys) else np.zeros(0, int)
-    run = np.diff(np.append(starts, len(keys)))
-    times = np.empty(len(keys), np.int64)
-    times[order] = np.arange(len(keys)) - np.repeat(starts, run)
+    order, times = np.argsort(keys, kind="stable"), np.empty(len(keys), np.int64)
+    times[order] = np.arange(len(keys)) - np.searchsorted(keys[order], keys[order])
     return times
 
 

@@ -209,11 +209,6 @@ def empty_record(
     )
 
 
-def inside_of(bits: UInt8[Array, "words atoms"]) -> Int[Array, ""]:
-    """Count the decisions that are yes; each pair has two."""
-    return jnp.sum(jnp.bitwise_count(bits), dtype=jnp.int64)
-
-
 def write_row(record: EpochRecord, row, **values) -> EpochRecord:
     """Write one row of the named columns."""
 
@@ -307,7 +302,8 @@ def run_epoch(
             lambda x: jnp.zeros(shape, jnp.uint8) if held is None else held,
             state.x_before[:, order],
         )
-        inside = inside_of(before)
+        # each pair has two decisions that are yes
+        inside = jnp.sum(jnp.bitwise_count(before), dtype=jnp.int64)
 
     def body(carry):
         step, x, v, images, _, heat, extra, cells, row, _, _, _, largest, record, earlier = carry

@@ -71,12 +71,14 @@ class PressureParts:
                 weighted = simulation.model.weights
                 jump = simulation.jumps_of(i, j)[0] if weighted else self._jumps[kind]
                 r_cut = np.array(simulation.decider.r_cut)[kind]
-                parts["impulsive"] = share * _impulsive(r, r_cut, jump)
+                # the line through two shells inside the cutoff, at the cutoff
+                shell = np.floor((r_cut - r) / (_SHELL * r_cut))
+                line = np.select([shell <= 0, shell == 1], [1.5, -0.5], 0.0)
+                parts["impulsive"] = share * float(np.sum(line * jump)) / _SHELL
         self.samples.append(parts)
 
     def summary(self) -> dict[str, Any] | None:
         """Return means and standard errors in the user's unit, and cutoff corrections; None without samples.
-        samples.
 
         Standard errors assume independent samples; the correction for pairs beyond the cutoff is evaluated at
         the mean volume.
@@ -123,13 +125,3 @@ def _virials(
                 slope = slope * np.asarray(weight)[a] * np.asarray(weight)[b]
             found[name] = float(-2 * np.sum(np.asarray(r2) * slope))
     return found
-
-
-def _impulsive(
-    r: Float[np.ndarray, "pairs"], r_cut: Float[np.ndarray, "pairs"], jump: Float[np.ndarray, "pairs"]
-) -> float:
-    """Sum of r_cut u(r_cut) times the pair density at the cutoff, extrapolated from two shells inside it."""
-    shell = np.floor((r_cut - r) / (_SHELL * r_cut))
-    # the line through both shells, at the cutoff
-    line = np.select([shell <= 0, shell == 1], [1.5, -0.5], 0.0)
-    return float(np.sum(line * jump)) / _SHELL

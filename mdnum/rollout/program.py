@@ -9,7 +9,7 @@ from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, UInt64
+from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
@@ -183,14 +183,17 @@ class MdProgram:
 
     def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
         """Return a run's decisions (see `Program.history`); the default loss is `squared_displacement`."""
-        marks, segment = [], None
+        marks: list[np.uint64] = []
+        segment = None
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
-            marks.append(marks_of(segment))
+            # hashes of the pairs inside at each step, independent of order and neighbor list
+            table, rows = segment.table, segment.rows_of("bits")
+            marks += [fingerprint_of_bits(bits, table.index, table.order)[1] for bits in rows]
         assert segment is not None
         row = segment.rows - 1
         x, images, v = (segment.unsorted(name, row) for name in ("x", "images", "v"))
         x = unwrapped(np.asarray(segment.cell_of(row).matrix), x, images)
-        every = np.concatenate(marks)
+        every = np.array(marks, np.uint64)
         failed = segment.closes if segment.closes in FAILURES else ""
         # a run that failed has no last step for a loss to be of
         value = energy = float("nan")
@@ -235,13 +238,6 @@ class MdProgram:
                 cell = rows.cells[row] if rows.cells else self.simulation.cell
                 return self.simulation.in_row(cell), np.ascontiguousarray(rows.x[row].T)
         return None
-
-
-def marks_of(segment: Segment) -> UInt64[np.ndarray, "rows"]:
-    """Hashes of the pairs inside at each step of a segment, independent of order and neighbor list."""
-    table = segment.table
-    rows = segment.rows_of("bits")
-    return np.array([fingerprint_of_bits(bits, table.index, table.order)[1] for bits in rows], np.uint64)
 
 
 def pair_margin(

@@ -152,7 +152,8 @@ class Rollout:
         for segment in engine.segments():
             if segment.closes in FAILURES:
                 blown = segment
-            kept = _finite_rows(segment)
+            # the last row of a run that blew up is not finite
+            kept = replace(segment, rows=segment.rows - 1) if segment.closes == "blow-up" else segment
             if kept.rows:
                 self._take(kept, interval)
             now = time.perf_counter()
@@ -337,11 +338,6 @@ class Rollout:
             remedy=f"Everything up to step {kept} is in {self.folder.path}. {remedy}",
             folder=self.folder.path,
         )
-
-
-def _finite_rows(segment: Segment) -> Segment:
-    """Return the segment without its last row if this row is not finite."""
-    return replace(segment, rows=segment.rows - 1) if segment.closes == "blow-up" else segment
 
 
 def run(

@@ -475,20 +475,13 @@ class ListHealth:
         self.dangerous += dangerous
         consumed = 2 * epoch.displacement / rule.skin if rule.skin > 0 else np.inf
         values = {
-            "epoch": epoch.epoch,
-            "start": epoch.start,
-            "length": epoch.length,
-            "displacement": epoch.displacement,
+            **{name: getattr(epoch, name) for name in ("epoch", "start", "length", "displacement")},
             "skin_consumed": consumed,
-            "pairs_listed": epoch.pairs_listed,
-            "capacity": epoch.capacity,
-            "occupancy": epoch.occupancy,
+            **{name: getattr(epoch, name) for name in ("pairs_listed", "capacity", "occupancy")},
             "reason": reason,
             "dangerous": dangerous,
             "lost_pairs": len(epoch.lost),
-            "lost_pair_steps": epoch.lost_pair_steps,
-            "first_lost_step": epoch.first_lost_step,
-            "build_ms": epoch.build_ms,
+            **{name: getattr(epoch, name) for name in ("lost_pair_steps", "first_lost_step", "build_ms")},
             # the flip of the `rebuild` channel: how far the skin was overdrawn at the step that follows
             "margin": rule.skin / 2 - epoch.next_displacement if rebuilt else np.nan,
         }

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.md.cell import Cell
-from mdnum.md.ledger import FlipTable
 from mdnum.rollout.compared import PairFlips, ReferenceFrame, in_user_order
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state
 from mdnum.rollout.epoch import Pins
@@ -145,7 +144,9 @@ class Track:
         if self._recorder is not None:
             if self.first_pairs is None:
                 self.first_pairs = self.frame.keys(decided_pairs(self.simulation, segment, 0))
-            self._flips.append(_flips_of(self._recorder.flips(segment), self.frame))
+            made = self._recorder.flips(segment)
+            keys = self.frame.keys_of(made.i, made.j)
+            self._flips.append(PairFlips(made.step, keys, made.entered, made.margin, made.bound))
             self._doubts.append(self._recorder.doubtful(segment))
         self.failed = segment.closes if segment.closes in FAILURES else ""
         self._ahead.append(rows_of(self.simulation, segment, self.frame, self.failed))
@@ -176,12 +177,6 @@ class Track:
         self._doubts = [every[every.step > last]]
         i, j = np.divmod(self.frame.keys_of(taken.i, taken.j), self.simulation.atoms)
         return replace(taken, i=i, j=j)
-
-
-def _flips_of(ledger: FlipTable, frame: ReferenceFrame) -> PairFlips:
-    """Return the columns of a ledger that a comparison needs, in the labels of the first run."""
-    keys = frame.keys_of(ledger.i, ledger.j)
-    return PairFlips(ledger.step, keys, ledger.entered, ledger.margin, ledger.bound)
 
 
 def rows_of(simulation: Simulation, segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:

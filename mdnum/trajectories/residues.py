@@ -67,7 +67,11 @@ class ByResidue:
         chosen = np.union1d(every, every if groups[1] is None else groups[1])
         counts = {"hydrogens": light[chosen], "virtual sites": virtual[chosen]}
         told = {} if hydrogens else {name: int(some.sum()) for name, some in counts.items() if some.any()}
-        return cls(table.residues, of_residues(table), (sides[0], sides[1]), told)
+        at = np.unique(table.residues, return_index=True)[1]
+        names, blank = table.residue_names[at], np.full(len(at), "", object)
+        ids, segments = table.residue_ids[at], table.segments[at]
+        residues = AtomTable(blank, names, names, ids, np.arange(len(at)), segments)
+        return cls(table.residues, residues, (sides[0], sides[1]), told)
 
     @property
     def names(self) -> ResidueNames:
@@ -95,14 +99,6 @@ def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarr
     ]
     dummy = np.isin(table.species.astype(str), ["DUMMY", "EP"])
     return np.isin(table.species.astype(str), ["H", "D"]), np.array(virtual, bool) | dummy
-
-
-def of_residues(table: AtomTable) -> AtomTable:
-    """Return a table with an entry for each residue, whose species is the residue's name."""
-    at = np.unique(table.residues, return_index=True)[1]
-    names, blank = table.residue_names[at], np.full(len(at), "", object)
-    ids, segments = table.residue_ids[at], table.segments[at]
-    return AtomTable(blank, names, names, ids, np.arange(len(at)), segments)
 
 
 class ResidueTracker:

@@ -35,7 +35,7 @@ from mdnum.store import RunFolder
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.topology import AtomTable, Topology, topology_universe
 from mdnum.trajectories.trajectory import Trajectory
-from mdnum.units import METAL, Units
+from mdnum.units import METAL
 from mdnum.units import get as units_named
 
 _NOT_READ = "Columns {} are not read as velocities, which are taken from {} alone."
@@ -54,9 +54,11 @@ class AseFrames(Trajectory):
         return raw
 
     def _of_atoms(self, first: Any) -> AtomTable:
-        """Return the table of atoms of the first frame, and set the units."""
+        """Return the table of atoms of the first frame; set the units, those of ASE or of a run of mdnum."""
         self._timed = "time" in first.info
-        units = _units(self.path)
+        units = METAL
+        if self.path.name == "trajectory.traj":
+            units = units_named(str(RunFolder(self.path.parent).system.get("units", "metal")))
         self.length, self.time = units.length, units.time if self._timed else "frame"
         self._per_time = units.time_factor
         if names := ignored_velocities(first.arrays):
@@ -129,13 +131,6 @@ def format_of(path: Path) -> str:
         message = "neither MDAnalysis nor ASE knows this format"
         remedy = "Name the file by its format (.xtc, .dcd, .extxyz, ...), or convert it"
         raise InputError(message, remedy=remedy, where=str(path)) from error
-
-
-def _units(path: Path) -> Units:
-    """Return the units of the mdnum run that wrote a file; for other files, ASE's Å, with times in ps."""
-    if path.name != "trajectory.traj":
-        return METAL
-    return units_named(str(RunFolder(path.parent).system.get("units", "metal")))
 
 
 # ---- text

@@ -19,7 +19,7 @@ import contextlib
 import importlib.util
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,11 +94,6 @@ def declared(name: str) -> Mapping[str, Any]:
         InputError: the package that adds the entry has no text file.
     """
     return beside(_file(name))
-
-
-def of_command(command: str) -> Iterator[str]:
-    """Yield the entries of `VERBS` that belong to one command of the command line."""
-    return (name for name in VERBS if name.split()[0] == command)
 
 
 def home(kind: str) -> str:

@@ -246,6 +246,7 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
     from mdnum.audit.functions import examined
     from mdnum.gradients import parameters
     from mdnum.gradients.diagnose.trust import NOT_FINITE, UNDECIDED
+    from mdnum.systems.schema import pair_names
 
     agreement, simulation, loss = found.agreement, problem.simulation, problem.loss
     assert agreement is not None
@@ -272,7 +273,10 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
         "parameters": [
             {
                 "name": name, "unit": parameters.unit(simulation, name),
-                "value": brief(parameters.value(simulation, name)), "entries": _entries(simulation, name),
+                "value": brief(parameters.value(simulation, name)),
+                "entries": pair_names(simulation.symbols)
+                if parameters.by(simulation, name) == "pair type"
+                else None,
             }
             for name in names
         ],
@@ -304,15 +308,6 @@ def _not_run(
     rows += [(part, TEXTS(f"left_{part}"), f"--also {part}") for part in ALSO if part not in further]
     rows += [(part, why, "") for part, why in found.failed.items()]
     return [dict(zip(("what", "why", "how"), row, strict=True)) for row in rows]
-
-
-def _entries(simulation: Simulation, name: str) -> list[str] | None:
-    """Return the pair type of each entry of a parameter; None unless it has one entry per pair type."""
-    from mdnum.gradients import parameters
-    from mdnum.systems.schema import pair_names
-
-    of_pairs = parameters.by(simulation, name) == "pair type"
-    return pair_names(simulation.symbols) if of_pairs else None
 
 
 def _keep_arrays(answer: Answer) -> None:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnum.gradients import parameters
-from mdnum.gradients.adjoint import AdjointCarry, StretchReversal, transposed
+from mdnum.gradients.adjoint import StretchReversal, transposed
 from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import GUARD, radial_speed, tape_of, wanted
 from mdnum.gradients.tape import RunTape, TapeStretch, seen_in
@@ -90,7 +90,10 @@ def detective(
     for stretch in tape.backward():
         before = back.carry
         _, trace = back.through(stretch)
-        row = _last_bad(trace, stretch.rows)
+        # the latest row whose cotangents are not finite
+        leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(trace) if is_inexact(leaf)]
+        bad = (row for row in reversed(range(stretch.rows)) if count_bad([leaf[row] for leaf in leaves]))
+        row = next(bad, None)
         if row is None and count_bad(back.carry):
             # what a crossing before the first row of a stretch adds is seen in the carry alone
             row = 0
@@ -100,12 +103,6 @@ def detective(
         if progress is not None:
             progress(tape.steps - stretch.first, tape.steps, "reverse pass")
     return NotFinite()
-
-
-def _last_bad(trace: AdjointCarry, rows: int) -> int | None:
-    """Return the latest row whose cotangents are not finite; None if all are finite."""
-    leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(trace) if is_inexact(leaf)]
-    return next((row for row in reversed(range(rows)) if count_bad([leaf[row] for leaf in leaves])), None)
 
 
 def _in_forward(tape: RunTape) -> NotFinite:

@@ -39,12 +39,8 @@ _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are spread evenly
 
 def movers() -> Iterator[Case]:
     """Yield motion sequences for a kept neighbor list, short sequences first."""
-    for area, scripts in (
-        ("motion", _pairs),
-        ("motion", _many),
-        ("wrapping", _wrapping),
-        ("strain", _strain),
-    ):
+    areas = {_pairs: "motion", _many: "motion", _wrapping: "wrapping", _strain: "strain"}
+    for scripts, area in areas.items():
         yield from (sequence(name, area, path, *rest) for name, path, *rest in scripts())
     yield from _narrow()
     yield from _reuse()
@@ -56,9 +52,9 @@ def sequences() -> Iterator[Case]:
         yield replace(case, skin=0.0)
 
 
-def _two(apart: float, middle: ndarray = _MIDDLE) -> ndarray:
+def _two(apart: float) -> ndarray:
     half = np.array([apart / 2, 0.0, 0.0])
-    return np.array([middle - half, middle + half])
+    return np.array([_MIDDLE - half, _MIDDLE + half])
 
 
 def _beside(apart: float) -> ndarray:
