@@ -317,16 +317,14 @@ def _engineering() -> ScalarFormatter:
 # -- fewer points that look the same: lines keep every peak, points keep every place
 
 
-def thin_line(
-    x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"], bins: int = BINS
-) -> Int[np.ndarray, "kept"]:
+def thin_line(x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"]) -> Int[np.ndarray, "kept"]:
     """Choose the points of a line to keep: at most four per bin (first, lowest, highest, last), and all gaps.
 
     Args:
         x: positions on the scale of the axis (logarithms on a logarithmic axis), NaN for a gap.
         y: values on the scale of their axis, NaN for a gap.
     """
-    if len(x) <= 4 * bins:
+    if len(x) <= 4 * BINS:
         return np.arange(len(x))
     gap = ~(np.isfinite(x) & np.isfinite(y))
     inside = x[~gap]
@@ -334,9 +332,9 @@ def thin_line(
         # it doubles back: only equal neighbors can go
         return np.flatnonzero(np.r_[True, (np.diff(x) != 0) | (np.diff(y) != 0)])
     place = np.zeros(len(x), int)
-    place[~gap] = ((inside - inside[0]) / (inside[-1] - inside[0]) * bins).astype(int)
+    place[~gap] = ((inside - inside[0]) / (inside[-1] - inside[0]) * BINS).astype(int)
     # a gap, and each side of one, is a group of its own
-    key = 2 * np.cumsum(np.r_[False, gap[1:] != gap[:-1]]) * (bins + 2) + place
+    key = 2 * np.cumsum(np.r_[False, gap[1:] != gap[:-1]]) * (BINS + 2) + place
     starts = np.flatnonzero(np.r_[True, key[1:] != key[:-1]])
     ends = np.append(starts[1:], len(x))
     filled = np.where(gap, 0.0, y)
@@ -348,25 +346,23 @@ def thin_line(
     return np.unique(np.concatenate(chosen))
 
 
-def thin_points(
-    x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"], bins: int = BINS
-) -> Int[np.ndarray, "kept"]:
+def thin_points(x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"]) -> Int[np.ndarray, "kept"]:
     """Choose the points to keep: one in each occupied cell of a fine grid.
 
     Args:
         x, y: coordinates on the scales of the axes.
     """
     finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
-    if len(finite) <= bins:
+    if len(finite) <= BINS:
         return finite
     # which of a cell's points stays is drawn by lot, or the grid would show
     finite = np.random.default_rng(0).permutation(finite)
-    cells = bins / 2
+    cells = BINS / 2
     while True:
         place = np.zeros(len(finite), np.int64)
         for values in (x[finite], y[finite]):
             low, span = values.min(), float(np.ptp(values))
-            place = place * (bins + 1) + ((values - low) / (span or 1.0) * cells).astype(np.int64)
+            place = place * (BINS + 1) + ((values - low) / (span or 1.0) * cells).astype(np.int64)
         _, first = np.unique(place, return_index=True)
         # a curve stays a curve; a cloud that fills the figure gets a coarser grid
         if len(first) <= MARKS:

@@ -65,12 +65,7 @@ def _headline(view: FlipsView) -> str:
         code = "no_flips" if any(one["pairs_most"] for one in every) else "no_contact"
         return TEXTS(code, frames=summary["frames"], rule=view.rule(every[0]))
     frames, rule = summary["frames"], view.rule(one)
-    values = {
-        "flips": one["flips"],
-        "pairs": one["pairs_flipped"],
-        "entered": one["entered"],
-        "left": one["left"],
-    }
+    values = {"pairs": one["pairs_flipped"], **{name: one[name] for name in ("flips", "entered", "left")}}
     parts = [TEXTS("flips_residue" if view.by_residue else "flips", **values, frames=frames, rule=rule)]
     if one["flips"] >= FEW:
         between = one["stride"]["between"]

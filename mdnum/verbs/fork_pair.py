@@ -146,11 +146,7 @@ def followed(
     from mdnum.forks import fork as follow
     from mdnum.forks.pair import counterfactuals
 
-    options: dict[str, Any] = {
-        "counterfactual": asked.counterfactual,
-        "back": asked.back,
-        "repeats": asked.repeats,
-    }
+    options: Any = {name: getattr(asked, name) for name in ("counterfactual", "back", "repeats")}
     counterfactuals(twin, **options)
     with frame.answering("fork", f"fork-{system.name}", system, **keep) as answer:
         made = follow(twin, asked.steps, split=asked.split, progress=answer.log, **options)
@@ -190,8 +186,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
         "splits": {name: made.splits[name] for name in ("B", "B|A", "A|B") if name in made.splits},
         "table": made.table,
         "shares": [
-            {"what": one.what, "reference": one.reference, "steps": one.steps, "at_least": one.at_least,
-             "e_foldings": one.e_foldings}
+            {name: getattr(one, name) for name in ("what", "reference", "steps", "at_least", "e_foldings")}
             for one in made.shares
         ],
         "repeated": repeated[0], "repeated_other": repeated[1],
@@ -260,11 +255,8 @@ def _decision(made: Fork) -> dict[str, Any] | None:
     decision = made.decision
     if decision is None:
         return None
-    length, space, protects = (
-        decision.margin,
-        {"contact": "height", "stop": "residual"}.get(decision.channel),
-        1,
-    )
+    length, protects = decision.margin, 1
+    space = {"contact": "height", "stop": "residual"}.get(decision.channel)
     subject: dict[str, Any] = {"ball": decision.subject[0] if decision.subject else None}
     if decision.channel == "pair":
         i, j = decision.subject
