@@ -24,31 +24,17 @@ from mdnum.errors import InputError
 from mdnum.md.cutoffs import AtCutoff
 from mdnum.md.potentials import CutPotential, PairFunction
 from mdnum.numerics.exact import inlined, interpreted
+from mdnum.plain import beside
 from mdnum.references.independent import ClassicalCalculator
 from mdnum.safe_path import environment, python
 from mdnum.systems.simulation import Simulation
 
-#: Operations of jax as lepton expressions; in lepton, step(0) is 1.
+_TABLES = beside(__file__)
 _WORDS = {
-    **{
-        name: f"{name}({{}})"
-        for name in (
-            "sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "abs",
-            "floor", "ceil", "erf", "erfc", "square",
-        )
-    },
-    **dict.fromkeys(
-        ("convert_element_type", "copy", "broadcast_in_dim", "squeeze", "reshape", "stop_gradient"), "{}"
-    ),
-    "add": "{} + {}", "add_any": "{} + {}", "sub": "{} - {}", "mul": "{} * {}", "div": "{} / {}",
-    "neg": "-{}", "max": "max({}, {})", "min": "min({}, {})", "pow": "{}^{}", "atan2": "atan2({}, {})",
-    "exp2": "2^{}", "expm1": "exp({}) - 1", "log1p": "log(1 + {})", "rsqrt": "1 / sqrt({})",
-    "cbrt": "{}^(1/3)", "logistic": "1 / (1 + exp(-{}))", "sign": "step({0}) - step(-{0})",
-    "clamp": "min(max({1}, {0}), {2})",
-    "ge": "step({} - {})", "le": "step({1} - {0})", "gt": "1 - step({1} - {0})", "lt": "1 - step({} - {})",
-    "eq": "delta({} - {})", "ne": "1 - delta({} - {})", "and": "{} * {}", "or": "max({}, {})",
-    "not": "1 - {}", "select_n": "select({0}, {2}, {1})",
-}  # fmt: skip
+    **{name: f"{name}({{}})" for name in _TABLES["functions"]},
+    **dict.fromkeys(_TABLES["unchanged"], "{}"),
+    **_TABLES["operations"],
+}
 #: Largest number of constants in an expression; lepton stores an expression that is used twice two times.
 _LARGEST = 100_000
 

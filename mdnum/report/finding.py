@@ -1,45 +1,7 @@
 """Findings of all verbs, their sentences, and the verdict that summarizes them.
 
-Code determines a finding (code, values); a text file next to the verb has its sentences, with named fields:
-
-    [LOST_PAIRS]
-    severity = "error"
-    section = "List health"                                  # of the page, which shows more
-    title = "the neighbor list lost {lost:# pair}"
-    text = "{lost:# pair} inside the cutoff {lost:? was were} missing from the list in use."
-    remedy = "Raise neighbors.skin."
-    remedy_blind = "Set neighbors.rebuild.check = true."    # of the variant "blind", instead of remedy
-    more_first = "The first is at step {step}."             # of the variant "first", after text
-
-    [sentences]
-    lists = "No pair was lost in {lists:# list}."
-
-    [plots.lengths]                                          # words and scales of a `section.Plot`
-    title = "Steps per list"
-    x_label = "step"
-    y_label = "steps per list"
-    y_scale = "log"
-    caption = "How many steps each list served."
-
-    [keys]                                                   # numbers above a page: value and note
-    "Lost pairs" = ["{lost}", "in {lists:# list}, {dangerous} dangerous"]
-    "Speed" = [["{speed}", "steps per second"], ["–", "too short a run to tell"]]
-
-    [browse.flips]                                           # columns of a `browse.Browse`
-    noun = "flips"
-    placeholder = "atom 17, step:100..200"
-    columns = [
-      { name = "step", of = "step", kind = "count" },
-      { name = "distance", of = "distance", unit = "{length}" },
-    ]
-
-If a list has several texts, the first one whose fields all have a value is used; without one, the row is left
-out. The format of a field determines its form: `{x}` a number or text as people read it, `{x:3}` with 3
-significant digits, `{x:+3}` with its sign, `{x:g}` without trailing zeros, `{x:%}` a percentage, `{n:# pair}`
-"2 pairs" (`{n:# life lives}` with an irregular plural, `{n:# pair_step}` with a space), `{n:? was were}` the
-first word for 1 and the second otherwise. A `Measured` is written with its unit (`{x:3m}`: in thousandths of
-it, meV), `{x:=}` with the digits that its floor leaves, `{x.floor:1}` without a unit; if a verb has a unit
-system, `{units.energy}` is the name of a unit.
+Code determines a finding (code, values); a text file next to the verb has its sentences, with named fields.
+`mdnum/verbs/__init__.toml` explains what such a file contains, and what the format of a field determines.
 """
 
 from __future__ import annotations
