@@ -1,18 +1,11 @@
 """Estimate of flips lost between frames: pairs that cross their threshold and return by the next frame.
 
-The reference is the number of flips that an examination of the run at every time step would count. Crossings
-within a time step do not count, so a file with every step loses nothing. Nearly independent estimates are:
-
-- **thinning**: the share of flips that would be lost with every second, fourth and eighth frame alone;
-- **persistence**: how much motion continues from one frame to the next. Pairs spread evenly around a
-  threshold cross it in proportion to the displacement between two frames, whatever the path;
-- **velocities**, if the file has them: the ratio of displacements to those that velocities alone predict; and
-  the **flux**, the rate at which pairs in straight flight cross their thresholds.
-
-The first two are extrapolated to finer frames by a family of laws: frames a time t apart show flips at a rate
-(1 + (t/τ)^p)^(-s/p), with p = 2 for smooth paths and 1 if velocities change in kicks, s = 1/2 for motion that
-ends up diffusive and 1 if atoms stay at their sites. The laws that fit are averaged. Constants were chosen on
-test systems with known losses, and the coverage was measured on others (docs/lost-flips.md).
+The reference is the number of flips that an examination of the run at every time step would count. The
+estimates (thinning, persistence, velocities and flux), the test systems on which constants were chosen, and
+the measured coverage are in docs/lost-flips.md. The first two are extrapolated to finer frames by a family of
+laws: frames a time t apart show flips at a rate (1 + (t/τ)^p)^(-s/p), with p = 2 for smooth paths and 1 if
+velocities change in kicks, s = 1/2 for motion that ends up diffusive and 1 if atoms stay at their sites. The
+laws that fit are averaged.
 """
 
 from __future__ import annotations

@@ -1,16 +1,8 @@
 """The verbs, one module each; their functions are the functions of `mdnum`.
 
-Each verb is declared in its module and in the text file of the same name; there is no other list of its
-commands and folders. In addition to the verb's sentences, the text file contains
-
-    [command], or [group] and [commands.NAME]   commands as typed (see `mdnum.cli.commands`)
-    [kinds.KIND]                                folders that the verb writes (see `mdnum.store.layout.Layout`)
-
-and the module contains the functions that its commands call and
-
-    KINDS = {"KIND": Verb(judge, page)}         how folders are judged and shown (see `mdnum.verbs.frame`)
-
-A verb's module is imported only when the verb is used.
+Each verb is declared in its module (see `mdnum.verbs.frame`) and in the text file of the same name, whose
+tables `__init__.toml` explains; there is no other list of its commands and folders. A verb's module is
+imported only when the verb is used.
 """
 
 from __future__ import annotations
