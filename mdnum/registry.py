@@ -42,6 +42,18 @@ def unknown(noun: str, word: str, known: Iterable[str], *, where: str | None = N
     return InputError(f"unknown {noun} {word!r}", remedy=remedy, where=where)
 
 
+def expect_known(noun: str, words: Iterable[str], known: Iterable[str], *, where: str | None = None) -> None:
+    """Raise an error if a name is unknown.
+
+    Raises:
+        InputError: see `unknown`, with the first such name.
+    """
+    known = list(known)
+    for word in words:
+        if word not in known:
+            raise unknown(noun, word, known, where=where)
+
+
 @functools.lru_cache
 def _plugins(group: str, path: tuple[str, ...]) -> tuple[metadata.EntryPoint, ...]:
     # by the search path, which says whose entry points there are

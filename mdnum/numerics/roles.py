@@ -9,6 +9,7 @@ import ml_dtypes
 import numpy as np
 
 from mdnum.errors import InputError
+from mdnum.registry import expect_known
 
 WIDE: Mapping[str, np.dtype] = {"float64": np.dtype(np.float64), "float32": np.dtype(np.float32)}
 ALL: Mapping[str, np.dtype] = {
@@ -31,12 +32,6 @@ def carrier(name: str) -> np.dtype:
     return ALL["float64" if name == FIXED_POINT else name]
 
 
-def _refuse_unknown(role: str, word: str, known: Mapping[str, object], noun: str = "dtype") -> None:
-    if word not in known:
-        said = f"unknown {noun} {word!r}; expected one of {', '.join(known)}"
-        raise InputError(said, where=f"precision.{role}")
-
-
 def check_role(role: str, dtype: str) -> None:
     """Reject a dtype that is not allowed for a role of molecular dynamics.
 
@@ -52,7 +47,7 @@ def check_role(role: str, dtype: str) -> None:
             where=f"precision.{role}",
             remedy=f"Use {' or '.join(WIDE)}; pair forces may be {dtype} (precision.force)",
         )
-    _refuse_unknown(role, dtype, known)
+    expect_known("dtype", [dtype], known, where=f"precision.{role}")
 
 
 @dataclass(frozen=True)
@@ -105,8 +100,9 @@ class RolePrecision:
 
     def __post_init__(self):
         for role in ("state", "arithmetic", "decision", "accumulate", "loss"):
-            _refuse_unknown(role, getattr(self, role), ALL)
-        _refuse_unknown("rounding", self.rounding, dict.fromkeys(("nearest", "stochastic")), "rounding")
+            expect_known("dtype", [getattr(self, role)], ALL, where=f"precision.{role}")
+        known = ("nearest", "stochastic")
+        expect_known("rounding", [self.rounding], known, where="precision.rounding")
         if self.seed < 0:
             raise InputError(f"seed {self.seed} is negative", remedy="Give 0 or more", where="precision.seed")
 

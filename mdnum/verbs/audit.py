@@ -23,7 +23,7 @@ from mdnum.audit.causes import heads
 from mdnum.audit.checks import CHECKS
 from mdnum.errors import InputError
 from mdnum.plain import plain
-from mdnum.registry import unknown
+from mdnum.registry import expect_known
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Key, Page, Plot, Section, curves, pairs, points_of, records
 from mdnum.report.words import heading, listed, many
@@ -265,9 +265,7 @@ def _wanted(checks: str | Sequence[str] | None) -> list[str]:
     if checks is None:
         return conclusion.in_order(list(CHECKS))
     names = frame.words(checks)
-    for name in names:
-        if name not in CHECKS:
-            raise unknown("check", name, CHECKS)
+    expect_known("check", names, CHECKS)
     if not names:
         raise InputError("no check was given", remedy=f"Choose from {', '.join(CHECKS)}")
     return conclusion.in_order(list(names))

@@ -19,6 +19,7 @@ from mdnum.plain import headed
 from mdnum.references.conformance.case import AREAS
 from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE, CaseAnswers, Report
 from mdnum.references.conformance.lists import LIMITS, PairList
+from mdnum.registry import expect_known
 from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Figure, Page, Section, Table, pairs, table_of
@@ -65,11 +66,8 @@ class Options:
             raise InputError(
                 f"{self.cases:,} random cases were requested", remedy=f"Give 0 to {MOST_CASES:,}"
             )
-        if self.precision not in (None, *PRECISIONS):
-            raise InputError(f"unknown precision {self.precision!r}", remedy=f"Use {', '.join(PRECISIONS)}")
-        unknown = [word for word in self.limits if word not in LIMITS]
-        if unknown:
-            raise InputError(f"unknown limit {unknown[0]!r}", remedy=f"Choose from {', '.join(LIMITS)}")
+        expect_known("precision", filter(None, [self.precision]), PRECISIONS)
+        expect_known("limit", self.limits, LIMITS)
         unit = PRECISIONS.get(self.precision or "")
         tested = tested.with_options(full=self.full, superset=self.superset, unit=unit)
         limits: Any = {LIMITS[word]: True for word in self.limits}

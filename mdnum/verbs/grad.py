@@ -12,6 +12,7 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.plain import plain
+from mdnum.registry import expect_known
 from mdnum.store.files import write_bytes
 from mdnum.verbs import frame, grad_page, grad_verdict
 from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step
@@ -92,11 +93,7 @@ def grad(
         raise InputError(f"replicas = {replicas}; a standard error needs at least 2")
     names, further = words(wrt), words(also)
     asked = None if methods is None else words(methods)
-    unknown = [word for word in further if word not in (*ALSO, ALL)]
-    if unknown:
-        raise InputError(
-            f"unknown part {unknown[0]!r} of a diagnosis", remedy=f"Choose from {', '.join(ALSO)}"
-        )
+    expect_known("part of a diagnosis", further, (*ALSO, ALL))
     further = ALSO if ALL in further else further
     if world_of(system) == "ball":
         whose = "of molecular dynamics: this system is a ball"
@@ -377,8 +374,7 @@ def _ball_system(
     from mdnum.systems import BallSystem, ball, load
 
     kinds = get_args(ball.LossTable.model_fields["kind"].annotation)
-    if of is not None and of not in kinds:
-        raise InputError(f"a ball has no loss {of!r}", remedy=f"Choose from {', '.join(kinds)}")
+    expect_known("loss of a ball", filter(None, [of]), kinds)
     changes: dict[str, Any] = {} if of is None else {"loss.kind": of}
     changes |= {"gradient.of": list(names)} if names else {}
     made = load(system, overrides, world="ball")

@@ -13,6 +13,7 @@ import numpy as np
 
 from mdnum.errors import InputError, MdnumError
 from mdnum.reading import FrameError
+from mdnum.registry import expect_known
 from mdnum.trajectories.arrays import ArrayFrames, host, one_by_one
 from mdnum.trajectories.listed import GivenList, ListCheck
 from mdnum.trajectories.trajectory import SAMPLE
@@ -75,8 +76,7 @@ class Recorder:
         window: int = WINDOW, name: str = "loop", out: str | Path | None = None, report: bool = True,
         **arrays: Any,
     ) -> None:  # fmt: skip
-        if compare not in ("r2 <", "r2 <=", "r <", "r <="):
-            raise InputError(f"unknown comparison {compare!r}", remedy="Write r2 <, r2 <=, r < or r <=")
+        expect_known("comparison", [compare], ("r2 <", "r2 <=", "r <", "r <="), where="compare")
         if compare.endswith("="):
             r_cut = np.nextafter(np.atleast_1d(np.asarray(r_cut, float)), np.inf).tolist()
         self._rules = rules(r_cut, pairs, nearest, most)

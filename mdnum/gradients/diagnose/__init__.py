@@ -36,6 +36,7 @@ from mdnum.gradients.tape import pace_of
 from mdnum.md.integrators import without_kick
 from mdnum.numerics import unit_roundoff
 from mdnum.plain import result
+from mdnum.registry import expect_known
 
 __all__ = [
     "PARTS", "GradientDiagnosis", "GradientGrowth", "Spectrum", "Trust", "agreement", "detective", "diagnose",
@@ -278,11 +279,7 @@ def diagnose(
         InputError: a parameter, part or method does not exist. NumericalError: the run blew up.
     """
     full = parameters.resolve(problem.simulation, names)
-    unknown = [part for part in parts if part not in PARTS]
-    if unknown:
-        raise InputError(
-            f"unknown part {unknown[0]!r} of a diagnosis", remedy=f"Choose from {', '.join(PARTS)}"
-        )
+    expect_known("part of a diagnosis", parts, PARTS)
     searched = parameters.resolve(problem.simulation, edges_of) if edges_of else ()
     chosen = _methods(methods)
     plain, why = _first(chosen, Symmetric), ""
