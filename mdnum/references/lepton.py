@@ -29,7 +29,7 @@ from mdnum.references.independent import ClassicalCalculator
 from mdnum.safe_path import environment, python
 from mdnum.systems.simulation import Simulation
 
-_TABLES = beside(__file__)
+_TABLES = beside(__file__)["words"]
 _WORDS = {
     **{name: f"{name}({{}})" for name in _TABLES["functions"]},
     **dict.fromkeys(_TABLES["unchanged"], "{}"),
