@@ -489,7 +489,10 @@ def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int)
 def _permuted(
     subject: CalculatorSubject, walk: PairWalk, radius: float, count: int, aside: bool = False
 ) -> tuple[float, float] | None:
-    """Return the changes of energy and force on reordering the atoms; None if rounding explains them."""
+    """Return the changes of energy and force on reordering the atoms; None if rounding explains them.
+
+    With `aside`, the last neighbor is moved out of reach of all others.
+    """
     atoms, _ = cluster(walk.pair, radius, count)
     if aside:
         atoms.positions[-1] += 3 * (atoms.positions[-1] - atoms.positions[0])

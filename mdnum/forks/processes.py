@@ -426,7 +426,10 @@ def _ask(
     timeout: float | None = None,
     settings: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Run a process that answers a question; return the reason for a failure, or ""."""
+    """Run a process that answers a question; return the reason for a failure, or "".
+
+    `heard` is called with each line that the process prints; `settings` are environment variables.
+    """
     file.write_text(json.dumps(question))
     command, late = python("-m", "mdnum.forks.processes", str(file)), []
     # what it prints on stderr may be long, and nobody reads a pipe meanwhile
