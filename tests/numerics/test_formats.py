@@ -219,7 +219,7 @@ def test_every_role_can_have_its_own_dtype_and_no_other():
     assert seen == [np.float16, ml_dtypes.bfloat16, np.float32, np.float64, np.float16]
     assert RolePrecision.all("bfloat16") == RolePrecision(*["bfloat16"] * 5)
     for wrong, message in (
-        ({"decision": "half"}, r"precision\.decision.*'half'.*expected one of.*bfloat16"),
+        ({"decision": "half"}, r"precision\.decision.*'half'.*Choose from.*bfloat16"),
         ({"rounding": "up"}, r"precision\.rounding.*'up'.*nearest, stochastic"),
         ({"seed": -1}, r"precision\.seed"),
     ):
@@ -235,5 +235,5 @@ def test_sixteen_bits_are_for_pair_forces_alone():
     for role in ("state", "decision", "accumulate"):
         with pytest.raises(InputError, match=rf"precision\.{role}.*bfloat16 is not supp.*precision.force"):
             PrecisionPolicy(**{role: "bfloat16"})
-    with pytest.raises(InputError, match=r"precision\.force.*'half'.*expected one of.*bfloat16"):
+    with pytest.raises(InputError, match=r"precision\.force.*'half'.*Choose from.*bfloat16"):
         PrecisionPolicy(force="half")
