@@ -46,7 +46,10 @@ grad: Any = importlib.import_module("mdnum.verbs.grad")
             ("silicon/tersoff-512", "--of", "msd", "--wrt", "r_cut"),
             "parameter 'r_cut'. Choose from potential.A,",
         ),
-        ((WELL, "--of", "msd", "--wrt", "sigma", "--also", "spektrum"), "Choose from spectrum, edges, scaling"),
+        (
+            (WELL, "--of", "msd", "--wrt", "sigma", "--also", "spektrum"),
+            "Choose from spectrum, edges, scaling",
+        ),
         ((WELL, "--of", "msd", "--wrt", "sigma", "--replicas", "1"), "needs at least 2"),
         (("ball/drop", "--replicas", "3"), "--methods randomized"),
         (("ball/drop", "--also", "edges"), "system is a ball"),
