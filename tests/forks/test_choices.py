@@ -68,7 +68,7 @@ def test_every_shipped_choice_is_parsed_from_its_name(world: str):
         ("nonsense", "lists all"),
         ("vmap", "fork processes"),
         ("precision.mass", "'mass'.* state, force, decision, accumulate"),
-        ("precision=half", "Choose from float64, float32, float16, bfloat16"),
+        ("precision=half", "expected one of float64, float32, float16, bfloat16"),
         ("format=coo", "'coo'.* dense, sparse, ordered-sparse"),
         ("reduction=karatsuba", "reduction 'karatsuba'"),
         ("order@karatsuba", "reduction 'karatsuba'"),
