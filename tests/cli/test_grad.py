@@ -48,7 +48,7 @@ grad: Any = importlib.import_module("mdnum.verbs.grad")
         ),
         (
             (WELL, "--of", "msd", "--wrt", "sigma", "--also", "spektrum"),
-            "Choose from spectrum, edges, scaling",
+            "spectrum, edges, scaling",
         ),
         ((WELL, "--of", "msd", "--wrt", "sigma", "--replicas", "1"), "needs at least 2"),
         (("ball/drop", "--replicas", "3"), "--methods randomized"),
