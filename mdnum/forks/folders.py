@@ -173,7 +173,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
             raise InputError(
                 f"the runs are of different systems: {key} is {one} in the first and {other} in the second",
                 where=where,
-                remedy=f"{remedy}, which may differ in numbers or numerical choices",
+                remedy="Give two runs of the same system; only numbers and numerical settings may differ",
             )
     if world == "flips":
         return _of_frames(first, second, where)
@@ -331,7 +331,7 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
         raise InputError(
             f"the runs are of different systems: {different}",
             where=where,
-            remedy="Compare runs of one system",
+            remedy="Compare two runs of the same system",
         )
     rows: list[Difference] = []
     for name, (a, b) in {
@@ -360,7 +360,7 @@ def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
     """Compare two sets of atoms by property; yield whether each agrees, and a message if not."""
     yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
     symbols = [each.get_chemical_symbols() for each in (one, other)]
-    yield symbols[0] == symbols[1], "species differ or their order"
+    yield symbols[0] == symbols[1], "species or their order differ"
     yield np.allclose(one.get_masses(), other.get_masses(), rtol=_SAME), "masses differ"
     yield bool((one.pbc == other.pbc).all()), "periodic directions differ"
     size = float(np.abs(one.cell.array).max())

@@ -179,7 +179,7 @@ def counterfactuals(
     most = repeats_asked(repeats, runs, reason or "such runs are disabled")
     if back and not runs:
         raise InputError(
-            f"A cannot be run with B's decisions, because B is not run with A's: "
+            f"A is run with B's decisions only if B is also run with A's decisions, but it is not: "
             f"{reason or 'such runs are disabled'}",
             remedy="Omit the option `back`",
         )
@@ -201,7 +201,7 @@ def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such ru
         )
     if repeats and not counterfactual:
         raise InputError(
-            f"repeats = {repeats}, but B is not run with A's decisions, so there is nothing to repeat: {why}",
+            f"repeats = {repeats}, but B is not run with A's decisions, so there is no run to repeat: {why}",
             remedy="Set repeats = 0, or omit it",
         )
     return repeats

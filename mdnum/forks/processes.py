@@ -206,7 +206,7 @@ def _ran(variant: Variant, question: Mapping[str, Any], file: Path) -> tuple[Ran
     seconds = time.perf_counter() - begin
     x = np.zeros(0) if failed else np.load(out)
     if not len(x):
-        return Ran(variant, (), failed or "the skin was used up at once", seconds), None
+        return Ran(variant, (), failed or "the first step used up the whole skin", seconds), None
     hashes = tuple(hashlib.sha256(np.ascontiguousarray(row).tobytes()).hexdigest() for row in x)
     return Ran(variant, hashes, "", seconds), x
 

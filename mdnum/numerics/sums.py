@@ -191,7 +191,7 @@ class Blocked(Reduction):
 
     def __post_init__(self):
         if self.width < 2:
-            raise InputError(f"a summation tree of width {self.width} adds nothing", remedy="Use 2 or more.")
+            raise InputError(f"a summation tree of width {self.width} adds no terms", remedy="Use 2 or more.")
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """Sum the terms level by level."""

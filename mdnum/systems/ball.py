@@ -370,13 +370,13 @@ def _on_boundary(spec: BallSpec) -> Iterator[Problem]:
     if given:
         yield (
             f"start.{given[0]}",
-            f"[start] has boundary and {', '.join(given)}, but boundary says where every ball is",
+            f"[start] has boundary and {', '.join(given)}, but boundary determines the height of every ball",
             f"Remove {' and '.join(given)}, or boundary",
         )
     if spec.stop is None or isinstance(spec.stop, FixedRule):
         yield (
             "start.boundary",
-            "a batch on the boundary needs a tolerance to be on the boundary of",
+            "a batch on the boundary needs a tolerance, which defines the boundary",
             'Give a [stop] table with rule = "sum" and tol',
         )
         return
@@ -476,8 +476,8 @@ def _stops(spec: BallSpec) -> Iterator[Problem]:
     if isinstance(stop, _Tolerance) and stop.enter is not None and stop.enter < stop.tol:
         yield (
             "stop.enter",
-            f"stop.enter = {stop.enter:g} is below stop.tol = {stop.tol:g}: a solve would start that is over "
-            "before it begins",
+            f"stop.enter = {stop.enter:g} is below stop.tol = {stop.tol:g}: a solve could start that "
+            "has converged already",
             "Make enter at least tol",
         )
     if isinstance(stop, RelativeRule) and stop.tol >= 1:
@@ -543,7 +543,7 @@ def _losses(spec: BallSpec) -> Iterator[Problem]:
     if loss.kind == "residual-penetration" and contact.kind != "projection":
         yield (
             "loss.kind",
-            f"residual-penetration is what a projection's solver leaves, but the contact is a {contact.kind}",
+            f"residual-penetration exists only for a projection, but the contact is a {contact.kind}",
             'Set loss.kind to "final-height"',
         )
     if loss.target is not None and loss.kind != "final-height":
@@ -555,7 +555,7 @@ def _losses(spec: BallSpec) -> Iterator[Problem]:
         if name not in known:
             yield "gradient.of", f"{seen}which {contact.kind} does not have", f"It has {', '.join(known)}"
         if name == "eps" and isinstance(contact, PenaltyContact) and not contact.eps:
-            seen += "but contact.eps = 0 is the sharp contact, which no width belongs to"
+            seen += "but contact.eps = 0 is the sharp contact, which has no width"
             yield "gradient.of", seen, "Set contact.eps above 0"
         if name == "tol" and not isinstance(spec.stop, _Tolerance):
             yield "gradient.of", f"{seen}but the rule is fixed", "Remove it, or use another rule"

@@ -462,7 +462,7 @@ def assembled(
         builder = "host" if jax.default_backend() == "cpu" else "device"
     integrator.check(cell)
     if integrator.moves_cell and not pairwise and getattr(model, "fixed_box", False):
-        message = f"{origin.name} has a potential with a box of its own, and {integrator.name} moves the box"
+        message = f"{origin.name} has a potential with a fixed box, but {integrator.name} changes the box"
         remedy = "Let it take box= (jax_md.space.periodic_general)"
         raise InputError(message, where="dynamics.kind", remedy=remedy)
     velocities = draw.velocities(masses, units, None if draw.drawn else atoms.get_velocities())
@@ -509,7 +509,7 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
         model = each_term(model, of_kinds)
         if model.weights and not np.array_equal(atoms.numbers, simulation.structure.numbers):
             remedy = "Give atoms of the same species in the same order"
-            message = "the atoms have weights, and these are others"
+            message = "the potential has a weight for each atom, and the species of these atoms differ"
             raise InputError(message, where=simulation.name, remedy=remedy)
     return assembled(
         Origin(simulation.name, simulation.origin.about), atoms, simulation.units, model,

@@ -175,7 +175,7 @@ def conform(
                 "Give a function of (positions, cell, pbc, r_cut) that returns"
             )  # fmt: skip
             lacks = re.search(r"No module named '(\w+)", why)
-            install = f"Run python3 -m pip install {lacks[1]}, or what else provides it" if lacks else ""
+            install = f"Run python3 -m pip install {lacks[1]}, or a package that has it" if lacks else ""
             raise InputError(why, where=tested.name, remedy=install or f"{calls} {_RETURNS}")
         if folder is None:
             slug = f"conform-{tested.name.replace(':', '-')}"
@@ -236,7 +236,7 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
         (row["list"], f"install {' '.join(row['lacks'])}" if row["lacks"] else row["version"], row["what"])
         for row in rows
     ]
-    table = ("neighbor lists that have a name here", ("list", "version", "what"), lines)
+    table = ("neighbor lists that are known by name", ("list", "version", "what"), lines)
     return Reply(headed("conform-list", {"lists": rows}), [table, TEXTS("own_lists")])
 
 

@@ -134,14 +134,14 @@ def flips(
     if in_memory := hasattr(trajectory, "shape") or type(trajectory) in (list, tuple):
         refuse(files, "of files", "Leave it out for arrays")
     else:
-        refuse(dict.fromkeys(arrays, True), "of arrays", "Leave it out: a file has its own")
+        refuse(dict.fromkeys(arrays, True), "of arrays", "Leave it out: a file contains its own values")
     open_one = partial(open_trajectory, topology=topology, format=format)
     with as_python(in_memory):
         asked = rules(cutoffs, pairs, nearest, most)
         if other is not None:
             from mdnum.verbs.flips_compare import compare
 
-            refuse({"by": by != "atom"}, "of one trajectory", "Leave it out, or examine each by itself")
+            refuse({"by": by != "atom"}, "of one trajectory", "Leave it out, or examine each separately")
             _refuse_topology_first(trajectory, other, topology)
             a, b = map(open_one, (trajectory, other))
             a.drop_repeats = b.drop_repeats = drop_repeats

@@ -102,10 +102,10 @@ def fork(
         given = {"split": split is not None, "repeats": repeats is not None, "minimal": minimal,
                  "counterfactual": not counterfactual, "back": back is not None,
                  "pin": pin is not None}  # fmt: skip
-        frame.refuse(given, "of one comparison, and all choices were asked for", "Give one choice to vary")
+        frame.refuse(given, "of one comparison, but all choices were requested", "Give one choice to vary")
         return fork_screen(loaded, steps=asked.steps, **keep)
     if isinstance(loaded, BallSystem):
-        remedy = 'A decision of a ball is overridden by itself by the choice "contact=STEP:BALL"'
+        remedy = 'To override one decision of a ball, vary the choice "contact=STEP:BALL"'
         given = {"minimal": minimal, "pin": pin is not None}
         frame.refuse(given, f"of molecular dynamics, and {loaded.name} is a ball", remedy)
         loaded = loaded if asked.steps is None else loaded.for_steps(asked.steps)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # seconds between writes, and how many times what a write takes
 _EVERY, _TIMES = 2.0, 50.0
-_LOOK = "Look at what the loop did up to that step: what came before is kept"
+_LOOK = "Examine what the loop did up to that step; all earlier records are kept"
 _NONE = {name: np.zeros(0, np.int64) for name in ("rule", "i", "j", "rank", "entered")}
 
 

@@ -136,7 +136,7 @@ class Summation(Choice):
             return simulations(system, b, f"force sums {self.word}, not {before}")
         before = system.spec.precision.reduction
         sums_residuals(system)
-        applies(system.balls > 1, "the residual of one ball is no sum")
+        applies(system.balls > 1, "the residual of one ball is not a sum")
         applies(self.word != before, f"the system sums {self.word} already")
         values = {"precision.reduction": self.word}
         return twin(system, values, self.name, f"residuals summed {self.word}, not {before}")
@@ -145,7 +145,7 @@ class Summation(Choice):
 def sums_residuals(system: Any) -> None:
     """Raise an `InputError` if a ball's system does not sum residuals over several balls."""
     stop = system.spec.stop
-    applies(stop is not None, "its steps solve nothing, so there is no residual to sum")
+    applies(stop is not None, "its steps use no solver, so there is no residual to sum")
     reason = f"its solver is stopped by the rule {stop.rule}, which sums nothing"
     applies(isinstance(stop, SumRule | RelativeRule), reason)
 
@@ -197,7 +197,7 @@ class Order(Summed):
         return self.twin(a, b, f"neighbors of each atom shuffled with seed {self.seed}")
 
     def _of_balls(self, system: Any) -> Twin:
-        applies(self.both in (None, "exact", "alone"), "of a ball there are order@exact and order@alone")
+        applies(self.both in (None, "exact", "alone"), "for a ball, use order@exact or order@alone")
         applies(system.balls > 1, "there is one ball")
         own, stop, difference = (
             system.spec.precision.reduction,
@@ -217,7 +217,7 @@ class Order(Summed):
                 rest = "" if self.both else ": order@alone must hold"
                 raise InputError(error.message + rest) from None
             without = own.partition(":")[0] in (*ORDERLESS, "sorted")
-            reason = f"sums are {own}, which have no order: order@exact must hold"
+            reason = f"sums are {own} and do not depend on the order: order@exact must hold"
             applies(self.both is not None or not without, reason)
             if self.both == "exact" and own != "exact":
                 system = varied(system, {"precision.reduction": "exact"}, self.name)
@@ -257,7 +257,7 @@ class FormatChoice(Summed):
         a, own = summed(system, self.both), reduction_word(system.reduction)
         if self.both is None:
             applies(system.pairwise, "a many-body potential has a format of its own")
-            applies(own == "sequential", f"a format is the order of a loop, and sums are {own} here")
+            applies(own == "sequential", f"a format is an order of sequential sums, but sums are {own} here")
         b = ReorderedSimulation.of(a, self.word)
         return self.twin(a, b, f"pair terms in the order of {self.word} lists, not of the search's")
 

@@ -39,7 +39,7 @@ class Stopping(Choice):
 
     def make(self, system: Any) -> Twin:
         stop = system.spec.stop
-        applies(stop is not None, "its steps solve nothing, so nothing stops a solver")
+        applies(stop is not None, "its steps use no solver, so there is no stopping rule")
         reason = "its solver makes a fixed number of iterations and has no tolerance"
         applies(not isinstance(stop, FixedRule), reason)
         reason = "its tolerance is a share of the first residual and not a height"
@@ -65,7 +65,7 @@ class Cap(Choice):
 
     def make(self, system: Any) -> Twin:
         stop = system.spec.stop
-        applies(stop is not None, "its steps solve nothing, so there is no iteration to add")
+        applies(stop is not None, "its steps use no solver, so there is no iteration to add")
         word = "count" if isinstance(stop, FixedRule) else "max_iter"
         key, value = f"stop.{word}", getattr(stop, word)
         after = value + self.more
@@ -129,7 +129,7 @@ class ContactStep(Choice):
         applies(len(begins) > place, f"{len(begins)} contacts begin in {run.steps} steps")
         row, earlier = begins[place], self.at == "earlier"
         step, ball = int(run.contacts.step[row]), int(run.contacts.subject[row, 0])
-        applies(not (earlier and step == 1), f"that contact of ball {ball} begins at the first step")
+        applies(not (earlier and step == 1), f"ball {ball} has this contact from the first step on")
         pin = ImposedDecision("contact", step - earlier, ball, int(earlier))
         return _imposed(program, pin, f"the contact of ball {ball} at step {step} begins a step {self.at}")
 
@@ -153,7 +153,7 @@ class Iterations(Choice):
         return f"{which} makes {count} {'more' if self.more > 0 else 'fewer'}"
 
     def make(self, system: BallSystem) -> Twin:
-        applies(system.spec.stop is not None, "its steps solve nothing, so there is no iteration to add")
+        applies(system.spec.stop is not None, "its steps use no solver, so there is no iteration to add")
         _check_place(system, self.step, self.ball)
         program: Any = program_of(system)
         counts = program.run(program.steps).iterations

@@ -53,7 +53,7 @@ OFTEN = {
 }  # fmt: skip
 #: Distance from a face of the box, relative to its edge, within which an ulp could move an atom across.
 _NEAR = 1e-6
-_NO_NEIGHBOR = "is 0, and the next float is nothing beside any other number"
+_NO_NEIGHBOR = "is 0, and the next float is negligible compared with any other number"
 
 
 def _frame(simulation: Any, **parts: Any) -> Any:
@@ -75,7 +75,7 @@ class Relabel(Summed):
 
     def make(self, system: Simulation) -> Twin:
         shared = "atoms" not in system.integrator.noise_belongs_to
-        applies(shared, "the thermostat's noise belongs to labels: other atoms would get it")
+        applies(shared, "the thermostat's noise belongs to labels: other atoms would receive it")
         applies(not (system.pairwise and system.model.weights), "the atoms' weights belong to labels")
         a = summed(system, self.both)
         labels = np.random.default_rng(self.seed).permutation(a.atoms)
@@ -116,7 +116,7 @@ class Rotate(Summed):
 
     def make(self, system: Simulation) -> Twin:
         shared = "axes" not in system.integrator.noise_belongs_to
-        applies(shared, "the noise belongs to axes: others would get it")
+        applies(shared, "the noise belongs to axes: other directions would receive it")
         known = _SYMMETRIES if self.axes is None else (self.axes,)
         word = next((word for word in known if _is_symmetry(word, system.structure)), "")
         applies(bool(word), f"the box is not the same with axes {self.axes} in place of xyz")

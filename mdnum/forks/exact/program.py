@@ -142,8 +142,8 @@ def unsupported(simulation: Simulation) -> InputError | None:
     reasons = (
         (
             not alone,
-            f"the exact program serves one pair potential, not {simulation.potential.name!r}",
-            "Use a system with one, as a lennard-jones system",
+            f"exact arithmetic supports a single pair potential, not {simulation.potential.name!r}",
+            "Use a system with a single pair potential, such as lennard-jones",
             "potential.kind",
         ),
         (
@@ -154,14 +154,14 @@ def unsupported(simulation: Simulation) -> InputError | None:
         ),
         (
             type(simulation.integrator) is not VelocityVerlet,
-            f"the exact program serves NVE dynamics, not {simulation.integrator.name!r}: its noise is "
+            f"exact arithmetic supports only NVE dynamics, not {simulation.integrator.name!r}: the noise is "
             "defined by its rounding",
             "Use --set dynamics.kind=nve",
             "dynamics.kind",
         ),
         (
             atoms > MOST_ATOMS,
-            f"{atoms} atoms; the exact program follows all pairs of at most {MOST_ATOMS}",
+            f"{atoms} atoms; an exact run follows all pairs, of at most {MOST_ATOMS} atoms",
             "Use a smaller structure, e.g. argon/crystal-108",
             "system",
         ),

@@ -6,8 +6,8 @@ second factor, from tangents, includes no earlier flip. So the contributions of 
 total contribution of flips.
 
 Between two boundaries every run makes the same decisions, and loss and gradient are smooth functions of the
-parameter. At a boundary the decision on one pair differs between two adjacent floats: a longer step of an
-optimizer crosses into another program, and the gradients on both sides show how useful such a step is.
+parameter. At a boundary the decision on one pair differs between two adjacent floats: an optimizer step
+across the boundary changes the decisions, and the two gradients show how useful such a step is.
 """
 
 from __future__ import annotations
