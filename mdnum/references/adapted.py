@@ -47,8 +47,8 @@ class SpeciesSum(ClassicalCalculator):
 
     Args:
         parts: (calculator, species a, species b) for every pair of species present.
-    Error: the subtraction costs the digits by which the sum over like pairs exceeds that over unlike
-        pairs; about one for the mixtures shipped.
+    Error: the subtraction costs the digits by which the sum over like pairs exceeds that over unlike pairs;
+        about one digit for the mixtures shipped.
     """
 
     def __init__(self, parts: Sequence[tuple[Calculator, str, str]], **kwargs: Any):
@@ -122,7 +122,7 @@ def morse(form: PairForm, begin: float, end: float) -> Calculator:
 
 
 def short_listed_eam(file: Path) -> Calculator:
-    """Return ASE's EAM with a shorter neighbor list; its own reaches 2 (cutoff + skin) and takes minutes."""
+    """Return ASE's EAM with a shorter neighbor list; ASE's reaches 2 (cutoff + skin) and takes minutes."""
     from ase.calculators.eam import EAM
     from ase.neighborlist import NeighborList
 

@@ -74,7 +74,7 @@ def reference(subject: Simulation | System) -> Reference:
     """Return the best available reference for a simulation, an ASE class if there is one, else plain numpy.
 
     Args:
-        subject: a `Simulation`, or a `System`, whose box may be too small for its skin.
+        subject: a `Simulation`; or a `System`, also one whose box is too small for its skin.
     """
     simulation = _objects(subject)
     species, model = simulation.symbols, simulation.model
@@ -101,7 +101,7 @@ def reference(subject: Simulation | System) -> Reference:
 
 
 def independent(subject: Simulation | System) -> Reference:
-    """Return a plain-numpy reference for any potential except eam: a third calculation next to ASE's."""
+    """Return a plain-numpy reference for any potential except eam: a third calculation, next to ASE."""
     simulation = _objects(subject)
     model, compare = simulation.model, simulation.decider.compare
     if isinstance(model, EnergyFunction):

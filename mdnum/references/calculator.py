@@ -78,7 +78,7 @@ class MdnumCalculator(ClassicalCalculator):
 
     Use this calculator to relax structures with ase.optimize, to compute stress and equations of state, and
     to compare mdnum's forces with ASE's own tools. A Verlet list is kept between calls until motion and box
-    strain have used up its skin; for molecular dynamics use mdnum's rollout, which records its flips.
+    strain exceed what its skin allows; for molecular dynamics use mdnum's rollout, which records its flips.
 
     Args:
         system: a `Simulation`, a `System`, or the name or path of a system file; the atoms may differ from
@@ -90,7 +90,7 @@ class MdnumCalculator(ClassicalCalculator):
     Raises:
         InputError: neither or both of system and potential; invalid tables. At the first use: species without
             constants, a cell narrower than two cutoffs, a coordinate that is not finite.
-        NumericalError: an energy or a force that is not finite, as of two atoms at one place.
+        NumericalError: an energy or a force that is not finite, such as that of two atoms at one place.
         TypeError: an unknown keyword.
 
     Example:

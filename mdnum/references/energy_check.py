@@ -122,19 +122,19 @@ def check_energy(
     judge: Reference | None = None,
     lammps: bool = False,
 ) -> EnergyReport:
-    """Compare energies, forces and stresses with ASE (or with plain numpy if ASE has no such class).
+    """Compare energies, forces and stresses with those of an ASE calculator (or of a plain numpy
+    implementation where ASE has no calculator for the potential).
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
         frames: positions and cells to compare, by name or in order, or an iterator of names and frames;
             default the initial frame and a later one, since the forces of a perfect crystal vanish.
         judge: reference to use instead of the one chosen by `ase_models.reference`.
-        lammps: whether a user's pair function is also evaluated by LAMMPS, if installed; the results must
-            agree.
+        lammps: also evaluate a user's pair function by LAMMPS, if installed; the results must agree.
 
-    For a pair potential with more than `SAMPLED` atoms, energies and forces of a few hundred atoms at random
-    places are compared, chosen by `neighborhoods`: an exact statement about those atoms. Each frame has its
-    own places, so that two frames cover twice the atoms.
+    For a pair potential with more than `SAMPLED` atoms, only energies and forces of a few hundred atoms are
+    compared, chosen at random places by `neighborhoods`; for these atoms the comparison is exact. Each frame
+    has other places, so that two frames cover twice as many atoms.
 
     Raises:
         InputError: the system cannot be built.
@@ -404,7 +404,7 @@ def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = 
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
-        judge: source of the forces; default ASE's class, or plain numpy where ASE has none or takes minutes.
+        judge: source of the forces; default ASE, or plain numpy where ASE has no calculator or takes minutes.
     """
     # its optimizers come with it, and a run that is only compared needs none
     from ase.md.verlet import VelocityVerlet
@@ -463,7 +463,7 @@ PLACES, ATOMS = 8, 32  # places at random, and atoms nearest to each whose energ
 def neighborhoods(
     atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
 ) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
-    """Yield free clusters at random places: a group of atoms with all atoms within reach of the group.
+    """Yield free clusters at random places: each a group of atoms with all atoms within reach of the group.
 
     For a pair potential of that reach, the chosen atoms have the same energies and forces in the cluster as
     in the whole system, so a difference in the cluster is a difference in the whole. Neighbors are found by
@@ -471,7 +471,7 @@ def neighborhoods(
 
     Args:
         atoms: the whole system, with any cell; coordinates may lie outside the cell.
-        reach: no interaction is longer, length.
+        reach: largest range of an interaction, length.
         places, count: number of groups, and largest number of atoms in each, all within reach of its center.
         seed: random seed for the centers, each an atom.
 

@@ -168,7 +168,7 @@ def pair_forms(model: CutPotential, symbols: Sequence[str], compare: str) -> dic
     """Return the interaction of every two species, in both orders.
 
     Args:
-        symbols: of the species, sorted.
+        symbols: symbols of the species, sorted.
         compare: comparison that defines inside, as in a system file.
     """
     forms = {}

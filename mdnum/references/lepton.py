@@ -122,7 +122,7 @@ class Lepton(ClassicalCalculator):
     """ASE calculator that evaluates a pair function with LAMMPS, in a separate process for each call.
 
     Args:
-        simulation: of a pair function.
+        simulation: a simulation with a user's pair function.
 
     Raises:
         Untranslated: lepton does not support the formula.

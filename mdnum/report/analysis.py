@@ -1,4 +1,4 @@
-"""Statistics of a run's tables: chatter, residence times, busiest pairs, margins in bounds, and energies."""
+"""Statistics of a run's tables: chatter, residence times, busiest pairs, margins per bound, and energies."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class Scan:
 
     @property
     def alternates(self) -> bool:
-        """True if the flips of every pair enter and leave alternately; otherwise a flip is missing."""
+        """True if every pair enters and leaves alternately; otherwise a flip is missing."""
         self._follow()
         return self._alternates
 

@@ -1,6 +1,6 @@
 """Findings of all verbs, their sentences, and the verdict that summarizes them.
 
-Code determines a finding (code, values); a text file next to the verb has its sentences, with named fields.
+A verb determines a finding by its code and its values; a text file next to the verb has the sentences.
 `mdnum/verbs/__init__.toml` explains what such a file contains, and what the format of a field determines.
 """
 
@@ -221,7 +221,7 @@ class Verdict:
         return " ".join((self.headline, *self.evidence))
 
     def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a summary with headline, findings and verdict; an empty one means an unfinished folder."""
+        """Return a summary with headline, findings and verdict; an empty one if the folder is unfinished."""
         usual = {"status": "complete" if summary else "unfinished", "seconds": None}
         found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
         return headed(kind, {**usual, **summary, **found})

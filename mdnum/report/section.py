@@ -134,7 +134,7 @@ def curves(
     Args:
         x: positions shared by all lines.
         lines: values of each line, by label.
-        log: True for a logarithmic axis, without values ≤ 0 and lines that have no others.
+        log: True for a logarithmic axis; values ≤ 0, and lines with no other values, are left out.
     """
     if log:
         lines = {label: positive(y) for label, y in lines.items() if np.any(np.nan_to_num(y) > 0)}

@@ -347,7 +347,7 @@ _RUNS = Path("runs")
 
 
 def default_folder(system: str, runs: Path = _RUNS) -> Path:
-    """Create a new folder runs/NAME-N: the system's name in dashes, and the first N past existing numbers.
+    """Create a new folder runs/NAME-N: NAME is the system's name with dashes, N the first unused number.
 
     Creating the folder claims its name: processes that search at the same time get different folders.
 

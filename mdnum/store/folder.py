@@ -264,7 +264,7 @@ class RunFolder:
         return True
 
     def checkpoint_beside(self, state: Callable[[], Mapping[str, Any]]) -> None:
-        """Write a forced `checkpoint` in a background thread, which also makes the state.
+        """Write a forced `checkpoint` in a background thread; the thread also makes the state.
 
         An error in the thread is raised by the next checkpoint, or by `finalize`.
         """

@@ -1,8 +1,8 @@
 """The verbs, one module each; their functions are the functions of `mdnum`.
 
-Each verb is declared in its module (see `mdnum.verbs.frame`) and in the text file of the same name, whose
-tables `__init__.toml` explains; there is no other list of its commands and folders. A verb's module is
-imported only when the verb is used.
+Each verb is declared in its module (see `mdnum.verbs.frame`) and in the text file of the same name;
+`__init__.toml` explains the tables of text files. No other file lists commands and folders. The module of a
+verb is imported only when the verb is used.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mdnum.registry import Registry
 
 
 def _check(module: Any) -> None:
-    """Raise an error if another package's module lacks something that its text file declares."""
+    """Raise an error if a module of another package lacks something that the module's text file declares."""
     from mdnum.store import Layout
 
     texts, name = beside(module.__file__), module.__name__
@@ -58,7 +58,7 @@ PARTIAL, UNDECIDED = "partial", "undecided"
 
 @dataclass(frozen=True)
 class Reply:
-    """Result of a command that is printed immediately, without a folder."""
+    """Result of a command that is printed immediately; the command makes no folder."""
 
     document: Mapping[str, Any]  # for JSON
     # for people: lines, findings, and tables of a title, columns and rows, or of a title and records
@@ -108,7 +108,7 @@ def home(kind: str) -> str:
 
 
 def schema(kind: str) -> dict[str, Any]:
-    """Return the JSON Schema of a kind's documents: of mdnum, of the package with the kind, or answer.json.
+    """Return the JSON Schema for a kind of document: mdnum's, that of the kind's package, or answer.json.
 
     Raises:
         InputError: no installed verb makes such documents.

@@ -62,9 +62,9 @@ def audit(
 ) -> Outcome:
     """Test whether a calculator is safe to run and to differentiate.
 
-    The effort is limited by the number of calls of the calculator, independent of its speed: about 6,000
-    calls for one element, and at most 12,000. Calls that lead to a verdict come first. If an audit is
-    interrupted, the completed checks are in its folder.
+    The effort is limited by the number of calls, independent of the calculator's speed: about 6,000 calls for
+    one element, and at most 12,000. Calls that lead to a verdict come first. If an audit is interrupted, the
+    completed checks are in its folder.
 
     Example:
         >>> mdnum.audit_calculator(ase.calculators.emt.EMT(), "copper.xyz").verdict
@@ -76,7 +76,7 @@ def audit(
         structure: an ASE `Atoms` object or a file that ASE can read; by default the calculator's own
             structure, or one that is built for it.
         checks: names of `CHECKS`; default all.
-        temperature: temperature of kT and of the run, K; by default the system's own, or 300.
+        temperature: temperature of the run and in kT, K; by default that of the system, or 300 K.
         timestep: time step of the run, fs (τ for a system in reduced units); by default a fraction of the
             period of the fastest vibration.
         steps: number of steps of the run; default 200.
@@ -244,7 +244,7 @@ def answer_of(
 
 
 def _keep_evidence(folder: RunFolder, loaded: LoadedCalculator, check: AuditCheck) -> None:
-    """Write structures that reproduce a finding to the last bit, and a script that does so without mdnum."""
+    """Write structures that reproduce a finding to the last bit, and a script that shows it without mdnum."""
     from mdnum.audit.record import STRUCTURES, script
 
     _write_structures(folder, check.structures)

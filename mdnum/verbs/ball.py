@@ -40,7 +40,7 @@ def bounce(
     against: Sequence[str | Mapping[str, Any]] = (),
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a ball's system and its variants, record every contact and stop decision, and write a report.
+    """Simulate a bouncing ball and its variants, record every contact and solver stop, and write a report.
 
     Example:
         >>> mdnum.bounce("ball/drop", against=["precision.state=float32"])
@@ -199,7 +199,7 @@ def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dic
 
 
 def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
-    """Return the loss, if possible from a derivative of the program itself, which is already compiled."""
+    """Return the loss: if possible, the value computed with a derivative of the program itself."""
     same = ("unrolled", "frozen", "event-aware")
     known = [made["value"] for made in gradient if made["method"] in same and not made["refused"]]
     return known[0] if known else problem.value()

@@ -42,12 +42,12 @@ class BallView(View):
 
     @property
     def ended(self) -> dict[str, int]:
-        """Number of solves by the reason why they ended."""
+        """Number of solves for each reason why the solver stopped."""
         return {word: n for word, n in self.summary["ended"].items() if n and word != "none"}
 
     @property
     def located(self) -> bool:
-        """True if impacts are located within a step; the counts are then impacts, not iterations."""
+        """True if impacts are located within a step; counts are then of impacts, not of iterations."""
         return self.summary["integrator"] == "event-located"
 
     def first_step(self, reason: str) -> int:

@@ -30,7 +30,7 @@ def tables(run: BallRun) -> dict[str, dict[str, np.ndarray]]:
 
 
 def steps(run: BallRun) -> dict[str, np.ndarray]:
-    """One row per state 0..steps: contacts, flips, the solver's end, margins, mean height and energy."""
+    """One row per state 0..steps: contacts, flips, how the solver ended, margins, mean height and energy."""
     entered, left = run.contacts.counts(run.steps)
     inside = run.contact.sum(axis=1)
     first = inside[0] - entered[1] + left[1]
@@ -77,8 +77,8 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
     """Return one row per stop decision, for the steps that had something to solve.
 
-    All decisions are included if one rule stops all balls and histories were kept; otherwise, the last two of
-    each solve.
+    All decisions are included if one rule stops all balls and histories were kept; otherwise, only the last
+    two decisions of each solve.
     """
     rule = rule_of(run)
     if rule is None:
@@ -187,7 +187,7 @@ def compared(
     Args:
         found: where the variant diverges from the run.
         other: the run of the variant.
-        gradient, theirs: derivatives of the run and of the variant, the first method's first.
+        gradient, theirs: derivatives of the run and of the variant; those by the first method come first.
     """
     own, their = (dict(made[0]["gradient"]) if made else {} for made in (gradient, theirs))
     forked, separation = found.fork is not None, found.separation
@@ -284,7 +284,7 @@ def solved(run: BallRun) -> np.ndarray:
 
 
 def ambiguous_flips(run: BallRun) -> np.ndarray:
-    """Select contact flips whose step depends on rounding; flips with an exact height do not."""
+    """Select contact flips whose step depends on rounding; flips with an exact height do not depend on it."""
     return run.contacts.ambiguous & (run.contacts.bound > 0)
 
 
@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step; if balls have their own, of the one nearest to its tolerance."""
+    """Residual and stop margin of each step; for separate residuals, of the ball nearest to tolerance."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

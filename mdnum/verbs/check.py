@@ -52,7 +52,7 @@ class Checked:
 
 
 def check(question: str, system: Simulation | System | str | Path, *, allow_code: bool = False) -> Checked:
-    """Compare a system with other codes.
+    """Compare the energies, pairs or dynamics of a system with those of other codes.
 
     Example:
         >>> mdnum.check("energy", "argon/liquid-864").report.ok
@@ -131,8 +131,8 @@ def structure_findings(system: System) -> Iterator[Finding]:
 def temperature_findings(start: float, requested: float, atoms: int, unit: str) -> Iterator[Finding]:
     """Yield a warning if the temperature of the velocities differs greatly from the requested one.
 
-    There is no warning for a crystal, which loses half of its kinetic energy at first, nor for the scatter of
-    few atoms.
+    No warning is given for a crystal, which loses half of its kinetic energy at first, or for a difference
+    within the statistical scatter of few atoms.
     """
     ratio = start / requested if requested > 0 else 1.0
     if 1 / _OTHER <= ratio <= _OTHER or abs(ratio - 1) <= 5 * math.sqrt(2 / (3 * atoms)):

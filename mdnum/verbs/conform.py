@@ -112,15 +112,15 @@ def conform(
         pairs: a name (`references.conformance.known`), `package.module:function`, `file.py:function`, or a
             function of (positions, cell, pbc, r_cut) that returns (i, j), (i, j, shift), (i, j, shift,
             distance) or a mapping; or a class with `allocate` and `update`. A list with a name is called in a
-            separate process, so that a crash is a finding. With `resume`, the examined list if it had no
-            name; otherwise omitted.
+            separate process, so that a crash is reported as a finding. With `resume`, give the list again
+            only if it had no name.
         cases: number of random cases in addition to the named cases, at most `MOST_CASES`; default 500.
         seed: seed of the random cases.
         large: include cases with 5,000 and 100,000 atoms.
         full: whether every pair is listed from both of its atoms (True) or once (False); by default detected.
         precision: precision of the list's arithmetic, "float64" or "float32"; by default detected.
         superset: whether pairs beyond the cutoff may be listed.
-        limits: unsupported features of the list, words of `LIMITS`: such cases are skipped.
+        limits: features that the list does not support, as words of `LIMITS`; cases with them are skipped.
         time: time limit in minutes, after which no further case is tested and no failure is reproduced.
         out: the new folder; default runs/conform-<name>-<n>.
         resume: a folder to resume instead, with its original options.
@@ -128,9 +128,9 @@ def conform(
         progress: see `mdnum.verbs.frame.Keep`.
 
     Returns:
-        the outcome; its result is the `references.conformance.Report`. The status in its summary is "partial"
+        the outcome; its result is the `references.conformance.Report`. The status in the summary is "partial"
         if the time limit was reached after `BREADTH` cases of each area, "undecided" if it was reached
-        before.
+        earlier.
 
     Raises:
         InputError: there is no such list, or it cannot be called, or its return value is no list of pairs; or

@@ -1,4 +1,4 @@
-"""`mdnum flips`: the ledger of flips of any program's trajectory; for two trajectories, see flips_compare."""
+"""`mdnum flips`: ledger (table) of the flips in any program's trajectory; for two, see flips_compare."""
 
 from __future__ import annotations
 
@@ -103,13 +103,13 @@ def flips(
         most: maximum number of neighbors of an atom inside a cutoff; the nearest are kept.
         between: two selections in MDAnalysis syntax; only pairs with one atom in each are examined.
         by: "atom" for pairs of atoms, "residue" for pairs of residues; two residues are inside if their
-            smallest distance is.
+            nearest two atoms are.
         hydrogens: whether hydrogens and virtual sites count in contacts between residues.
-        window: number of frames within which a reversed flip is chatter, and up to which an absence is
-            ignored in an intermittent contact.
+        window: number of frames. A flip reversed within this number is chatter; a shorter or equal absence
+            does not end an intermittent contact.
         format: format of the files, if their names do not reveal it.
-        drop_repeats: omit every frame that repeats an earlier one or its time; the others keep their numbers.
-            Such frames are reported in any case.
+        drop_repeats: omit every frame that repeats an earlier frame or its time; other frames keep their
+            numbers. Such frames are reported in any case.
         keep: see `frame.Keep`; without overrides.
 
     Raises:
@@ -158,7 +158,7 @@ def flips(
 
 @dataclass
 class FrameExamination:
-    """Examination of frames into a folder; frames are read from a file or pushed by a `Recorder`."""
+    """Examination of frames, with results in a folder; the frames come from a file or from a `Recorder`."""
 
     answer: Answer  # its folder takes what follows from the tables, when all frames were examined
     rows: HeldRows  # to be handed over to the folder by then
@@ -172,11 +172,11 @@ def examining(
     opened: Trajectory, asked: tuple[Rule, ...], between: tuple[str, str] | None, window: int,
     live: bool = False, hydrogens: bool | None = None, **keep: Unpack[Keep],
 ) -> Iterator[FrameExamination]:  # fmt: skip
-    """Context manager of a new folder whose tables are filled inside; arguments as for `flips`.
+    """Context manager for a new folder, whose tables are filled inside the block; arguments as for `flips`.
 
     Args:
-        live: whether frames come from a running program: frame numbers are then steps, between which no
-            decisions are made, and rows are kept in part files because the program may be killed.
+        live: whether frames come from a running program. Frame numbers are then time steps, with no decisions
+            in between, and rows are kept in part files because the program may be killed.
         hydrogens: whether hydrogens count in contacts between residues; None for pairs of atoms.
     """
     from mdnum.trajectories.follow import follow
@@ -376,7 +376,7 @@ def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
 
 
 def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str, Any]:
-    """Summarize the times of the frames: interval, uniformity, and whether a simulation can have them."""
+    """Summarize the times of the frames: interval, uniformity, and whether simulations produce such times."""
     timed = trajectory.time != "frame"
     times = frames["time"][frames["rule"] == 0]
     steps = np.diff(times)
@@ -570,7 +570,7 @@ def _counted(
 def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
     """Name atoms as "GLY 12 CA" (or by atom name if there are no residues), and residues as "GLY 12".
 
-    Where there are several segments, theirs is in front: "A GLY 12".
+    If there are several segments, the name begins with the segment: "A GLY 12".
     """
     several = len(set(table.segments.tolist())) > 1
     columns = (table.segments, table.residue_names, table.residue_ids, table.names)
@@ -599,7 +599,7 @@ def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str
 
 
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
-    """Estimate the rate of crossings from velocities, as if continuously observed, and that of flips."""
+    """Estimate the rate of crossings, as if observed continuously, from velocities; and the rate of flips."""
     duration = steps["last_time"] - steps["first_time"]
     if not one.flux or not steps["timed"] or not duration > 0 or found.odd is not None:
         return None

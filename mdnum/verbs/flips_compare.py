@@ -1,4 +1,4 @@
-"""`mdnum flips A B`: comparison of the neighbor sets of two trajectories of the same atoms, by frame."""
+"""`mdnum flips A B`: comparison of neighbor sets in two trajectories of the same atoms, frame by frame."""
 
 from __future__ import annotations
 
@@ -248,7 +248,7 @@ def _evidence(view: ComparisonView) -> Iterator[str]:
 
 
 def _certain(one: Mapping[str, Any]) -> str:
-    """Classify since when the neighbor sets differ irrespective of the rounding of the files."""
+    """Classify from when on the neighbor sets differ by more than rounding in the files explains."""
     if one["first"]["pairs"] > one["first"]["ambiguous"]:
         return "some"
     return "never" if one["certain"] is None else "later"
@@ -269,7 +269,7 @@ def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _leap(view: ComparisonView, first: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a sentence if the separation grows faster than before when the sets begin to differ."""
+    """Yield a sentence if the separation grows faster once the sets differ than it did before."""
     table, at = view.table("apart"), int(first["frame"])
     furthest = table["furthest"]
     # a difference that has just begun grows fast, whatever began it

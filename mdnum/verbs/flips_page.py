@@ -1,4 +1,4 @@
-"""Findings, sections and figures of a ledger of flips, and its limits, from the folder alone."""
+"""Findings, sections and figures on the flips of a trajectory, and their limits, from the folder alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Functions shared by one and two trajectories: the summary of a file, and formatting of its numbers."""
+"""Functions for the analysis of one trajectory and the comparison of two: summary, and format of numbers."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def name_of(trajectory: Trajectory) -> str:
 
 
 def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None) -> dict[str, Any]:
-    """Return the entries of summary.json on a file."""
+    """Return the entries of summary.json that describe a file."""
     return {
         "world": "flips", "question": question, "system": name_of(trajectory), "file": str(trajectory.path),
         **{name: getattr(trajectory, name) for name in ("format", "reader", "atoms", "length", "time")},
@@ -86,7 +86,7 @@ def as_python(in_memory: bool) -> Iterator[None]:
 
 
 def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = False) -> dict[str, Any]:
-    """Return the entries of summary.json on how reading ended."""
+    """Return the entries of summary.json that describe how reading ended."""
     told = None if stopped is None else str(stopped)
     return {
         "stopped": in_python(told) if told and in_memory else told,

@@ -1,7 +1,7 @@
-"""`mdnum fork`: where two runs that differ in one choice diverge, and whether a flip caused it.
+"""`mdnum fork`: where two runs that differ in one choice diverge, and whether a flip is the cause.
 
-In both worlds, one choice (`fork`) or every choice (`fork_screen`) is varied, two finished runs are compared
-or replayed (`fork_folders`), or ensembles are compared (`fork_benign`).
+For molecular dynamics and for a ball, `fork` varies one choice and `fork_screen` every choice; `fork_folders`
+compares or replays two finished runs. `fork_benign` compares ensembles.
 """
 
 from __future__ import annotations
@@ -60,21 +60,21 @@ def fork(
 
     Args:
         system: a simulation, a system, a shipped name or the path of a system file, of either world.
-        vary: the choice, such as "precision" or "contact=earlier"; "all" screens every choice. The default,
-            as for steps and split, is that of the [fork] table of the system file, or else "precision".
+        vary: the choice, such as "precision" or "contact=earlier"; "all" screens every choice. Defaults of
+            vary, steps and split are in the [fork] table of the file, if any; else vary is "precision".
         steps: last step; by default the system's own.
         split: separation that counts as a split, length; default 0.01 of the longest cutoff, for a ball 0.01
             of the largest start height.
         repeats: maximum number of further pairs of runs with perturbed starts, which distinguish a delay from
-            chance; default 15. Pairs are run until the verdict is clear, and again with start displacements a
-            hundredth of that size.
-        counterfactual: whether to run B's arithmetic under A's decisions, which the verdict requires.
+            chance; default 15. Pairs are run until the verdict is clear, and again with starts displaced a
+            hundredth as far.
+        counterfactual: whether to run B's arithmetic under A's decisions; this run is needed for a verdict.
         back: whether to run A's arithmetic under B's decisions too, for the two-by-two table; by default the
             same as counterfactual.
         lyapunov: whether to propagate a tangent along A, for the largest Lyapunov exponent (not for a ball).
-        minimal: whether to find the smallest set of decisions that, overridden with A's, keeps the runs
-            together; this takes up to 80 runs.
-        pin: a decision to override with A's in one additional run of B: "fork", a pair "3-75", or a pair over
+        minimal: whether to find the smallest set of B's decisions that must be replaced by A's to keep the
+            runs together; this takes up to 80 runs.
+        pin: a decision that one additional run of B takes over from A: "fork", a pair "3-75", or a pair over
             a window "3-75:600..700". minimal and pin are for molecular dynamics only.
         keep: see `mdnum.verbs.frame.Keep`.
 
@@ -133,9 +133,9 @@ def _asked_by_default(system: Any) -> Mapping[str, Any]:
 def fork_screen(
     system: Simulation | System | BallSystem | str | Path, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Run the free runs of every choice, and rank the choices by when they fork.
+    """Run each choice without imposed decisions, and rank the choices by the step at which the runs fork.
 
-    Counterfactuals are left for the choices that prove to matter.
+    For the choices that prove to matter, `fork` also runs counterfactuals (one run's decisions in the other).
 
     Example:
         >>> mdnum.fork_screen("argon/crystal-108", steps=200)
@@ -173,7 +173,7 @@ def fork_screen(
 def fork_folders(
     a: str | Path, b: str | Path, *, replay: bool = False, objects: Sequence[Simulation] = (), **asked: Any
 ) -> Outcome:
-    """Compare two finished runs of one world: find their differences, and where they diverge.
+    """Compare two finished runs of molecular dynamics or of a ball: how they differ, and where they diverge.
 
     Example:
         >>> mdnum.fork_folders("runs/liquid-864", "runs/liquid-864-2")
@@ -182,10 +182,10 @@ def fork_folders(
         a, b: run folders; or two folders of `mdnum.Recorder` or `mdnum flips`, whose steps are frames.
         replay: run both again (molecular dynamics), and judge the flip at their fork as `fork` does. The
             summary then states whether the replay diverges where the stored tables do; the replay has the
-            same bits if versions and processor are the same. Otherwise nothing is run, and all dates are
+            same bits if versions and processor are the same. Without replay nothing is run, and all steps are
             those of the stored tables.
-        objects: the simulations of these runs, if they were made from objects; they are matched with the
-            folders, and checked, by the data in the folders.
+        objects: the simulations of these runs, if the runs were made from objects; the data in the folders
+            show which simulation belongs to which folder, and check it.
         asked: out, report and progress; for a replay also steps, split, repeats, counterfactual, back,
             lyapunov, minimal and pin of `fork`, with at most as many steps as both runs have.
 

@@ -1,4 +1,4 @@
-"""`mdnum fork certify` and `processes`: runs versus exact arithmetic, and programs versus each other."""
+"""`mdnum fork certify` and `processes`: runs versus exact arithmetic, and variants of one program."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def fork_certify(
     policies: Mapping[str, Any] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find, for each precision, the step at which a run departs from the history in exact arithmetic.
+    """Find, for each precision, the step at which a run departs from the decisions of exact arithmetic.
 
     Example:
         >>> mdnum.fork_certify("argon/crystal-108", steps=100)
@@ -51,7 +51,7 @@ def fork_certify(
         system: a simulation, a system, a shipped name or the path of a system file: one pair potential, NVE,
             at most 108 atoms; or a ball whose steps consist of sums and products.
         steps: last step; by default the system's own.
-        policies: precisions to rank, by name: dtypes by role, such as {"state": "float32"}; default
+        policies: precisions to rank: for each name, the dtypes by role, such as {"state": "float32"}; default
             `MD_POLICIES` or `BALL_POLICIES` of `mdnum.forks.exact.certify`.
         keep: see `mdnum.verbs.frame.Keep`.
 

@@ -1,4 +1,4 @@
-"""`mdnum fork map` and `forecast`: where decisions change along a parameter, and which would flip first."""
+"""`mdnum fork map` and `forecast`: where decisions change along a parameter, and which flip first."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def fork_map(
     confirm: bool = True,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find where the history of a run's decisions changes along a parameter, to adjacent floats.
+    """Find the values of a parameter at which the decisions of a run change, to adjacent floats.
 
     Example:
         >>> mdnum.fork_map("argon/crystal-108", "cutoff.radius", 1.58, 1.59, steps=100)

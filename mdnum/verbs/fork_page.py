@@ -1,4 +1,4 @@
-"""Report page of a pair of runs, of either world, from the folder alone."""
+"""Report page of a pair of runs, of molecular dynamics or of a ball, from the folder alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs of a pair, of either world, and the summary and tables of their fork folder."""
+"""Run two simulations that differ in one choice, and write the summary and tables of their folder."""
 
 from __future__ import annotations
 

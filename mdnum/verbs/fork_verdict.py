@@ -1,4 +1,4 @@
-"""Findings on two runs of either world, and the verdict in one sentence, from the folder alone."""
+"""Findings on two runs, and the verdict in one sentence, from the folder alone."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """State how many of the pair and its repeats split later without the flips, at each displacement."""
+    """State how many runs (the pair and its repeats) split later without flips, at each displacement."""
     said = ""
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -158,7 +158,7 @@ def _findings(view: View) -> Iterator[Finding]:
 
 
 def must_hold(row: Mapping[str, Any]) -> Finding:
-    """Return the finding that a choice that by design cannot change a bit did change one."""
+    """Return the finding that a choice changed a bit although, by design, it cannot."""
     values: dict[str, Any] = {name: row.get(name) for name in ("choice", "difference", "first_bit", "fork")}
     return TEXTS.finding("MUST_HOLD_FORKED", *["fork"] * (row.get("fork") is not None), **values)
 

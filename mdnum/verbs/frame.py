@@ -94,7 +94,7 @@ class View:
         return self._tables[name]
 
     def kept(self, codes: Mapping[str, Any]) -> list[Finding]:
-        """Return findings of summary.json that the verb cannot derive again because it lacks their codes."""
+        """Return findings in summary.json that the verb cannot derive again because it lacks these codes."""
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
 
@@ -117,7 +117,7 @@ class Verb:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised if control-C is pressed when an answer (`outcome`) already exists, which is in its folder."""
+    """Raised if control-C is pressed when an answer already exists: `outcome`, stored in its folder."""
 
     def __init__(self, outcome: Outcome):
         super().__init__(outcome)
@@ -274,7 +274,7 @@ def answering(
     progress: Progress | None = None,
     allow_code: bool = False,
 ) -> Iterator[Answer]:
-    """Context manager of a new folder, which is afterwards stored with its duration, judged and shown.
+    """Context manager for a new folder; at its end, results and duration are stored, judged and shown.
 
     Args:
         kind, name, system: as for `new_folder`.

@@ -1,4 +1,4 @@
-"""`mdnum grad`: derivatives of a loss through a rollout of either world by several methods."""
+"""`mdnum grad`: derivatives of a loss through a simulation (a rollout), by several methods."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def grad(
     half_step: bool = True,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Differentiate a rollout's loss with respect to parameters by several methods, and compare these.
+    """Differentiate a rollout's loss with respect to parameters by several methods, and compare the results.
 
     Example:
         >>> mdnum.grad("argon/crystal-108", "mean-potential", ["sigma", "cutoff.radius"], steps=200)
@@ -73,9 +73,9 @@ def grad(
             summary.
         replicas: number of starts for the standard error of the gradient, at least 2; 0 for none. Each
             requires a run and a tangent pass.
-        also: further parts of the diagnosis, of `ALSO`, or "all".
+        also: names of further parts of the diagnosis, from `ALSO`, or "all".
         half_step: repeat the run and its gradient at half the time step, which about doubles the work;
-            otherwise no gradient is called trusted, and its number of digits is unknown. Not for a ball.
+            without it no gradient is called trusted, and the number of digits is unknown. Not for a ball.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:

@@ -49,7 +49,7 @@ class ProgressBar:
     """Progress bar of a rollout, called as progress(step, steps, info); shows steps/s, flips, rebuilds, ETA.
 
     If something other than steps is counted, info["unit"] names it. The bar is drawn by a thread, because a
-    run begins with seconds of compilation without calls.
+    run begins with seconds of compilation, during which there are no calls.
 
     Args:
         stream: where to draw a bar, or to print lines if the stream is no terminal; default stderr, or the

@@ -50,7 +50,7 @@ class Recorder:
     Args:
         r_cut: one or more cutoffs, length; pairs by species, nearest neighbors and `most` as for `flips`.
         compare: "r2 <", "r2 <=", "r <" or "r <=", which decides whether a pair exactly at the cutoff is
-            inside. The rounding of r is within the bound of a margin, and does not affect decisions here.
+            inside. The rounding of r is within the bound of a margin, and affects no decision here.
         atoms: ASE `Atoms`, for calls without arguments (`dyn.attach`); positions, box, species and, if the
             calculator provides it, the total energy are read from them.
         pair_energy: u(r), the energy of a pair at a distance up to the cutoff, as truncated there (with

@@ -1,4 +1,4 @@
-"""`mdnum run`: a rollout of a system into a folder, with comparison to the reference and a verdict."""
+"""`mdnum run`: simulation of a system, stored in a folder, with a comparison to ASE and a verdict."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def run(
         save_every: number of steps between trajectory frames; by default the system's.
         overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
         resume: continue the run in this folder, bit for bit.
-        check: compare with ASE (or with plain numpy if ASE has no such potential).
+        check: compare with ASE (or plain numpy, if ASE has no calculator for the potential).
         report: write report.html.
         progress: see `mdnum.verbs.frame.Keep`.
         allow_code: execute the Python code that a system file names.

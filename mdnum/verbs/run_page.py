@@ -114,7 +114,7 @@ class RunView(View):
 
     @cached_property
     def budget(self) -> dict[str, np.ndarray]:
-        """Energy over time: its change, the cumulative jumps of the ledger, and the difference of the two."""
+        """Energy over time: its change, the cumulative jumps of the flips, and the difference of the two."""
         conserved = self.series["conserved"]
         change, jumps = conserved - conserved[0], np.cumsum(self.series["energy_jump"])
         return {"change": change, "jumps": jumps, "residual": change - jumps}

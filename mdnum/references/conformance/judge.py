@@ -150,7 +150,7 @@ def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
     """Return all errors in the pairs from a neighbor list; empty if the pairs conform.
 
     A pair within rounding error of the cutoff (`Truth.scale` times the unit roundoff of the list) may be
-    present or absent, but must be so for both of its atoms.
+    present or absent, but in the same way for both of its atoms.
 
     Args:
         truth: exact pairs, listed as far as the answer may reach.

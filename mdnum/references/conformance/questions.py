@@ -364,10 +364,10 @@ def plan(
 
     Args:
         count: number of random cases.
-        seed: of the random cases.
+        seed: seed of the random cases.
         padding: padding of a kept list, in skins, if known; see `motions`.
-        far: include cases that terminate a process which allocates a cell grid over all space.
-        large: include 5,000 and 100,000 atoms.
+        far: include cases in which a cell grid over all space exceeds memory and ends the process.
+        large: include cases with 5,000 and 100,000 atoms.
     """
     named = [*movers(), *motions(padding)] if tested.kept else []
     named += as_kept(tested, catalog())

@@ -261,8 +261,8 @@ def examine(
 
     Args:
         cases: number of random cases, in addition to the named ones.
-        seed: of the random cases.
-        large: include 5,000 and 100,000 atoms.
+        seed: seed of the random cases.
+        large: include cases with 5,000 and 100,000 atoms.
         stop: stop at the first failure.
         shrink: reduce failures to a few atoms.
         apart: call the list in a separate process, so that a crash is reported; needs a list from `load`.
@@ -272,7 +272,7 @@ def examine(
         deadline: no case starts after this time; the remaining cases are counted.
         answers: results of an earlier examination of the same cases, which are not run again; new results are
             added to it.
-        saved: called at the beginning and after each new result, with whether it must not be lost.
+        saved: called at the beginning and after each new result, with True if it must not be lost.
 
     Returns:
         the cases and their results. A list may raise exceptions, return anything and write to its input:
