@@ -1,8 +1,8 @@
 """Test whether a fork is benign: whether two programs whose runs diverge still give the same measurements.
 
-B is compared with an ensemble of A at a step that is found by calibration. Too early, the ensemble differs by
-less than rounding errors may; too late, every run has forgotten its start, and a changed program gives the
-same scatter. The window between these limits depends on the system. Therefore planted changes are run, and
+B is compared with an ensemble of A at a step that is found by calibration. Too early, the runs differ by less
+than rounding errors can cause; too late, every run has forgotten its start, and a changed program gives the
+same scatter. The window between depends on the system. Therefore programs with planted changes are run, and
 the comparison takes place at a step at which all of them can be distinguished from rounding.
 
 The rule is that of the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
@@ -201,7 +201,7 @@ class Calibration:
 
     @property
     def rate(self) -> float:
-        """False positives per verdict, estimated from the rate of outliers among the held-out single runs."""
+        """Share of verdicts that are false positives, estimated from the outliers among the held-out runs."""
         return two_of_three(self.alone / self.held_out) if self.held_out else float("nan")
 
     @property
@@ -291,7 +291,7 @@ def calibrate(
 
 
 def choose(windows: Sequence[Window], name: str) -> Window:
-    """Choose the latest window in which every planted change is clear, or else the window that is clearest.
+    """Choose the latest window in which every planted change is clear, or else the clearest window.
 
     Raises:
         InputError: no window distinguishes the planted changes.
@@ -365,7 +365,7 @@ def benign(
     If B passes, the choice had no larger effect than the smallest perturbation of a start.
 
     Args:
-        twin: the programs. B's frame does not matter, because no feature depends on atom labels or axes.
+        twin: the programs. B's atom labels and axes do not matter, because no feature depends on them.
         steps: step of the comparison; default the step found by calibration.
         calibration: an existing calibration of A's ensemble.
         progress: called with the number of runs done, their total, and a dictionary of figures.

@@ -215,10 +215,10 @@ def boundaries(
     """Find the boundaries of a run's history along a number, within the resolution of a grid.
 
     The system is run at every point of a grid. A cell whose ends have different histories is bisected until
-    its ends are adjacent floats. If the other half contains a change too, that half is searched later. The
-    search proceeds upward from the lowest float, so boundaries beyond the requested number lie above all that
-    were found. All runs use the program that a user runs (for the cutoff radius, a program that takes the
-    radius as an argument). A fresh process repeats the runs on both sides of every boundary.
+    its ends are adjacent floats. The other half, if it contains a change too, is searched later. The search
+    proceeds upward from the lowest float, so boundaries beyond the requested number lie above all that were
+    found. All runs use the program that a user runs (for the cutoff radius, a program that takes the radius
+    as an argument). A fresh process repeats the runs on both sides of every boundary.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.

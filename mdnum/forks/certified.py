@@ -1,10 +1,10 @@
 """Reliability of the decisions of runs: each run by itself, and one run relative to another.
 
-There are three dates. Up to the *certified horizon* of a run no decision was within its rounding bound: exact
-arithmetic, applied to the same states, would have given every decision the same result. Up to the end of
-*protection*, the pair closest to its cutoff was further from it than the separation of the runs can have
-moved the pair. As long as both conditions hold, no decision can differ. If one program is the wider one in
-every role, the other program agrees with all its decisions up to the *shadow horizon*.
+There are three dates (steps). Up to the *certified horizon* of a run no decision was within its rounding
+bound: exact arithmetic, applied to the same states, would have given every decision the same result. Up to
+the end of *protection*, the pair closest to its cutoff was further from it than the separation of the runs
+can have moved the pair. As long as both conditions hold, no decision can differ. If one program is at least
+as precise in every role, the other program makes the same decisions up to the *shadow horizon*.
 
 All dates refer to decisions given the state at their step. A decision that is correct for its state is
 correct for this run, which may have left the exact history long before (`forks.exact.certify` finds when).

@@ -1,7 +1,7 @@
 """Ensembles of runs of one program from slightly perturbed starts, measured at a few steps; planted changes.
 
 Every feature is a continuous function of the positions, so small differences between the members of a short
-run remain small in the features. Therefore pairs are counted with hat functions and not in boxes.
+run remain small in the features. Therefore pairs are counted with hat functions and not in bins.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def hats(
     """Count distances in a histogram of hat functions: a distance between two nodes is shared between both.
 
     Every node receives a share that grows linearly with proximity. Distances below the first node count for
-    that node. The last node only ends the histogram, so a pair that moves out of range causes no jump.
+    the first node. The last node only ends the histogram, so a pair that moves out of range causes no jump.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)

@@ -1,7 +1,7 @@
 """Where two finished runs of one world diverge, and how the runs differ, according to their folders.
 
 No run is repeated. The first differing bit and the fork are read from the tables of both folders. To compare
-positions, `twin_of` rebuilds both programs from the folders, and `mdnum.forks.fork` runs them again.
+positions, `twin_of` rebuilds both programs from the folders, and `mdnum.forks.fork` runs both again.
 
 Two runs belong to different systems if their steps or subjects do not correspond: different atoms, another
 box, another potential or another contact. Any other difference, in a number or in a choice of the program, is

@@ -215,9 +215,9 @@ def _beyond(step: int) -> int:
 def displacements(fork: Fork) -> tuple[float, float]:
     """Return two displacements (lengths) for starts of repeats: the runs' initial separation, and less.
 
-    At a hundredth of the first displacement a repeat begins to have the pair's rounding errors; at much less
-    it equals the pair itself and proves nothing. If a hundredth is less than an ulp, the second displacement
-    may be larger than the first.
+    At a hundredth of the first displacement a repeat begins to have the pair's rounding errors; at much less,
+    the repeat equals the pair itself and proves nothing. If a hundredth is less than an ulp, the second
+    displacement may be larger than the first.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]

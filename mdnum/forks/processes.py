@@ -132,8 +132,8 @@ def variants(
 ) -> Variants:
     """Run a system in several programs, two processes at a time, and find which results agree.
 
-    All programs use a single neighbor list, with twice the skin if the box has room, and stop before that
-    skin is used up. Another machine may give other clusters: some processors have no fused multiply-add.
+    All programs use a single neighbor list, with twice the skin if the box has room, and stop before motion
+    exceeds it. Another machine may give other clusters: some processors have no fused multiply-add.
 
     Args:
         system: a system that was loaded from a file and has a pair potential.

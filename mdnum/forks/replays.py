@@ -2,8 +2,8 @@
 causes.
 
 A decision is overridden by imposing A's decision on B; B makes all other decisions itself. The smallest set
-of pairs that keeps B with A is found by bisection and delta debugging, as Verrou finds the instructions of a
-program.
+of pairs that keeps B with A is found by bisection and delta debugging, as Verrou finds the instructions that
+cause an error.
 """
 
 from __future__ import annotations

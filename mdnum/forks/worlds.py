@@ -1,7 +1,7 @@
 """The program, the numbers and the variations of a system of either world.
 
-The functions import the modules of molecular dynamics themselves, because those modules import jax_md, which
-a ball does not need.
+The functions import the modules of molecular dynamics when they are called, because those modules import
+jax_md, which a ball does not need.
 """
 
 from __future__ import annotations

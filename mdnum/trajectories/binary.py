@@ -1,10 +1,10 @@
 """Readers of GROMACS's xtc and trr files that check each frame before it is decoded.
 
 If bytes are wrong, the library that decodes xtc files divides by zero or writes outside its buffers, and all
-earlier results are lost with the process. Each frame is therefore examined first. The compressed stream
-states how many bits each atom takes; a walk through the stream, without decoding, verifies header, number of
-atoms, step sizes and length. Damage that leaves a valid stream is not detected. Source: the algorithm of
-xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile), the walk alone.
+earlier results are lost with the process. Each frame is therefore examined first: the compressed stream
+states how many bits each atom takes, so that the header, the number of atoms, the numbers of bits and the
+length can be verified without decoding. Damage that leaves a valid stream is not detected. Source: the
+algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
 
 MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. They write the index through
 symbolic links, and trust it even if it belongs to another file; this module uses no index file. Source of the
@@ -83,7 +83,7 @@ class XdrFile:
         return number
 
     def ends_at(self, number: int) -> bool:
-        """Return True if the file ends with the frame before the given number."""
+        """Return True if the frame before the given one is the last of the file."""
         return self.start(number) == self._size
 
     def start(self, number: int) -> int:

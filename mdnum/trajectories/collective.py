@@ -41,7 +41,7 @@ class Collective:
             x: positions of a sample of the atoms, which represents all atoms.
             atoms: number of all atoms.
             side: length of the shortest lattice vector; 0 without a periodic direction.
-            far: the length of a displacement that is far between two frames in this box; 0 without a box.
+            far: length from which a displacement between two frames is large in this box; 0 without a box.
         """
         now, least, last, alike = spreads(x), self.least, self.last, self.alike
         share, axis, value = _most_alike(x)

@@ -1,10 +1,10 @@
 """Meaning of the six box numbers in a DCD file: there are three conventions, and no record of the choice.
 
 The numbers are lengths and cosines of the angles (NAMD, VMD, LAMMPS, MDAnalysis since 2.10), lengths and
-angles in degrees (CHARMM before version 22, OpenMM, MDAnalysis before), or a symmetric matrix of vectors
-(CHARMM since 22). With a wrong box, atoms overlap across the boundary, and atoms that are wrapped between
-frames seem to leap. If neither is observed, the version in the header decides: all programs except CHARMM
-write 24.
+angles in degrees (CHARMM before version 22, OpenMM, MDAnalysis before), or a symmetric matrix of lattice
+vectors (CHARMM since 22). With a wrong box, atoms overlap across the boundary, and atoms that are wrapped
+between frames seem to leap. If neither is observed, the version number in the header decides: all programs
+except CHARMM write 24.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Reading of one trajectory, or of two trajectories in step, with checks of frames and flips of neighbors.
+"""Reading of one trajectory, or of two frame by frame, with checks of frames and flips of neighbors.
 
 The neighbor sets of two trajectories are compared once, at the first frame. From then on, the flips of both
-trajectories update the difference, so the cost of a frame is proportional to its changes.
+trajectories update the difference, so the cost of a frame is proportional to the number of its flips.
 """
 
 from __future__ import annotations

@@ -98,11 +98,11 @@ class FrameCheck:
     """Check that rejects frames which no simulation writes or which cannot be compared with the first one.
 
     Raises:
-        FrameError: a coordinate is not finite; an atom is further out than any atom gets, or than floats
-            resolve distances of length `radius`; more than one atom is at exactly 0, 0, 0; all atoms made an
-            impossible common move; the box repeats along other axes than in the first frame (most often, the
-            box is missing) or along an axis without a vector; or the label of an atom differs from the first
-            frame, and the file has no ids or a rule needs species.
+        FrameError: a coordinate is not finite; an atom is farther out than any atom gets, or so far out that
+            floats do not resolve distances of length `radius`; more than one atom is at exactly 0, 0, 0; all
+            atoms made an impossible common move; the box repeats along other axes than in the first frame
+            (most often, the box is missing) or along an axis without a vector; or the label of an atom
+            differs from the first frame, and the file has no ids or a rule needs species.
     """
 
     atoms: AtomIndices = None  # those that matter, ascending; None for all
@@ -203,7 +203,7 @@ def far_out(
 ) -> tuple[int, int, str] | None:
     """Return the most distant atom if it is impossibly far out; arguments as in `FrameCheck`.
 
-    Positions of some atoms one frame earlier give the size of the system even if half of it is damaged.
+    Positions of some atoms one frame earlier give the size of the system even if half the frame is damaged.
 
     Returns:
         (the atom, the number of atoms too far out, the reason in words); None if no atom is too far out.

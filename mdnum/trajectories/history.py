@@ -1,4 +1,4 @@
-"""History of every pair over the frames: its flips, its contacts, and the flips left at larger strides.
+"""History of every pair over the frames: its flips, its contacts, and the flips that larger strides leave.
 
 The module `lost` estimates from such counts how many flips are lost between frames.
 """

@@ -9,9 +9,9 @@ with the coordinates as they are stored, i < j, integers s and the reduced vecto
 operations. A decision therefore does not depend on the search that found the pair.
 
 Bins divide the coordinates of the reduced lattice. Nonperiodic directions have bins too, folded onto a fixed
-number of them, so that one distant atom creates neither many bins nor a full one. For each bin, the atoms of
-all bins in reach are gathered with the lattice vectors that bring them near, repeatedly if the box is small;
-then every atom of the bin is compared with all gathered atoms.
+number of them, so that one distant atom neither creates many bins nor puts all others into one. For each bin,
+the atoms of all bins in reach are gathered with the lattice vectors that bring them near, repeatedly if the
+box is small; then every atom of the bin is compared with all gathered atoms.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ReducedLattice(NamedTuple):
 
     @property
     def volume(self) -> float:
-        """Volume of the box; nonperiodic directions count with one unit of length."""
+        """Volume of the box; a nonperiodic direction counts as one unit of length."""
         return float(1.0 / abs(np.linalg.det(self.inverse)))
 
     def rounding(self, largest: float, radius: float) -> float:

@@ -157,7 +157,7 @@ def parse_slice(words: str, where: str = "") -> slice:
     """Return the slice that a text describes: "100:", "::10", "-50:", "5" (one frame), "" (all frames).
 
     Raises:
-        InputError: the text is not a slice, or its stride is not positive, whereas flips follow time.
+        InputError: the text is not a slice, or its stride is not positive (flips are found forward in time).
     """
     match = _SLICE.fullmatch(words.strip())
     if match is None:

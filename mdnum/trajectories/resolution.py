@@ -282,9 +282,9 @@ def grid_effect(
 
     Error: the atoms of a pair are assumed to move independently and straight, and pairs to be spread evenly
         around the cutoff; the draws scatter by about 1 % of the shares. In an LJ liquid with known float64
-        positions, the shares were right to 0.01 at strides of 0.0002 to 0.1 τ, among the 4 nearest to 0.02
-        and the 12 nearest to 0.07 (tests/trajectories/test_resolution.py). Bonded atoms move together, with
-        less relative motion than assumed.
+        positions, the shares were right to 0.01 at strides of 0.0002 to 0.1 τ; for the 4 nearest neighbors to
+        0.02, and for the 12 nearest to 0.07 (tests/trajectories/test_resolution.py). Bonded atoms move
+        together, with less relative motion than assumed.
     """
     if len(sample) < 2 or not len(sample[0].positions) or not radius > 0:
         return None

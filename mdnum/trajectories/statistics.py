@@ -5,7 +5,7 @@ Three quantities describe how long contacts last:
 - the **lifetime** of a contact whose beginning was observed: the product-limit estimate (Kaplan and Meier, J.
   Am. Stat. Assoc. 53, 457, 1958), in which contacts that outlast the last frame count for the time observed;
 - the **mean by rate**: time inside divided by the number of departures, which uses every frame of every
-  contact, whether its ends were observed or not, and is the mean lifetime if pairs leave at a constant rate;
+  contact, even if its ends were not observed. It is the mean lifetime if pairs leave at a constant rate;
 - the **residence**: of the pairs inside at some frame, the share still inside, without a break, after a given
   lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more often, so
   residence differs from lifetime.
@@ -56,7 +56,7 @@ class Durations(Sums):
 
     @property
     def followed(self) -> Int[np.ndarray, "lengths"]:
-        """Contacts with observed beginning, by frames until their observed end or last observed survival."""
+        """Contacts whose beginning was observed, by the frames until their end or until last observed."""
         # one that goes on after n frames was seen to survive n - 1 times
         return self.seen + np.append(self.goes_on[1:], 0)
 
@@ -140,7 +140,7 @@ def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.nd
 
 
 def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Count pairs inside at a frame that are inside after a lag too, whatever happened in between.
+    """Count pairs that are inside both at a frame and after a lag, whatever happened in between.
 
     The ratio of the two results is the intermittent counterpart of `residence` (counts for subsets of the
     pairs are additive). Each lag is from 0 to frames - 1.
@@ -248,7 +248,7 @@ class ClassTally(Sums):
 
     @property
     def mean_stay(self) -> Float[np.ndarray, "classes classes"]:
-        """Mean number of frames inside per departure; nan if no pair left."""
+        """Mean number of frames inside for each departure of a pair; nan if no pair left."""
         none = np.full(self.left.shape, np.nan)
         return np.divide(self.exposure, self.left, out=none, where=self.left > 0)
 

@@ -1,7 +1,7 @@
 """Trajectories that ASE reads, and text files that are read frame by frame, with every digit kept.
 
-Text formats read by this module, and what the libraries lose of them (tests/trajectories/test_source.py
-measures that they still do):
+Text formats read by this module, and what other libraries lose when they read these formats (as
+tests/trajectories/test_source.py confirms):
 
 - LAMMPS's `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org/dump.html,
   Howto_triclinic): MDAnalysis reduces them to float32 and reads a tilted box without its tilt;
@@ -137,7 +137,7 @@ def format_of(path: Path) -> str:
 
 
 def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
-    """Reject a last line that was cut within its last number, since the remaining digits are another number.
+    """Reject a last line that was cut within its last number, since the remaining digits form another number.
 
     A missing newline proves nothing by itself, since some programs omit it. The number was cut if it has
     fewer digits than the numbers at the same place in the lines before.

@@ -2,9 +2,9 @@
 
 Atoms are sorted into clusters of sixteen by halving space. Two clusters and the lattice vector between them
 form a tile: a row of sixteen decisions, as bits, for each atom of the first cluster. At each frame, the rows
-that may hold a near pair are computed in float32 vectors and compared with the frame before. A pair closer to
-its threshold than float32 can resolve is decided by the number that all searches use (`search.exact_square`),
-and so is a pair whose margin is needed.
+that may hold a near pair are computed in float32 vectors and compared with the previous frame. A pair closer
+to its threshold than float32 can resolve is decided by the number that all searches use
+(`search.exact_square`), and so is a pair whose margin is needed.
 
 Tiles remain valid as long as each cluster stays in the box around it with which the tiles were found. Atoms
 are followed through the lattice, so an atom that a code wraps into the box between two frames has not moved

@@ -1,8 +1,8 @@
 """Base class of all trajectory readers: the requested frames, in order, and the properties of the atoms.
 
-Positions are those of the file: nothing is wrapped, unwrapped or centered. Readers differ in precision: ASE's
-and mdnum's own (gro, LAMMPS's text dumps) keep every digit, MDAnalysis's reduce every coordinate to float32
-(`Trajectory.bits`).
+Positions are those of the file: nothing is wrapped, unwrapped or centered. Readers differ in precision: those
+of ASE and of mdnum (gro, LAMMPS's text dumps) keep every digit, while those of MDAnalysis reduce every
+coordinate to float32 (`Trajectory.bits`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Motion of atoms across the faces of the box, and frames that do not continue the frame before.
+"""Motion of atoms across faces of the box, and frames that do not continue the previous frame.
 
 An atom that is wrapped into another cell has to jump by whole lattice vectors of the box at that frame;
 otherwise quantities computed from its path are wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153,

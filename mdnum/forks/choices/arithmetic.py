@@ -1,8 +1,8 @@
 """Choices of arithmetic: the float format of each role, and the order of sums.
 
 The order of a sum is set by a reduction, or by the order of pairs in lists, which depends on how and when
-lists are built. These choices do not change which pairs interact if every list is rebuilt before its skin is
-used up. They must have no effect on sums that do not depend on order.
+lists are built. These choices do not change which pairs interact if every list is rebuilt before motion
+exceeds its skin. The choices must have no effect on sums that do not depend on order.
 """
 
 from __future__ import annotations
