@@ -30,7 +30,7 @@ def idle(done: int, total: int, info: dict[str, Any]) -> None:
 
 
 class CallsUp(TimeUp):
-    """Raised when a check or a search has used up its calls; the work in progress is abandoned."""
+    """Raised when a check or a search has made all calls allowed to it; the work in progress is abandoned."""
 
     why = "the calls of this check were used up"
 
@@ -84,7 +84,7 @@ class Meter:
 
     @contextmanager
     def apart(self, calls: int) -> Iterator[None]:
-        """Grant extra calls for a result that several checks share; the check keeps its own calls."""
+        """Grant extra calls for a result that several checks share, beyond those of the check itself."""
         most = self.most
         self.most = self.calls + calls
         try:

@@ -54,8 +54,8 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
     element if the calculator distinguishes the two. The lattice constant is at the calculator's own energy
     minimum. The crystal is repeated until two cutoffs fit into the cell (at most 500 atoms, fewer for a slow
     calculator), and its atoms are displaced slightly. `info["origin"]` describes the structure. If the
-    calculator fails on atoms without neighbors, a denser crystal is built: this failure is a finding and does
-    not stop the audit.
+    calculator fails on atoms without neighbors, a denser crystal is built: the failure is reported later and
+    does not stop the audit.
 
     Args:
         deadline: time limit for building; at the deadline, or after `BUILDING_CALLS` calls, the best

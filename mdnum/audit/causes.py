@@ -50,8 +50,8 @@ def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
     """Return the index of the finding under which each finding is listed (its own if listed separately).
 
     A finding is listed under the deepest reported cause that explains it and is no less severe, or under the
-    first finding of the same code. A shared cause is likely but not proven: fix the upper finding and run the
-    audit again.
+    first finding of the same code. A shared cause is likely but not proven: correct the upper finding, and
+    run the audit again.
 
     Args:
         findings: code and severity of each, in the order in which they were found.

@@ -1,4 +1,4 @@
-"""Overall conclusion of all calculator checks: is the calculator safe to run, and to differentiate?"""
+"""Overall conclusion of all calculator checks: is it safe to run the calculator, and to differentiate it?"""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Locate and measure jumps and kinks of a curve by scanning and zooming, down to neighboring doubles.
 
 A curve is an energy and the force along one coordinate. Each value is predicted from the points on its left
-and, independently, from those on its right. Across a smooth stretch the mismatch of the two predictions
-falls with the fourth power of the spacing; across a jump it does not fall, and across a kink it falls only
-with the first power. The rate at which the mismatch falls on zooming therefore identifies the singularity,
+and, independently, from those on its right. Across a smooth stretch the mismatch of the two predictions falls
+with the fourth power of the spacing; across a kink the mismatch falls only with the first power, and across a
+jump not at all. The rate at which the mismatch falls on zooming therefore identifies the singularity,
 whatever the curve looks like elsewhere.
 """
 

@@ -48,7 +48,7 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
         None if all potentials are mdnum's, else plain values: `from` and `to`, length; `smoothness`, the
         number of derivatives of the cut energy that do not jump at the cutoff (-1: the energy jumps; 3: or
         more); `places`, a row each: `term`, `pair`, `distance`, the `order` of the lowest derivative of the
-        energy that jumps, `what` that is (the energy is 0, the force 1) and its `jump`, beyond minus before.
+        energy that jumps (0: the energy, 1: the force), its name `what` and its `jump`, beyond minus before.
         Where the function is "singular" or "not finite" the order is -1; it is -2 where the "force" is not
         minus the derivative of the energy, as with a wrong `custom_jvp`. If the energy is piecewise linear,
         one row, that of the largest, stands for all `kinks` `between` two distances; those within a 1920th of

@@ -290,8 +290,8 @@ def settled(
     """Return the structure with its atoms displaced slightly, away from any threshold, and its noise level.
 
     In a perfect crystal a whole neighbor shell can lie exactly on a cutoff, which would disturb checks that
-    are not about thresholds. An energy step within the line appears as noise, so the quietest of several
-    random displacements is used.
+    are not about thresholds. An energy step within the line appears as noise, so the displacement with the
+    least noise of several random ones is used.
 
     Args:
         at_least: minimum number of atoms; a smaller periodic cell is repeated.

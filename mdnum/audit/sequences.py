@@ -67,7 +67,7 @@ def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]
 
 
 def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures in which every atom moves slightly in its own direction, using up a skin slowly."""
+    """Yield structures in which every atom moves slightly in its own direction, until a skin is exceeded."""
     heading = rng.standard_normal((len(atoms), 3))
     heading /= np.linalg.norm(heading, axis=1)[:, None]
     yield "the structure", atoms

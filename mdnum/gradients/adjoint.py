@@ -1,7 +1,7 @@
 """Reverse-mode derivatives of a rollout at its recorded states and decisions.
 
 Inside jax.value_and_grad a compiler makes another forward pass, which rounds differently and, after some
-thousand steps, decides differently. Here the run is made first, by the same program as every other run.
+thousand steps, makes other decisions. Here the run is made first, by the same program as every other run.
 
 A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
 times that vector. For a pair potential this product is a tangent evaluation, pair by pair, gathered like the
@@ -339,7 +339,7 @@ def reverse(
     Args:
         wanted: derivatives to compute beyond the start: MODEL, SCALE, FORCE (the integrator's numbers),
             WEIGHT.
-        saltation: whether to add the effect of every flip through the time at which it happens.
+        saltation: whether to add the effect of every flip through the time at which the flip happens.
         guard: radial speed, length per internal time, below which a flip counts as grazing and adds nothing.
         watch: called with every stretch, last first, and the cotangents carried at its steps.
 

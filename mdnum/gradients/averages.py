@@ -1,10 +1,10 @@
 """Derivatives of averages over states, from one run that is not differentiated.
 
 An average over states does not depend on the time order of the frames. The derivative of an average by a
-parameter has up to three contributions. The term of each frame changes at fixed positions. Pairs cross the
-cutoff: a term that jumps when a pair enters changes with the radius by the jump times the density of pairs at
-the cutoff, which derivatives at fixed decisions miss. Under a thermostat, the weight exp(-U/kT) of each frame
-changes.
+parameter has up to three contributions. First, the term of each frame changes at fixed positions. Second, a
+term that jumps when a pair enters changes with the cutoff radius by the jump times the density of pairs
+there; derivatives at fixed decisions miss this. Third, under a thermostat, the weight exp(-U/kT) of each
+frame changes.
 """
 
 from __future__ import annotations
@@ -323,7 +323,7 @@ class Reweighting(Method):
     the derivative of the energy, divided by kT.
 
     Error: statistical; `details` holds a standard error from block averages. With few correlated frames the
-    error is large; the estimate covers only the variation within this run. Source: S. Thaler, J. Zavadlav,
+    error is large; its estimate covers only the variation within this run. Source: S. Thaler, J. Zavadlav,
     Nature Communications 12, 6884 (2021).
     """
 

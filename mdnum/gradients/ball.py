@@ -1,4 +1,4 @@
-"""Derivatives of a ball's rollout: a program with decisions has several, computed by different methods.
+"""Derivatives of a ball's rollout: a program with decisions has several derivatives, one for each method.
 
 The methods here differentiate the operations that ran (unrolled), the program with every decision pinned
 (frozen), or the loss averaged over random parameters (randomized). Methods that change the contact are in

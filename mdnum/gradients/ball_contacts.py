@@ -1,4 +1,4 @@
-"""Derivatives of a ball with special treatment of contacts: fixed point, soft floor, or true motion."""
+"""Derivatives of a ball's motion, with contacts treated by a fixed point, a soft floor, or as true motion."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """The derivative of the projection's fixed point, by the implicit function theorem.
 
-    The loss uses the iterations that ran; the derivative uses their limit, which is the floor for every gain.
-    The method `unrolled` gives a nonzero derivative by k, which is an artifact of the tolerance.
+    The loss uses the iterations that ran; the derivative uses the limit of the iterations, the floor for any
+    gain. The method `unrolled` gives a nonzero derivative by k, which is an artifact of the tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by

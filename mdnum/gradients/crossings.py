@@ -1,10 +1,10 @@
 """Contributions of flips to a gradient, through the times at which pairs cross their cutoff.
 
 If the force jumps at the cutoff, a perturbed pair crosses earlier or later, and its momentum differs from
-then on. Derivatives of a program's steps miss this effect, and the error does not shrink with the time step.
-The contribution is the saltation term of mdnum.numerics, with the cutoff sphere as the threshold, in the form
-for a reverse pass. A loss that uses the potential energy or the virial also jumps at a crossing: if its
-frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
+then on. Derivatives of a program's steps miss this effect, and their error does not shrink with the time
+step. The contribution is the saltation term of mdnum.numerics, with the cutoff sphere as the threshold, in
+the form for a reverse pass. A loss that uses the potential energy or the virial also jumps at a crossing: if
+its frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
 
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
 dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.

@@ -128,7 +128,7 @@ def choose_step(f: Callable[[float], float], x: float, first: float, spacing: fl
     """Choose the step at which truncation and noise of a central difference are about equal.
 
     Args:
-        first: the initial step, which is also the largest: beyond it the function may differ in kind.
+        first: the initial step, which is also the largest, because the function may differ in kind beyond it.
         spacing: between the values from which the noise is estimated: some rounding errors of x.
 
     Error: the truncation is estimated from differences over one and two steps; for a function that jumps in

@@ -38,7 +38,7 @@ def value_and_grad(
         a function from values by name (parameters without a value keep that of the system file) to (value,
         gradient by name), with names as given. For a complex loss z both are complex; the derivative by a
         real parameter p is dz/dp = d Re z/dp + i d Im z/dp, without a conjugate: d|z|² = 2 Re(conj(z) dz),
-        d arg z = Im(dz/z). It is no direction of descent; `mdnum grad` and `trust` take real losses only.
+        d arg z = Im(dz/z). This is no direction of descent; `mdnum grad` and `trust` take real losses only.
 
     Raises:
         InputError: a parameter or method does not exist, the method does not apply, or a value is not real.

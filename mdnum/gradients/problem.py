@@ -122,7 +122,7 @@ class Gradient:
 
 
 class Method:
-    """A way to differentiate a rollout: a frozen dataclass of its options, in a file with a row in METHODS.
+    """A way to differentiate a rollout: a frozen dataclass of options, with a row in the table METHODS.
 
     This base class serves both molecular dynamics and the ball; `ball.BallMethod` takes the problem of a
     ball.

@@ -81,7 +81,7 @@ def passed(
         names: full names of the parameters. saltation: whether to include the contribution of flips.
         guard: as a share of the rms radial speed of a pair. budget: bytes of the recorded run that are kept.
         tape: the run, if already made; with flips, if saltation is requested. Without saltation all its flips
-            count as grazing: this program is the one of event-aware, which need not be compiled twice.
+            count as grazing: the program is then that of event-aware, which need not be compiled twice.
 
     Raises:
         InputError: saltation without a pair potential. NumericalError: the run blew up, or second

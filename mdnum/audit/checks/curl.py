@@ -100,8 +100,8 @@ class CurlCheck(AuditCheck):
 def agreed(tried: Sequence[Loop]) -> Loop:
     """Return the loop with the smallest error, increased if a loop of another radius disagrees.
 
-    The curl is the same on every small circle, while the work due to a jump of the forces depends on the
-    circle.
+    The curl is the same for every small circle, while the work due to a jump of the forces depends on the
+    radius.
     """
     best = min(tried, key=lambda one: one.error)
     others = [one.curl for one in tried if _SIGNIFICANT * one.error < abs(best.curl)]

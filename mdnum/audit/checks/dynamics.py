@@ -51,8 +51,8 @@ class DynamicsCheck(AuditCheck):
     """Does a short run at constant energy conserve its energy, and if not, why?
 
     The check reports the energy drift with a block error, separated into integrator, flips and the rest. The
-    drift that remains after subtracting flips and the work of the forces is due to the integrator, and must
-    fall to a quarter with half the time step, which a second run tests.
+    drift that remains after subtracting flips and the work of the forces is due to the integrator. It must
+    fall to a quarter at half the time step; a second run tests this.
     """
 
     name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
@@ -113,7 +113,7 @@ class DynamicsCheck(AuditCheck):
 
 
 def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor) -> tuple[float, float]:
-    """Return the largest energy difference between a run and new objects, and its allowed value, eV."""
+    """Return the largest difference between energies of the run and of new objects, and its limit, in eV."""
     places = np.unique(np.linspace(0, len(ran.potential) - 1, count).astype(int))
     again = [subject.fresh().energy(ran.at(ran.positions[n])) for n in places]
     rounding = NoiseFloor(np.finfo(float).eps * largest(ran.potential), 0.0)

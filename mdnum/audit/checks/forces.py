@@ -80,8 +80,8 @@ class ForcesCheck(AuditCheck):
     """Are the forces minus the gradient of the energy, and of which energy?
 
     The error of a finite difference is |D(h) - D(h/4)| after extrapolation plus the measured noise over the
-    step; of nine steps h, the one with the smallest error is used. A deviation that grows like 1/h indicates
-    a jump of the energy, not a wrong force, and is reported as such.
+    step; of nine steps h, the one with the smallest error is used. A deviation from the force that grows like
+    1/h is reported as a jump of the energy, not as a wrong force.
     """
 
     name, title, order, basic, calls = "forces", "Forces", 10, True, 500
@@ -221,7 +221,7 @@ def slope(
 
     Args:
         line: displacement per Å of step; `what` names it.
-        forces: the calculator's at `atoms`, where `noise` is that of the energy.
+        forces: forces of the calculator at `atoms`; `noise` is the noise of the energy there.
     """
     plus, minus = (
         np.array([subject.energy(displaced(atoms, sign * step * line)) for step in _LADDER])
@@ -265,7 +265,7 @@ def _best(
 
     Args:
         gaps: difference minus force at each step, the longest first.
-        error: of the differences, estimated; rounding: the contribution of noise to this error.
+        error: estimated error of the differences; rounding: the contribution of noise to it.
     """
     best = int(np.argmin(error))
     wrong = abs(gaps[best])
@@ -359,7 +359,7 @@ def _two_energies(
 ) -> Iterator[Observed]:
     """Yield a finding if `energy` and `free_energy` differ by more than a constant.
 
-    All other checks examine `free_energy`, of which the forces are the gradient by ASE's definition; if the
+    All other checks examine `free_energy`, whose negative gradient the forces are by ASE's definition; if the
     two energies differ by at most a constant, the findings hold for both.
     """
     free, logged = subject.energies(atoms)

@@ -1,4 +1,4 @@
-"""Diagnosis of a gradient through a rollout: how far it can be trusted, and what contributes to it.
+"""Diagnosis of the gradient of a rollout: how far the gradient can be trusted, and what contributes to it.
 
 Methods answer different questions: the derivative of the steps that ran, the derivative of the flow including
 the times of its flips, the slope of the loss between shifted runs, the slope of an average, the derivative of
