@@ -385,13 +385,13 @@ def _on_boundary(spec: BallSpec) -> Iterator[Problem]:
     if not least <= low <= most:
         yield (
             "stop.tol",
-            f"stop.tol = {spec.stop.tol:g} is outside of what {boundary.format} can hold",
+            f"stop.tol = {spec.stop.tol:g} is outside the range of {boundary.format}",
             f"The smallest usable tolerance is {least:.3g}, the largest {most:.4g}",
         )
     if low != spec.stop.tol:
         yield (
             "stop.tol",
-            f"stop.tol = {spec.stop.tol!r} is no {boundary.format}, so no sum of them equals it",
+            f"stop.tol = {spec.stop.tol!r} is not a {boundary.format} number, so no sum equals it",
             f"Set it to the nearest one, tol = {low!r}",
         )
     share = spacing(np.nextafter(low, 0.0), boundary.format) / boundary.terms
@@ -424,7 +424,7 @@ def _starts(spec: BallSpec) -> Iterator[Problem]:
     if not (start.spread or start.spread_ulps):
         return
     if "height" in lists:
-        seen = f"start.{spread} has no meaning where start.height gives every ball its own"
+        seen = f"start.{spread} has no meaning if start.height gives a height for each ball"
         yield f"start.{spread}", seen, f"Remove {spread}, or give one height and start.balls"
     if start.spread and start.spread_ulps:
         yield "start.spread_ulps", "start.spread and start.spread_ulps both given", "Keep one of them"
@@ -464,7 +464,7 @@ def _stops(spec: BallSpec) -> Iterator[Problem]:
         what = "a projection" if contact.kind == "projection" else "implicit-midpoint"
         yield (
             "stop",
-            f"table [stop] missing; {what} iterates until it is told to stop",
+            f"table [stop] missing; {what} iterates until a stopping rule ends it",
             'Add for example [stop] with rule = "sum", tol = 1e-6, max_iter = 100',
         )
     if stop is not None and not needed:
@@ -483,7 +483,7 @@ def _stops(spec: BallSpec) -> Iterator[Problem]:
     if isinstance(stop, RelativeRule) and stop.tol >= 1:
         yield (
             "stop.tol",
-            f"stop.tol = {stop.tol:g} of the first residual is above that residual: nothing is solved",
+            f"stop.tol = {stop.tol:g} is relative to the first residual; with 1 or more, nothing is solved",
             "A relative tolerance is below 1",
         )
     if isinstance(contact, ProjectionContact) and (product := contact.alpha * contact.k) >= 2:

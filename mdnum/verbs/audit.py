@@ -527,13 +527,13 @@ def _page(view: AuditView, verdict: Verdict) -> Page:
             sections[-1], parts=[*sections[-1].parts, TEXTS("how_to_go_on", folder=str(view.folder.path))]
         )
     if (script := view.folder.path / _SCRIPT).exists():
-        code = Code("A script that shows it without mdnum", read_text(script))
+        code = Code("A script that repeats this without mdnum", read_text(script))
         sections.append(Section("Reproduce", [code]))
     for result in state.shown:
         parts = [_plot(result, place) for place in range(len(result.charts))]
         parts += [_marked(rows, title) for title, rows in result.tables.items() if rows]
         sections.append(Section(result.title, parts))
-    sections.append(Section("What was asked about", [pairs(_subject(summary, given))]))
+    sections.append(Section("What was tested", [pairs(_subject(summary, given))]))
     about = f"{state.name}, {summary['formula']}, {many(summary['atoms'], 'atom')}"
     return view.page(f"Audit of {state.name}", about, _keys(summary, verdict, given), sections)
 

@@ -459,7 +459,7 @@ def page(view: View, verdict: Verdict) -> Page:
         "oracle": TEXTS("oracle"),
     })  # fmt: skip
     sections = [
-        Section("Cases by what they are about", [_figure(summary), *_tables(summary)], terminal=True),
+        Section("Cases by subject", [_figure(summary), *_tables(summary)], terminal=True),
         Section("Conventions", [TEXTS("conventions"), pairs(_conventions(summary))]),
         Section("What was run", [pairs(what)]),
     ]
@@ -516,7 +516,7 @@ def _figure(summary: Mapping[str, Any]) -> Figure:
             left += share
         axes.set_yticks(place, [f"{row['area']} ({row['failed']:,} of {row['asked']:,})" for row in rows])
         axes.set_xlim(0, 1.0)
-        axes.set_xlabel("share of the cases asked")
+        axes.set_xlabel("share of the cases tested")
         axes.legend(loc="lower center", bbox_to_anchor=(0.45, 1.0), ncols=4, frameon=False, fontsize=8)
 
     alt = ", ".join(f"{row['area']} {row['failed']} of {row['asked']}" for row in rows) or "none asked"

@@ -458,7 +458,7 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
         lags = table["frames"] * (view.summary["interval"] if view.timed else 1.0)
         shares: list[tuple[str, str, Any, bool]] = [
             ("lifetime (seen to begin)", "survival", "first", False),
-            (f"gaps up to {view.summary['window']} frames overlooked", "intermittent", "first", True),
+            (f"gaps up to {view.summary['window']} frames ignored", "intermittent", "first", True),
             ("still inside, of those found inside", "residence", "second", False),
             ("inside again or still", "again", "second", True),
         ]

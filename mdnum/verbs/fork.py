@@ -366,7 +366,7 @@ def page_benign(view: View, verdict: Verdict) -> Page:
     names = tuple(f"component {k + 1}" for k in range(s["components"]))
     scores = Table(("run", *names), [(k + 1, *row) for k, row in enumerate(s["scores"])])
     return _page(view, f"{s['choice']}, benign?", str(s["difference"]), {}, [
-        Section("What tells B from A", [failing] * bool(s["failing"]), terminal=True),
+        Section("Quantities that distinguish B from A", [failing] * bool(s["failing"]), terminal=True),
         Section("Components", [TEXTS("components"), scores]),
     ])  # fmt: skip
 

@@ -204,7 +204,7 @@ def page_certify(view: View, verdict: Verdict) -> Page:
         return lambda row: (ambiguous.get(row["name"]) or {}).get(name)
 
     ranking = table_of(rows, {
-        "precision": "name", "leaves the exact history at": leaves,
+        "precision": "name", "first differs from exact at": leaves,
         "decision": lambda row: row["subject"] and f"{row['channel']} {'–'.join(map(str, row['subject']))}",
         "margin": "margin", "bits closer": "closer_bits", "growth a step": "growth_rate",
         f"separation at the end ({unit})": "separation_end",
@@ -214,7 +214,7 @@ def page_certify(view: View, verdict: Verdict) -> Page:
     dtypes = table_of(rows, {"precision": "name", **{role: role for role in roles}}, "Dtypes")
     kept_by = "; ".join(f"{row['name']} {leaves(row)}" for row in rows)
     figure = Figure(
-        "ranking", TEXTS("ranking_caption"), f"Steps kept of {steps}, by precision: {kept_by}.",
+        "ranking", TEXTS("ranking_caption"), f"Steps with exact decisions ({steps} in all): {kept_by}.",
         lambda canvas: _bars(s, canvas), 0.8 + 0.34 * len(rows),
     )  # fmt: skip
     series = _drawn(view.table("policy_separations"), {row["name"]: row["name"] for row in rows})
@@ -252,7 +252,7 @@ def _bars(s: Mapping[str, Any], figure: Canvas) -> None:
             axes.plot(doubt, at, "o", ms=5, mfc="none", mec=MUTED)
     axes.set_yticks(place, [row["name"] for row in rows], fontsize=8.5)
     axes.set_xlim(0, 1.02 * last)
-    axes.set_xlabel("leaves the exact history at step")
+    axes.set_xlabel("first decision that differs from exact, step")
 
 
 # -- programs ------------------------------------------------------------------------------------------

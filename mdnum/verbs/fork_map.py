@@ -301,7 +301,7 @@ def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
         weight, x = np.sqrt(np.diff(sides)), (at - at[0]) / (at[-1] - at[0])
         fit = np.polynomial.polynomial.polyfit(x[finite], loss[finite], _TREND, w=weight[finite])
         rest = loss - np.polynomial.polynomial.polyval(x, fit)
-        yield pieces("detail", rest, f"The {s['loss']}, less its trend", ", less a cubic")
+        yield pieces("detail", rest, f"The {s['loss']} minus its trend", ", minus a cubic fit")
     if len(edges) > 1:
         where = np.array([edge["above"] for edge in edges])
         jump, separation = (

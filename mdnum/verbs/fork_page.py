@@ -141,7 +141,7 @@ def _decision(view: View) -> Iterator[Any]:
         rows.append(("Distance", f"{number(d['distance'], 11)} {unit}, cutoff {number(own, 11)} {unit}"))
         if cutoffs["A"] != cutoffs["B"]:
             off = number(cutoffs["B"] - cutoffs["A"], 3, signed=True)
-            rows.append(("Cutoff", f"not the same number in both runs: B’s is {off} {unit} off A’s"))
+            rows.append(("Cutoff", f"differs between the runs: B’s minus A’s is {off} {unit}"))
         slope = d["margin"] / d["margin_length"] if d["margin_length"] else 1.0
     for run, margin in d["margins"].items():
         bound = d["bounds"][run]
@@ -237,7 +237,7 @@ def _two_by_two(view: View) -> Iterator[Any]:
         label, ran = TEXTS("start_displaced", displacement=size, unit=unit), len(s[name])
         for whose, run in (("its own", "free"), ("A’s", "imposed")):
             seen = [one[run] for one in s[name] if one[run] is not None]
-            unseen = [f"{ran - len(seen)} of {ran} not seen to"] * (len(seen) < ran)
+            unseen = [f"{ran - len(seen)} of {ran} unknown"] * (len(seen) < ran)
             steps = [f"{count(min(seen))} to {count(max(seen))}"] if seen else []
             lines[label, whose] = {"A": "; ".join(steps + unseen)}
     yield TEXTS("two_by_two")

@@ -179,7 +179,7 @@ def page(view: View, verdict: Verdict) -> Page:
         Section("How far it is trusted", list(_trust(view)), terminal=True),
         Section("Flips on the way", list(_flips(view))),
         Section("How changes stretch", list(_spectrum(view))),
-        Section("The nearest other histories", list(_edges(view))),
+        Section("Nearest values with other decisions", list(_edges(view))),
         Section("In a narrow format", list(_scaling(view))),
         Section("Left out", list(_left_out(view)), terminal=True),
         Section("What was differentiated", list(_what(view))),
@@ -384,7 +384,7 @@ def _edges(view: View) -> Iterator[Any]:
                 rows[-1][2:] = [repr(side["inside"]), repr(side["beyond"]), decision, *slopes]
     if rows:
         yield TEXTS("edges")
-        yield Table(("parameter", "side", "as here up to", "otherwise from", "first decision", "gradient",
+        yield Table(("parameter", "side", "same decisions up to", "other from", "first decision", "gradient",
                      "beyond"), rows)  # fmt: skip
 
 

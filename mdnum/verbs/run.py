@@ -274,7 +274,7 @@ def _status(run: RunView) -> Iterator[Finding]:
     planned = run.summary.get("steps_asked") or (run.system.get("dynamics") or {}).get("steps")
     of = f" of {planned:,}" if planned and planned > run.steps else ""
     if status == "failed":
-        error = run.summary.get("error") or "It stopped at the first number that was not finite."
+        error = run.summary.get("error") or "The run stopped at the first number that was not finite."
         box = ["box"] * (run.summary.get("reason") == "narrow box")
         yield TEXTS.finding(
             "RUN_FAILED",

@@ -321,7 +321,7 @@ def _pressure(run: RunView, parts: Mapping[str, Any]) -> Iterator[Any]:
     yield pairs([*rows[:at], *terms, *rows[at:]])
     if jump := parts["impulsive"]:
         whole = parts["total"]["mean"] + jump["mean"]
-        barostat = ", and by the target of the barostat" * ("volume" in run.series)
+        barostat = " and by the barostat" * ("volume" in run.series)
         yield TEXTS("impulsive", whole=whole, barostat=barostat, unit=units.pressure)
         if jump["error"]:
             yield TEXTS("impulsive_resolved", errors=abs(jump["mean"]) / jump["error"])
@@ -358,7 +358,7 @@ def _flips_per_step(run: RunView) -> Iterator[Any]:
 
     most = max(int(series[name].max(initial=0)) for name in ("entered", "left"))
     inside = f"{count(int(series['pairs'].min()))} to {count(int(series['pairs'].max()))}"
-    alt = f"Flips per step against time: at most {count(most)} one way in a step; pairs inside: {inside}."
+    alt = f"Flips in each step against time: at most {count(most)} enter or leave; pairs inside: {inside}."
     yield Figure("flips", TEXTS("flips_caption"), alt, draw, 3.5)
     if run.flips.total and run.steps:
         yield TEXTS("flip_rate", rate=run.flips.total / run.steps, pairs=run.flips.pairs)

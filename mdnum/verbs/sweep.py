@@ -259,7 +259,7 @@ def _after_a_loss(
             with place.claimed(address) as mine:
                 if mine and not enough(place.result(address), one.measures):
                     why = (
-                        f"its process ended {TRIES} times without an answer ({type(error).__name__}): memory?"
+                        f"its process ended {TRIES} times without a result ({type(error).__name__}): memory?"
                     )
                     with place.filling(address, point["state"]) as folder:
                         write_result(folder, {"status": "failed", "why": why, "measures": {}, "summary": {},

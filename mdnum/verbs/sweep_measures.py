@@ -112,11 +112,11 @@ def horizon(run: Sample, argument: str) -> Value:
 
 
 for _name, _unit, _title, _of in (
-    ("fork", "time", "time until two runs that differ by a rounding make different decisions", fork),
-    ("split", "time", "time until their separation is a hundredth of the cutoff", split),
-    ("separation", "1/time", "rate at which their separation grows", separation),
+    ("fork", "time", "time until two runs that differ by a rounding error make different decisions", fork),
+    ("split", "time", "time until two such runs are a hundredth of the cutoff apart", split),
+    ("separation", "1/time", "rate at which the separation of two such runs grows", separation),
     ("gradient", "", "derivative of a loss with respect to a parameter", gradient),
-    ("horizon", "time", "time up to which that derivative is trusted", horizon),
+    ("horizon", "time", "time up to which the derivative of a loss is trusted", horizon),
 ):
     _kind = ("CHOICE", _FORKS, _twin) if _of in (fork, split, separation) else (_LOSS, _GRADIENTS, _asked)
     MEASURES.add(_name, Measure(_name, _unit, _title, _of, "simulation", takes=_kind[0], sources=_kind[1],
