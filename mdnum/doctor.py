@@ -344,7 +344,6 @@ def pair_energy(r2: jax.Array) -> jax.Array:
 
 def crystal() -> DoctorRow:
     """Compare distances and energy of the tilted crystal, jitted and eager, with numpy and exact sums.
-    sums.
 
     On CPUs, jax 0.10.2 jits a vmapped matrix-vector product followed by a reduction incorrectly
     (jax-ml/jax#39103), without a warning: one coordinate of every displacement in a tilted box is wrong. The

@@ -186,7 +186,6 @@ class CrossRecorder:
         self, first: int, rows: int, a: PairFlips, b: PairFlips
     ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
         """Count the pairs that differ at each of the next steps; return also the flips that change the count.
-        count.
 
         Args:
             first: step of the first row.
@@ -332,7 +331,6 @@ def overridden(
     r_cut: Float[np.ndarray, "channels species species"],
 ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
     """Count the pairs whose decisions differ between two records; find their largest distance to the cutoff.
-    cutoff.
 
     Args:
         cells: as for `separations`.

@@ -57,7 +57,7 @@ class Advice:
         key: key of the axis. end: the value that is regarded as converged; None if there is none.
         settings: every value with its comparison, starting at the converged end.
         best: the value furthest from the end for which it and all values between are within the tolerance;
-            None if this is only the end itself, or if undecided.
+            the end itself if there is no other.
         undecided: the first undecided value beyond best.
         converged: whether the value next to the end agrees with it within the tolerance: if not, the end
             itself may not be converged.

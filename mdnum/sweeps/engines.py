@@ -45,7 +45,6 @@ _LOOK = 5.0
 @cache
 def _pinned(width: int) -> None:
     """Restrict this process to reserved cores, because XLA uses all visible cores despite OMP_NUM_THREADS.
-    OMP_NUM_THREADS.
 
     A core is reserved by a lock that is released when the process ends, so that all sweeps on a machine share
     the cores; if no core is free, a core is used twice.

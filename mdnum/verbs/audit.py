@@ -221,7 +221,6 @@ def answer_of(
     check: AuditCheck, subject: CalculatorSubject, log: frame.Progress, before: Iterable[CheckResult]
 ) -> CheckResult:
     """Return a check's result; a failure of the calculator that ends the check is returned as a finding.
-    finding.
 
     A finding is added if the calculator gave two results for one input, unless an earlier result has it.
     """

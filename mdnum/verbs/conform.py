@@ -66,7 +66,7 @@ class Options:
             raise InputError(
                 f"{self.cases:,} random cases were requested", remedy=f"Give 0 to {MOST_CASES:,}"
             )
-        expect_known("precision", filter(None, [self.precision]), PRECISIONS)
+        expect_known("precision", [] if self.precision is None else [self.precision], PRECISIONS)
         expect_known("limit", self.limits, LIMITS)
         unit = PRECISIONS.get(self.precision or "")
         tested = tested.with_options(full=self.full, superset=self.superset, unit=unit)

@@ -203,9 +203,9 @@ def _differences(view: View) -> list[Any]:
 def _with_error(row: Mapping[str, Any]) -> str:
     """A value with the digits that its error leaves, and the error."""
     value, error = row["value"], row["error"]
-    if not (value and error):
+    if not error:
         return number(value, 5)
-    digits = 2 + int(np.floor(np.log10(abs(value))) - np.floor(np.log10(error)))
+    digits = 2 + int(np.floor(np.log10(abs(value))) - np.floor(np.log10(error))) if value else 2
     return f"{number(value, min(max(digits, 2), 12))} ± {number(error, 2)}"
 
 
@@ -272,7 +272,7 @@ def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
         yield Plot(
             name, series=tuple(series), title=measure["title"], x_label=axis["key"],
             y_label=f"{shown} ({unit})" if unit else shown, caption=TEXTS("along"),
-            verticals=((float(axis["base"]), "system file"),) * (x[0] < axis["base"] < x[-1]),
+            verticals=((float(axis["base"]), "system file"),) * (x[0] <= axis["base"] <= x[-1]),
         )  # fmt: skip
 
 

@@ -30,6 +30,8 @@ def called(words: Sequence[str]) -> tuple[int | None, str, str]:
             code = cli.main(list(words))
     except SystemExit as stopped:
         code = stopped.code
+    except KeyboardInterrupt:
+        raise
     except BaseException:  # whatever it is, nobody caught it
         return None, out.getvalue(), traceback.format_exc()
     return code or 0, out.getvalue(), err.getvalue()
