@@ -48,7 +48,7 @@ _SAME = 1e-9  # of the energy: a second element that changes it by less is none 
 
 
 def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None) -> Atoms:
-    """Return a test structure for a calculator: its own, a crystal, or rigid water.
+    """Return a test structure for a calculator: the calculator's own, a crystal, or rigid water.
 
     The crystal is that of an element that the calculator is meant for; half of its atoms are of a second
     element if the calculator distinguishes the two. The lattice constant is at the calculator's own energy

@@ -51,7 +51,7 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
         energy that jumps (0: the energy, 1: the force), its name `what` and its `jump`, beyond minus before.
         Where the function is "singular" or "not finite" the order is -1; it is -2 where the "force" is not
         minus the derivative of the energy, as with a wrong `custom_jvp`. If the energy is piecewise linear,
-        one row, that of the largest, stands for all `kinks` `between` two distances; those within a 1920th of
+        the row of the largest kink stands for all `kinks` `between` two distances; those within a 1920th of
         the range count as one. `single`: whether a function rounds to float32 internally.
 
     Error:

@@ -46,7 +46,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Boundary:
-    """Two adjacent floats whose runs have different histories, and the first differing decision."""
+    """Two adjacent floats whose runs make different decisions, and the first decision that differs."""
 
     # below, above: the two sides; above.at is the float after below.at
     below: Side
@@ -70,7 +70,7 @@ class Boundary:
 
 @dataclass(frozen=True)
 class Interval:
-    """An interval of the number in which all computed runs have the same history."""
+    """An interval of the number in which all computed runs make the same decisions."""
 
     # low, high: its ends; both were run
     low: float
@@ -88,7 +88,7 @@ class Interval:
 
 @result
 class BoundaryMap:
-    """A run as a piecewise function of a number."""
+    """A run as a piecewise function of one number of its system."""
 
     # number, steps: that was varied, and the last step of every run
     number: Number
@@ -116,12 +116,12 @@ class BoundaryMap:
 
     @property
     def histories(self) -> int:
-        """Number of distinct histories that were found."""
+        """Number of different sequences of decisions (histories) that were found."""
         return len({interval.digest for interval in self.intervals})
 
 
 class NumberLine:
-    """Runs of one program along one number, addressed by the ordinal of a float.
+    """Runs of one system at different values of one number, addressed by the ordinal of a float.
 
     Args:
         program: the program with the system's own value of the number.
@@ -212,13 +212,13 @@ def boundaries(
     confirm: bool = True,
     progress: Progress | None = None,
 ) -> BoundaryMap:
-    """Find the boundaries of a run's history along a number, within the resolution of a grid.
+    """Find where the decisions of a run change along a number, within the resolution of a grid.
 
     The system is run at every point of a grid. A cell whose ends have different histories is bisected until
     its ends are adjacent floats. The other half, if it contains a change too, is searched later. The search
-    proceeds upward from the lowest float, so boundaries beyond the requested number lie above all that were
-    found. All runs use the program that a user runs (for the cutoff radius, a program that takes the radius
-    as an argument). A fresh process repeats the runs on both sides of every boundary.
+    proceeds upward from the lowest float, so if there are more boundaries than requested, the rest lie above
+    all that were found. All runs use the program that a user runs (for the cutoff radius, a program that
+    takes the radius as an argument). A fresh process repeats the runs on both sides of every boundary.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.

@@ -1,4 +1,4 @@
-"""Reliability of the decisions of runs: each run by itself, and one run relative to another.
+"""Reliability of decisions: those of each run by itself, and those of one run relative to another run.
 
 There are three dates (steps). Up to the *certified horizon* of a run no decision was within its rounding
 bound: exact arithmetic, applied to the same states, would have given every decision the same result. Up to
@@ -113,7 +113,7 @@ def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
 
 
 def wider(twin: Twin) -> str | None:
-    """Return the program that has at least the other's precision in every role and more in one, or None.
+    """Return the program whose precision is higher in some role and lower in none; None if neither's is.
 
     The programs must be identical otherwise: the effect of another time step, for example, is not rounding.
     """

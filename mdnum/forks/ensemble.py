@@ -191,7 +191,7 @@ def steps_to_diverge(simulation: Simulation, start: Start | None, separation: fl
 
 @dataclass(frozen=True)
 class Change:
-    """A program that was changed on purpose."""
+    """A program with a deliberate change, to test whether the comparison detects it."""
 
     name: str  # of the change, for readers
     must_fail: bool  # whether it is another model; else only other rounding

@@ -1,4 +1,4 @@
-"""Where two finished runs of one world diverge, and how the runs differ, according to their folders.
+"""Where two finished runs diverge, and how the runs differ, according to their folders.
 
 No run is repeated. The first differing bit and the fork are read from the tables of both folders. To compare
 positions, `twin_of` rebuilds both programs from the folders, and `mdnum.forks.fork` runs both again.
@@ -96,8 +96,8 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
     """Find where two runs diverge, using their folders.
 
     Args:
-        a, b: folders of runs of one world, finished or not; or folders of `mdnum flips` and `mdnum.Recorder`,
-            whose steps are frames.
+        a, b: run folders, both of molecular dynamics or both of a ball; or folders of `mdnum flips` and
+            `mdnum.Recorder`, whose steps are frames.
 
     Raises:
         InputError: the runs belong to different worlds or systems, so that their steps do not correspond (the
@@ -226,8 +226,8 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """Return the choices that a set of differing keys stands for: all dtypes by role are one choice, and so
-    are a cutoff and its numbers.
+    """Return the choices that a set of differing keys stands for: all dtypes by role are one choice; a cutoff
+    with its numbers is one choice too.
     """
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}

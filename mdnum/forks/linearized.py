@@ -1,4 +1,4 @@
-"""The linearized run: how a small perturbation of the start grows, and which decisions it flips.
+"""The linearized run: how a small perturbation of the start grows, and which decisions it changes.
 
 The tangent is propagated along the states that the run recorded, so the linearized run is the recorded run,
 bit for bit, list after list. The growth rate of the tangent is the largest Lyapunov exponent. The tangent is

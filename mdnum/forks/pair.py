@@ -1,4 +1,4 @@
-"""A pair of runs of either world, followed until they split: dates, decision at the fork, and verdict."""
+"""A pair of runs, followed until the runs split: steps of fork and split, deciding flip, and verdict."""
 
 from __future__ import annotations
 
@@ -323,7 +323,7 @@ def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
 
 @result
 class Screened:
-    """Effect of one choice within the horizon."""
+    """Effect of one choice within the steps that were run."""
 
     choice: str  # its name
     difference: str  # one line; why it does not apply where it does not
@@ -338,7 +338,7 @@ class Screened:
 
     @property
     def held(self) -> bool | None:
-        """True if no bit differed within the horizon; None if the choice was not run."""
+        """True if no bit differed in these steps; None if the choice was not run."""
         return None if self.reason_unavailable is not None else self.first_bit is None
 
 

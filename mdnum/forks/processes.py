@@ -1,4 +1,4 @@
-"""Computations in separate processes: histories computed again, and one system run by several programs.
+"""Computations in separate processes: decisions computed again, and one system run by several programs.
 
 Programs of one system (compiled or not, batched, inside a gradient, for other processors) compute the same
 formulas, but the compiler is free to round them differently. XLA's flags apply to a whole process, so each

@@ -1,4 +1,4 @@
-"""Simulations whose neighbor lists hold the same pairs in another order: that of a jax-md format, or
+"""Simulations whose neighbor lists hold the same pairs in another order: in the order of a jax-md format, or
 shuffled.
 
 The forces of a pair on its two atoms are exactly opposite, so a format changes only the order of sums. Dense

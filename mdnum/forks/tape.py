@@ -1,4 +1,4 @@
-"""All pair decisions of a run, stored so that they can be compared with or imposed on another run."""
+"""All pair decisions of a run, stored for comparison with another run or to be imposed on another run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The program, the numbers and the variations of a system of either world.
+"""The program, the numbers and the variations of a system, of molecular dynamics or of a ball.
 
 The functions import the modules of molecular dynamics when they are called, because those modules import
 jax_md, which a ball does not need.

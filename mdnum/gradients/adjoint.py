@@ -5,8 +5,8 @@ thousand steps, makes other decisions. Here the run is made first, by the same p
 
 A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
 times that vector. For a pair potential this product is a tangent evaluation, pair by pair, gathered like the
-forces: no scatter is needed. For any other energy the product is one tangent through one gradient of the
-energy. No tape of operations is kept.
+forces: no scatter is needed. For any other energy, the product is one tangent evaluation of the gradient of
+the energy. No tape of operations is kept.
 """
 
 from __future__ import annotations
@@ -70,8 +70,7 @@ def pull_back(
         x: sorted, wrapped positions, length. bits: the packed decisions that this evaluation used.
         onto_force, onto_energy: cotangents of the forces and of the potential energy.
         onto_virial: cotangent of the virial, or of its tensor, shape (3, 3) and symmetric.
-        wanted: derivatives to compute, of MODEL, SCALE, FORCE, WEIGHT and STRAIN; the others are returned as
-            0.
+        wanted: derivatives to compute, of MODEL, SCALE, FORCE, WEIGHT and STRAIN; others are returned as 0.
 
     Error: one rounding error per pair, in the dtype of the force; sums are taken slot by slot.
     """

@@ -147,7 +147,7 @@ class Symmetric(Method):
 
 @dataclass(frozen=True)
 class EventAware(Method):
-    """The derivative of the flow: that of the steps, plus a contribution from the time of every flip."""
+    """The derivative of the flow: the steps' derivative plus a contribution from the time of every flip."""
 
     # radial speed below which a crossing grazes and is left out, as a share of the rms radial speed of a
     # pair. Left in, single crossings would dominate: their terms go with one over that speed

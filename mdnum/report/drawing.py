@@ -1,4 +1,4 @@
-"""Plots drawn with plain matplotlib, in one style and one width, as SVG that adapts to the page."""
+"""Plots drawn with plain matplotlib, in one style and one width, as SVG figures that adapt to the page."""
 
 from __future__ import annotations
 

@@ -239,7 +239,7 @@ def conclude(
 
     Args:
         found: findings in the order in which they are to be read, whatever their severity.
-        evidence: facts on which the verdict rests, one sentence each.
+        evidence: facts on which the verdict is based, one sentence each.
         headline: the answer to the verb's question.
         best: the tone if there is neither an error nor a warning.
         judged: True if the headline follows from the findings already.

@@ -1,4 +1,4 @@
-"""Shared parts of all pages: template environment, style, and figures for wide and narrow screens."""
+"""Parts that all pages share: template environment, style, and figures for wide and narrow screens."""
 
 from __future__ import annotations
 

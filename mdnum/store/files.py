@@ -300,7 +300,7 @@ def place(path: Path) -> tuple[Path, str]:
 
 
 def foretell(path: Path, new: str) -> None:
-    """Permit a new digest, in addition to the present one, for a file that the manifest lists."""
+    """Permit a new digest, in addition to the present digest, for a file that the manifest lists."""
     root, name = place(path)
     if name == NAME or not (root / NAME).exists():
         return
@@ -333,7 +333,7 @@ def resumable(root: Path) -> bool:
 
 
 def listed_files(root: Path, names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the present digests of files, leaving out missing files."""
+    """Return the digests of files as they are now, leaving out missing files."""
     return {name: [digest(root / name)] for name in names if os.path.lexists(root / name)}
 
 

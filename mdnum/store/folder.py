@@ -191,7 +191,7 @@ class RunFolder:
         return self._layout
 
     def read_as(self, layout: Layout) -> None:
-        """Read a folder of an earlier version with the layout that its verb declares today."""
+        """Read a folder of an earlier version with the layout that the folder's verb declares today."""
         self._layout = layout
 
     @property
@@ -568,7 +568,7 @@ class RunFolder:
             raise FolderError(message, remedy=_RESTORE, where=str(self.path)) from error
 
     def check_start(self) -> None:
-        """Compare the input of a run (its system and the files that belong to it) with the manifest.
+        """Compare the input of a run (the system and the files that belong to the system) with the manifest.
 
         Raises:
             FolderError: the input was changed, so that a new run would differ from the recorded one.

@@ -95,7 +95,7 @@ class Frame:
 
 @dataclass
 class FrameCheck:
-    """Check that rejects frames which no simulation writes or which cannot be compared with the first one.
+    """Check that rejects frames that no simulation writes, and frames that do not match the first frame.
 
     Raises:
         FrameError: a coordinate is not finite; an atom is farther out than any atom gets, or so far out that

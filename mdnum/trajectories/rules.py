@@ -1,4 +1,4 @@
-"""Membership rules, which define the neighbors of an atom, each with a margin.
+"""Membership rules: each defines the neighbors of an atom, and a margin for every decision.
 
 A rule is *symmetric* (a pair is inside or not, in either order) or *directed* (j is a neighbor of i, and i
 need not be a neighbor of j). Distances are compared as float64 squares; a margin is a length, positive
@@ -47,7 +47,7 @@ class _Membership:
 
     @property
     def reach(self) -> float:
-        """Distance beyond which no atom is a neighbor, in length units."""
+        """Distance beyond which no atom can be a neighbor, in length units."""
         return self.radius
 
     @property

@@ -27,12 +27,12 @@ class BallView(View):
 
     @property
     def applied(self) -> list[Mapping[str, Any]]:
-        """Derivatives by method, without the methods that are not applicable."""
+        """Derivatives by method; methods that are not applicable are left out."""
         return [made for made in self.summary["gradient"] if not made["refused"]]
 
     @property
     def exact(self) -> Mapping[str, Any]:
-        """Quantities known in closed form; empty if there are none."""
+        """Quantities known in closed form; empty if no quantity is."""
         return self.summary["exact"] or {}
 
     @property

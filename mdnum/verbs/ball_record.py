@@ -1,4 +1,4 @@
-"""Content of the folder of a ball's run: tables of every decision, a summary, and the closed form."""
+"""Content of the folder of a ball's run: tables of all decisions, a summary, and the closed-form result."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""`mdnum ball --demo` as a function: classic effects, shown within seconds, with the numbers that prove them.
+"""`mdnum ball --demo` as a function: classic effects, shown within seconds, with numbers as proof.
 
-A demonstration is a script in the folder `demos` next to the systems, `NN_its_name.py`: its first line states
-the subject, and its `run()` returns a `Demo`. To add a demonstration, add a file.
+A demonstration is a script in the folder `demos` next to the systems, `NN_its_name.py`: the first line of the
+script states the subject, and the script's `run()` returns a `Demo`. To add a demonstration, add a file.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ def _alike(a: Trajectory, b: Trajectory) -> bool:
 
 
 class ComparisonView(FlipsView):
-    """View of a comparison's folder, with the values that its sentences need."""
+    """View of the folder of a comparison, with the values that sentences about the comparison need."""
 
     @property
     def certain(self) -> bool:

@@ -1,4 +1,4 @@
-"""Statistics and findings on neighbor lists and energy that a simulation loop records with positions."""
+"""Statistics and findings on the neighbor lists and energies that a simulation loop records."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ class FlipsView(View):
 
     @property
     def one(self) -> str:
-        """Kind of object whose neighbors are counted: "a residue" or "an atom"."""
+        """The kind of object of which neighbors are counted: "a residue" or "an atom"."""
         return "a residue" if self.by_residue else "an atom"
 
     @property

@@ -59,7 +59,7 @@ def fork(
         >>> mdnum.fork("argon/crystal-108", "precision.force=float32", steps=500)
 
     Args:
-        system: a simulation, a system, a shipped name or the path of a system file, of either world.
+        system: a simulation, a system, a shipped name or the path of a system file (also of a ball).
         vary: the choice, such as "precision" or "contact=earlier"; "all" screens every choice. Defaults of
             vary, steps and split are in the [fork] table of the file, if any; else vary is "precision".
         steps: last step; by default the system's own.
@@ -318,7 +318,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """Draw one line per choice with the steps of the first different bit, the fork and the split."""
+    """Draw one line per choice, with marks at the first different bit, at the fork and at the split."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (

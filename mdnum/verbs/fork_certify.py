@@ -327,7 +327,7 @@ def _cause(code: str, names: Sequence[str] = (), program: str = "", **values: An
 
 
 def judge_processes(view: View) -> Verdict:
-    """Return the verdict on how many different trajectories the programs of one system compute."""
+    """Return the verdict: how many different trajectories do the programs of one system compute?"""
     s = view.summary
     seeds = [row["first_bit"] for row in s["variants"] if row["first_bit"] is not None]
     ran, clusters = len(s["variants"]) - len(s["failed_variants"]), len(s["clusters"])

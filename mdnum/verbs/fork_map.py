@@ -80,7 +80,7 @@ def fork_map(
         >>> mdnum.fork_map("argon/crystal-108", "cutoff.radius", 1.58, 1.59, steps=100)
 
     Args:
-        system: a simulation, a system, a shipped name or the path of a system file, of either world.
+        system: a simulation, a system, a shipped name or the path of a system file (also of a ball).
         key: the parameter, such as "potential.sigma", "timestep" or "position.17.x"; for a ball "k", "tol",
             "y0".
         low, high: the closed interval, in the units of the system's file.

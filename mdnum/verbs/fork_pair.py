@@ -117,7 +117,7 @@ def basics(system: Simulation | System | BallSystem, steps: int | None) -> dict[
 
 
 def check(asked: PairQuestion) -> None:
-    """Raise an error for impossible options, before a folder is made."""
+    """Raise an error for impossible options before a folder is made."""
     from mdnum.forks.pair import repeats_asked
 
     expect_at_least(1, steps=1 if asked.steps is None else asked.steps)

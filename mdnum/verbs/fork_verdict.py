@@ -181,7 +181,7 @@ def judge_screen(view: View) -> Verdict:
 
 
 def judge_compare(view: View) -> Verdict:
-    """Return the verdict on where the runs of two folders diverge, and on possible causes."""
+    """Return the verdict: where the runs of two folders diverge, and what may be the cause."""
     summary = view.summary
     causes = summary["causes"]
     values = {name: summary[name] for name in ("steps", "first_bit", "fork")}
@@ -210,7 +210,7 @@ def judge_compare(view: View) -> Verdict:
 
 
 def judge_benign(view: View) -> Verdict:
-    """Return the verdict on whether B's runs belong to A's ensemble."""
+    """Return the verdict: do the runs of B belong to the ensemble of A?"""
     summary = view.summary
     values = {"difference": summary["difference"], "step": summary["window"]}
     if summary["passed"]:

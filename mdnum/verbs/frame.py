@@ -69,7 +69,7 @@ class View:
 
     @property
     def name(self) -> str:
-        """Name of the system, or of whatever else was examined."""
+        """Name of the system or other object that was examined."""
         return str(self.summary.get("system") or self.summary.get("name") or self.folder.path.name)
 
     @cached_property
@@ -310,7 +310,7 @@ def layout(kind: str) -> Layout:
 def new_folder(
     kind: str, name: str, out: str | Path | None = None, *, system: Any = None
 ) -> Iterator[RunFolder]:
-    """Context manager of an empty folder with the system and its provenance; it is closed if filling fails.
+    """Context manager for an empty folder with the system and its provenance; a failure closes the folder.
 
     Args:
         kind: kind of the folder, which a verb declares.

@@ -10,7 +10,7 @@ from mdnum.verbs.frame import finish
 
 
 def report(folder: Path) -> Reply:
-    """Judge a folder and write its page, as the verb that made the folder does."""
+    """Judge a folder and write the page of the folder, as the verb that made the folder does."""
     outcome = finish(folder)
     written = outcome.folder / "report.html"
     kept = {name: outcome.summary[name] for name in HEAD} | {"of": outcome.kind}

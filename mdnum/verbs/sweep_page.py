@@ -35,7 +35,7 @@ def _unit(view: View, name: str) -> str:
 
 
 def _moved(view: View) -> dict[str, list[str]]:
-    """Return the measures that each choice changes."""
+    """Return the measures that each choice changes, by choice."""
     found: dict[str, list[str]] = {axis["key"]: [] for axis in view.summary["axes"]}
     physical = {one["name"] for one in view.summary["measures"] if one["physical"]}
     for row in view.summary["differences"]:

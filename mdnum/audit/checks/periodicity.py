@@ -35,7 +35,7 @@ class PeriodicityCheck(InvarianceCheck):
 
 
 def mixed(atoms: Atoms, periodic: np.ndarray, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield a structure that is periodic along some axes, in cells that differ along the others."""
+    """Yield a structure that is periodic along some axes, in cells that differ along the other axes."""
     rows, axes = atoms.cell.array[periodic], np.flatnonzero(periodic)
     normals = np.linalg.svd(rows)[2][len(rows) :]
     extents = np.ptp(atoms.positions @ normals.T, axis=0)

@@ -1,4 +1,4 @@
-"""The step at which runs of either world leave the exact history, for each precision."""
+"""The step at which runs leave the exact history (all decisions in exact arithmetic), for each precision."""
 
 from __future__ import annotations
 
@@ -237,7 +237,7 @@ def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
 
 
 def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
-    """Add the gain of each policy over pure single precision, if that leaves the exact history."""
+    """Add the gain of each policy over pure single precision, if the latter leaves the exact history."""
     low = next((row for row in rows if row.is_all("float32")), None)
     high = next((row for row in rows if row.is_all("float64")), None)
     if low is None or low.horizon is None:

@@ -102,7 +102,7 @@ def _enclosed(
 
 @dataclass(frozen=True)
 class ExactHistory:
-    """The certified history of a run, with every decision proven."""
+    """The exact history of a run: its decisions, each of them proven."""
 
     tape: DecisionTape  # every decision, proven
     # smallest |threshold - r²| of any pair at each step, length², shape (steps + 1,); good to about ten

@@ -83,7 +83,7 @@ class GradientDifference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Comparison of all applicable gradient methods, for a run of one length."""
+    """Comparison of all applicable gradient methods, for one run."""
 
     horizon: int  # steps
     reference: str  # name of the method that the others are compared with
@@ -108,7 +108,7 @@ def agreement(
     """Compute the gradient by several methods, and explain their differences.
 
     Args:
-        names: parameters; a method that does not support all of them is applied to the others.
+        names: parameters; a method that does not support all of them is applied to those that it supports.
         methods: names or objects; all by default. A method that does not apply is listed with the reason.
         known: gradients already computed, by name of the method.
         growth: factor by which the gradient by the state grew over the run (`GradientGrowth.gain`).
@@ -273,7 +273,7 @@ def diagnose(
         format: narrow type that the cotangents are compared with.
 
     Returns:
-        the parts that are available; `failed` holds the reasons for the others.
+        the available parts; `failed` holds the reasons why other parts are missing.
 
     Raises:
         InputError: a parameter, part or method does not exist. NumericalError: the run blew up.

@@ -3,7 +3,7 @@
 A force can be finite while its derivative is not, a loss can have a square root at zero, a sum can overflow
 its format in the reverse pass. The reverse pass is repeated up to the step at which a number stops being
 finite, and this step is run operation by operation. An operation is at fault if its inputs are finite and its
-result is not, and if repairing it repairs the program's result: a number that is masked away later does no
+result is not, and if repairing it repairs the program's result: a number that is masked out later does no
 harm.
 """
 

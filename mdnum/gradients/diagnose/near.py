@@ -1,10 +1,10 @@
 """Pairs that turn around near their cutoff: contributions of flips that almost happened.
 
 A pair that turns back just outside its cutoff leaves no flip. If the pair had come a little closer, it would
-have entered and left at a radial speed near zero, and both crossings would have contributed terms
+have entered and left at a radial speed near zero, and each of the two crossings would have contributed a term
 proportional to one over this speed. So every turning point within reach of the cutoff counts, on either side
-of the cutoff and also between two steps: pairs that pass the cutoff contribute to the gradient, and this
-contribution could vanish.
+and also between two steps: a pair that passes the cutoff contributes to the gradient, and this contribution
+could vanish.
 
 Near the turning point r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth d crosses it
 twice with the speed sqrt(2 a d), and the two crossings contribute 2 w / sqrt(2 a d), where w is the

@@ -278,7 +278,7 @@ def trust(
 
     Args:
         problem: the loss of a rollout of a pair potential.
-        names: parameters; those of many entries (the start) are left out.
+        names: parameters; those with many entries (the start) are left out.
         tolerance: acceptable relative difference between two precisions, or between a time step and its half.
         saltation: whether flips count. points: number of horizons that are compared, evenly spread.
         replicas: starts for the standard error, each a run and a pass of tangents; 0 leaves it out.

@@ -3,10 +3,10 @@
 A pair that was just beyond r_cut + padding when the list was built is inside the cutoff once its two atoms
 have approached by the padding; the smallest motion that achieves this is along the line between them. A rule
 that tests whether two atoms could have approached by the padding rebuilds the list in time, for any
-direction, any division of the motion between the atoms and any motion of the others. Each sequence of
-`motions` therefore brings a pair closer by slightly more than the padding: along axes, diagonals and random
-directions; by both atoms or one, in any proportion; alone, among atoms at rest, among hundreds that move
-little, among others with the same motion or a common drift; in one step, slowly, and back and forth.
+direction, any division of the motion between the two atoms and any motion of the other atoms. Each sequence
+of `motions` therefore brings a pair closer by slightly more than the padding: along axes, diagonals and
+random directions; by both atoms or one, in any proportion; alone, among atoms at rest, among hundreds that
+move little, among others with the same motion or a common drift; in one step, slowly, and back and forth.
 """
 
 from __future__ import annotations
