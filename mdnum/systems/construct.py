@@ -509,7 +509,7 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
         model = each_term(model, of_kinds)
         if model.weights and not np.array_equal(atoms.numbers, simulation.structure.numbers):
             remedy = "Give atoms of the same species in the same order"
-            message = "the potential has a weight for each atom, and the species of these atoms differ"
+            message = "the potential has weights of single atoms, and the species of these atoms differ"
             raise InputError(message, where=simulation.name, remedy=remedy)
     return assembled(
         Origin(simulation.name, simulation.origin.about), atoms, simulation.units, model,

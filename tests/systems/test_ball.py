@@ -184,7 +184,7 @@ LEAST = "smallest usable tolerance is 8.9e-308"
         ("projection", {"stop.enter": "1e-7"}, "stop.enter = 1e-07 is below stop.tol = 1e-06"),
         ("projection", {"stop.rule": "some"}, "rule 'some' … sum, per-instance, maximum"),
         ("projection", {"stop.rule": "fixed"}, "key 'count' missing"),
-        ("projection", {"stop.rule": "relative", "stop.tol": "1"}, "above that residual"),
+        ("projection", {"stop.rule": "relative", "stop.tol": "1"}, "relative to the first residual"),
         ("projection", {"contact.hysteresis": "0.1"}, "no meaning for projection … stop.enter"),
         ("projection", {"gradient.of": '["tol"]', "stop.rule": "fixed", "stop.count": "3"}, "rule is fixed"),
         ("projection", {"contact.kind": "impact", "stop.tol": "1e-3"}, "does not iterate"),
@@ -312,7 +312,7 @@ NARROW = {"start.boundary.format": "float16", "stop.tol": repr(float(np.float16(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"stop.tol": "1e-3"}, r"is no bfloat16.*tol = 0\.00099945068359375"),
+        ({"stop.tol": "1e-3"}, r"is not a bfloat16 number.*tol = 0\.00099945068359375"),
         # the nearest one would be 0 or infinite: no tolerance
         ({"stop.tol": "1e-50"}, r"tolerance is 1\.18e-38, .* 3\.39e\+38"),
         ({"stop.tol": "1e39"}, r"tolerance is 1\.18e-38, .* 3\.39e\+38"),

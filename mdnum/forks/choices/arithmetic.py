@@ -197,7 +197,7 @@ class Order(Summed):
         return self.twin(a, b, f"neighbors of each atom shuffled with seed {self.seed}")
 
     def _of_balls(self, system: Any) -> Twin:
-        applies(self.both in (None, "exact", "alone"), "for a ball, use order@exact or order@alone")
+        applies(self.both in (None, "exact", "alone"), "for a ball, there are order@exact and order@alone")
         applies(system.balls > 1, "there is one ball")
         own, stop, difference = (
             system.spec.precision.reduction,

@@ -142,7 +142,7 @@ def unsupported(simulation: Simulation) -> InputError | None:
     reasons = (
         (
             not alone,
-            f"exact arithmetic supports a single pair potential, not {simulation.potential.name!r}",
+            f"exact arithmetic supports one pair potential, not {simulation.potential.name!r}",
             "Use a system with a single pair potential, such as lennard-jones",
             "potential.kind",
         ),
