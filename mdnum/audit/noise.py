@@ -1,4 +1,4 @@
-"""Measure the noise of a calculator's energies and forces, and the number of digits they carry."""
+"""Measure the noise of a calculator's energies and forces, and the number of digits in these numbers."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class WrongPlaces:
 
     @property
     def values(self) -> dict[str, Any]:
-        """Values for the text of a finding about wrong list positions."""
+        """Values for the sentences of a finding about wrong positions in the list of atoms."""
         shown = ", ".join(map(str, self.places[:8])) + (", …" if len(self.places) > 8 else "")
         every = int(np.diff(self.places)[0]) if self.pattern == "every" else 0
         return {"places": shown, "every": every, "wrong_places": len(self.places), "count": self.count}

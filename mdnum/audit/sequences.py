@@ -1,4 +1,4 @@
-"""Sequences of structures for one calculator object, which reveal errors of its neighbor list."""
+"""Sequences of structures for one calculator object, to reveal errors of the object's neighbor list."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked abou
 
 
 class SequenceStep(NamedTuple):
-    """A structure in a sequence, its change from the previous one, and whether its energy is compared."""
+    """A structure in a sequence, how it differs from the previous one, and whether energies are compared."""
 
     what: str
     atoms: Atoms

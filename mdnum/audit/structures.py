@@ -103,7 +103,7 @@ class Pair:
         return atoms
 
     def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
-        """Return the distances between atoms of the two particles, other than that of the reference atoms."""
+        """Return the distances between atoms of the two particles, without that of the reference atoms."""
         moved = self.second.positions[None] + [distance, 0.0, 0.0]
         return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
 

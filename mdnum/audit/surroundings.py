@@ -382,8 +382,8 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
     """Return a central atom at the origin with `count` neighbors, and their distinct distances.
 
     The neighbors fill the shell evenly (golden spiral in angle, equal volumes in distance), so that no two
-    are as close to each other as random positions would be. The neighbors are sorted by distance and follow
-    the central atom.
+    are as close to each other as some of many random positions would be. The neighbors are sorted by distance
+    and follow the central atom.
     """
     k = np.arange(count)
     share = (k + 0.5) / count

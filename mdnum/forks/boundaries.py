@@ -148,7 +148,7 @@ class NumberLine:
         return self.number.at(self.value(place))
 
     def run(self, place: int) -> DecisionHistory:
-        """Compute the history for the float with the given ordinal."""
+        """Compute the history (all decisions) for the float with the given ordinal."""
         history = self.at(place).history(self.steps, self.loss)
         self.known[place] = replace(history, marks=history.marks[:0], x=history.x[:0])
         return history
@@ -173,7 +173,7 @@ class NumberLine:
         return a, b
 
     def boundary(self, below: int, above: int) -> Boundary | None:
-        """Compare the runs at two ordinals with different histories; return None if a run fails first."""
+        """Compare the runs at two ordinals whose decisions differ; return None if a run fails first."""
         places = (below, above)
         runs = [self.run(place) for place in places]
         step = runs[0].first_difference(runs[1])

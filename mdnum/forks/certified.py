@@ -113,7 +113,7 @@ def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
 
 
 def wider(twin: Twin) -> str | None:
-    """Return the program whose precision is higher in some role and lower in none; None if neither's is.
+    """Return the program whose precision is higher in some role and lower in none; None if there is none.
 
     The programs must be identical otherwise: the effect of another time step, for example, is not rounding.
     """

@@ -1,9 +1,9 @@
 """The linearized run: how a small perturbation of the start grows, and which decisions it changes.
 
 The tangent is propagated along the states that the run recorded, so the linearized run is the recorded run,
-bit for bit, list after list. The growth rate of the tangent is the largest Lyapunov exponent. The tangent is
-rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn 1980), so the tangent does not saturate,
-whereas the separation of two runs does.
+bit for bit, with the same neighbor lists. The growth rate of the tangent is the largest Lyapunov exponent.
+The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn 1980), so the tangent does not
+saturate, whereas the separation of two runs does.
 
 Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation: to first
 order the decision flips at a = -m / (dm/da). The smallest of these amplitudes at each step covers all

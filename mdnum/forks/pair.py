@@ -112,9 +112,9 @@ def fork(
 
     Args:
         twin: the pair of programs.
-        steps: last step; default the system's own. Molecular dynamics ends at twice the split at the latest.
-            If the split is near the last step, the runs continue to 1.2 times the split, to distinguish a
-            cause from a delay.
+        steps: last step; default the system's own. Molecular dynamics ends at twice the step of the split at
+            the latest. If the split is near the last step, the runs continue to 1.2 times the split, to
+            distinguish a cause from a delay.
         split: separation that counts as split, length; default 0.01 of the longest cutoff or start height.
         counterfactual: whether to run B under A's decisions, which is impossible for many-body potentials.
         back: whether to run A under B's decisions too; default: only if B is run under A's decisions.

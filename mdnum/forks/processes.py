@@ -350,7 +350,7 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
 
 
 def digests(system: Simulation | BallSystem, key: str, steps: int, values: Sequence[float]) -> list[str]:
-    """Compute the digests of the histories for some values of a number, one after another."""
+    """Compute digests of all decisions of a run, for some values of a number, one after another."""
     number = program_of(system, steps).number(key)
     return [number.at(value).history(steps).digest for value in values]
 
@@ -362,7 +362,7 @@ def digests_elsewhere(
     values: Sequence[float],
     progress: Callable[[int], None] | None = None,
 ) -> list[str]:
-    """Compute the digests of histories in a fresh process, to confirm boundaries independently.
+    """Compute the digests of decisions in a fresh process, to confirm boundaries independently.
 
     The system is written to a folder and read there again, bit for bit, and its program is compiled again
     under the same environment.

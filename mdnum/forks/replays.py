@@ -197,7 +197,7 @@ def check_pins(fork: Fork) -> None:
 
 
 def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
-    """Return intervals (first step, end step or None) in which two runs decide a pair differently.
+    """Return intervals (first step, end step or None) in which two runs differ in the decision on a pair.
 
     Only the cross-run flips that were kept are used.
     """

@@ -65,7 +65,7 @@ class DecisionTape:
 
 
 def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
-    """Find the first step at which two tapes decide a pair differently; None if no common step differs.
+    """Find the first step at which two tapes hold different decisions on a pair; None if all steps agree.
 
     Raises:
         ValueError: the tapes have different numbers of atoms.

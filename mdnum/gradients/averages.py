@@ -3,8 +3,8 @@
 An average over states does not depend on the time order of the frames. The derivative of an average by a
 parameter has up to three contributions. First, the term of each frame changes at fixed positions. Second, a
 term that jumps when a pair enters changes with the cutoff radius by the jump times the density of pairs
-there; derivatives at fixed decisions miss this. Third, under a thermostat, the weight exp(-U/kT) of each
-frame changes.
+there; derivatives at fixed decisions lack this change. Third, under a thermostat, the weight exp(-U/kT) of
+each frame changes.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def standard_error(series: Float[np.ndarray, "frames"]) -> float:
 
 @dataclass(frozen=True)
 class Density:
-    """Number of pairs per length at the cutoff, weighted frame by frame."""
+    """Number of pairs per length at the cutoff; each frame has its own weight."""
 
     # each frame's share of the estimate that was chosen, shape (frames, types)
     frames: Float[np.ndarray, "frames types"]
@@ -206,7 +206,7 @@ def density(
     reach: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> Density:
-    """Sum over frames a weight times the density of pairs at the cutoff, delta(r_cut - r_ij).
+    """Sum, over all frames, a weight times the density of pairs at the cutoff, delta(r_cut - r_ij).
 
     The delta function is replaced by a parabola of finite width. The bias is even in the width; extrapolation
     from three widths, each half of the previous one, removes the second and fourth orders. The result comes
@@ -249,7 +249,7 @@ def density(
 
 @dataclass(frozen=True)
 class BoundaryTerm(Method):
-    """The derivative of an average over given states, with a boundary term for pairs at the cutoff."""
+    """The derivative of an average over given states, with a term for pairs that cross the cutoff."""
 
     # half the width of the widest kernel as a share of the cutoff; less where the box is narrow
     reach: float = 0.1

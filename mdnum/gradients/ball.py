@@ -105,7 +105,7 @@ def compare(
 
 
 class Dependence(NamedTuple):
-    """Whether any path in a program leads from a parameter to the loss, and whether an executed path does."""
+    """Whether any path of operations leads from a parameter to the loss, and whether such a path ran."""
 
     written: bool
     used: bool

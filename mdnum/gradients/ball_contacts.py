@@ -343,7 +343,7 @@ class _SaltatingProjection(_SaltatingReset, Projection):
 
 class _SaltatingPenalty(Penalty):
     def move(self, motion: Motion) -> Moved:
-        """Compute one step with a spring; a damper's force jumps by -damping v, which changes tangents."""
+        """Compute one step with a spring; the force of a damper jumps by -damping v, so tangents change."""
         contact = super().move(motion).record.contact
         y, v = lax.stop_gradient((motion.y, motion.v))
         jump = jnp.where(contact, -1.0, 1.0).astype(v.dtype) * lax.stop_gradient(self.damping) * v

@@ -126,8 +126,8 @@ class Pace(NamedTuple):
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Return frames per time around a step: a jump just before the step that comes earlier by a time dt
-        changes dt times this number of frames, on average, because frames are taken at whole steps.
+        """Return the number of frames per time around a step: if a jump just before the step comes earlier by
+        dt, it changes dt times this number of frames on average, since frames are taken at whole steps.
         """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)

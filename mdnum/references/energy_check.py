@@ -134,7 +134,7 @@ def check_energy(
 
     For a pair potential with more than `SAMPLED` atoms, only energies and forces of a few hundred atoms are
     compared, chosen at random places by `neighborhoods`; for these atoms the comparison is exact. Each frame
-    has other places, so that two frames cover twice as many atoms.
+    has its own random places, so that two frames cover twice as many atoms.
 
     Raises:
         InputError: the system cannot be built.

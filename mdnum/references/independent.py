@@ -169,7 +169,7 @@ def pair_forms(model: CutPotential, symbols: Sequence[str], compare: str) -> dic
 
     Args:
         symbols: symbols of the species, sorted.
-        compare: comparison that defines inside, as in a system file.
+        compare: comparison that defines which pairs are inside, as in a system file.
     """
     forms = {}
     for kind, (a, b) in enumerate(combinations_with_replacement(symbols, 2)):

@@ -164,7 +164,7 @@ class Texts:
 
         Args:
             rows: equally long columns; a "pair" uses two of them.
-            choices: words of columns of words, by column, if the text file does not list them.
+            choices: words that occur in columns of words, by column, if the text file does not list them.
             values: values of fields in names and units of columns.
         """
         entry, columns = self.entries["browse"][name], []

@@ -568,7 +568,7 @@ class RunFolder:
             raise FolderError(message, remedy=_RESTORE, where=str(self.path)) from error
 
     def check_start(self) -> None:
-        """Compare the input of a run (the system and the files that belong to the system) with the manifest.
+        """Compare the input of a run (the system and the files that belong to it) with the manifest.
 
         Raises:
             FolderError: the input was changed, so that a new run would differ from the recorded one.

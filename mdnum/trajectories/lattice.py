@@ -10,8 +10,8 @@ operations. A decision therefore does not depend on the search that found the pa
 
 Bins divide the coordinates of the reduced lattice. Nonperiodic directions have bins too, folded onto a fixed
 number of them, so that one distant atom neither creates many bins nor puts all others into one. For each bin,
-the atoms of all bins in reach are gathered with the lattice vectors that bring them near, repeatedly if the
-box is small; then every atom of the bin is compared with all gathered atoms.
+the atoms of all bins in reach are gathered with the lattice vectors that bring them near (an atom several
+times if the box is small); then every atom of the bin is compared with all gathered atoms.
 """
 
 from __future__ import annotations

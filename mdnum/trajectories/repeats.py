@@ -37,7 +37,7 @@ class RepeatedFrames:
 
     Attributes:
         drop: True to leave repeated frames out when frames are passed on.
-        most: number of frames remembered, the most recent ones.
+        most: number of frames remembered; older frames are forgotten.
         frames: number of repeated frames.
         again: ranges of different frames whose times occurred before, with numbers as in `stretches`, the
             first and the last time (time, to), and the number of frames (frames).

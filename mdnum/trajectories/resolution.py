@@ -274,7 +274,7 @@ def grid_effect(
         radius: the cutoff length; if `ranked`, the approximate distance of the last nearest neighbor.
         first: atoms on one side of a pair, whose neighbors are counted; None for all.
         second: atoms on the other side; None for the same atoms.
-        ranked: True if the order of distances decides, not a cutoff.
+        ranked: True if the order of distances decides, instead of a cutoff.
         draws: number of pairs or triples drawn.
 
     Returns:
@@ -303,7 +303,7 @@ def grid_effect(
     before, after = _drawn(random, one, other, radius, steps, draws, ranked)
 
     def decided(places: Places) -> np.ndarray:
-        """Return True if a pair is inside, or the second atom of a triple is nearer than the third."""
+        """Return True if a pair is inside; for a triple, if its second atom is nearer than its third."""
         squares = [((place - places[0]) ** 2).sum(axis=1) for place in places[1:]]
         return squares[0] < (squares[1] if ranked else radius**2)
 

@@ -91,7 +91,7 @@ class Survival:
 
     @property
     def mean(self) -> float:
-        """Area below the curve up to `longest`, frames: the mean, or less if some contacts last longer."""
+        """Area below the curve up to `longest`: the mean in frames, or less if some contacts last longer."""
         edges = np.concatenate([[0], self.frames, [self.longest]])
         return float(np.sum(np.diff(edges) * np.concatenate([[1.0], self.share])))
 

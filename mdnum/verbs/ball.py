@@ -47,7 +47,7 @@ def bounce(
 
     Args:
         system: a loaded system, a shipped name or the path of a system file.
-        steps: number of steps, instead of the system's.
+        steps: number of steps, instead of the number in the system file.
         against: further variants to compare with: "key=value", or several keys in a mapping.
         keep: see `frame.Keep`.
 

@@ -182,7 +182,7 @@ def compared(
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Return where a variant diverges from the run, and the effect on the loss and its gradient.
+    """Return where a variant diverges from the run, and how the loss and its gradient differ.
 
     Args:
         found: where the variant diverges from the run.
@@ -284,7 +284,7 @@ def solved(run: BallRun) -> np.ndarray:
 
 
 def ambiguous_flips(run: BallRun) -> np.ndarray:
-    """Select contact flips whose step depends on rounding; flips with an exact height do not depend on it."""
+    """Select contact flips whose step depends on rounding, which the step of an exact height does not."""
     return run.contacts.ambiguous & (run.contacts.bound > 0)
 
 

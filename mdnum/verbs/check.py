@@ -184,7 +184,7 @@ def energy_findings(report: EnergyReport) -> Iterator[Finding]:
 
 
 def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
-    """Yield findings of a comparison of a trajectory with ASE's."""
+    """Yield findings of the comparison of a trajectory with one that ASE computes."""
     if not report.ok:
         yield TEXTS.finding(
             "DYNAMICS_DIFFER", *["sudden"] * (report.sudden is not None), steps=len(report.position) - 1,

@@ -133,8 +133,8 @@ def conform(
         earlier.
 
     Raises:
-        InputError: there is no such list, or it cannot be called, or its return value is no list of pairs; or
-            the list differs from the one with which the folder was started.
+        InputError: the list does not exist, cannot be called, or returns something other than pairs; or the
+            list differs from the one with which the folder was started.
         FolderError: the folder cannot be used.
         Interrupted: by control-C or SIGTERM; the results so far are in the folder, with its page.
     """

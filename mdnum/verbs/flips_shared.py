@@ -187,7 +187,7 @@ class FlipsView(View):
         return f"{plain(frames, digits)} frame{'' if frames == 1 else 's'}"
 
     def life(self, one: Mapping[str, Any], name: str = "median", of: str = "lifetime") -> str:
-        """Format a lifetime of a rule: its value, any bound, or the reason why there is no value.
+        """Format a contact lifetime: its value, a bound if there is one, or the reason why there is no value.
 
         If half of the contacts have ended by the next frame, all lifetimes are upper bounds, because pairs
         crossed the threshold several times between frames.

@@ -82,7 +82,7 @@ def grad(
         folder, summary and page; its result is a `GradientDiagnosis`, for a ball `BallGradients`.
 
     Raises:
-        InputError: no such loss, parameter or method, or none of the methods is applicable.
+        InputError: a loss, parameter or method does not exist, or none of the methods is applicable.
         NumericalError: the run blew up.
         FolderError: the folder cannot be used.
     """

@@ -64,8 +64,8 @@ class Recorder:
             which converts steps to times and is needed for velocities; `length` and `time`, names of units.
 
     Raises:
-        InputError: an option cannot be used; in `see`, an array or a frame cannot be used, such as a frame
-            without finite positions: earlier frames are kept.
+        InputError: an option cannot be used; in `see`, an array or a frame cannot be used (its positions are
+            not finite, for example): earlier frames are kept.
         FolderError: the folder cannot be used.
     """
 

@@ -124,9 +124,9 @@ class RunView(View):
         """Indicators of the time step's adequacy, from energies and the fastest vibration; None if unknown.
 
         `per_period`: number of steps per period of the fastest vibration in the first and the last
-        configuration; `fluctuation`: ratio of the fluctuation of the conserved energy (without the flips'
-        jumps) to that of the kinetic energy; `drift` of the conserved energy over the run and its standard
-        error `drift_error`, in k_B T per atom.
+        configuration; `fluctuation`: fluctuation of the conserved energy (without the flips' jumps) over that
+        of the kinetic energy; `drift` of the conserved energy over the run and its standard error
+        `drift_error`, in k_B T per atom.
         """
         period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
         atoms = self.summary.get("atoms") or 0

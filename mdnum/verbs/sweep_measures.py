@@ -43,12 +43,12 @@ def _date(run: Sample, argument: str, name: str) -> Value:
 
 
 def fork(run: Sample, argument: str) -> Value:
-    """Time of the first different decision of two runs, time; its error comes from the seeds alone."""
+    """Time at which two runs first make different decisions; the scatter of the seeds gives its error."""
     return _date(run, argument, "fork")
 
 
 def split(run: Sample, argument: str) -> Value:
-    """Time until two runs are a hundredth of the cutoff apart, time; its error comes from the seeds."""
+    """Time until two runs are a hundredth of the cutoff apart; the scatter of the seeds gives its error."""
     return _date(run, argument, "split")
 
 
@@ -100,7 +100,7 @@ def gradient(run: Sample, argument: str) -> Value:
 
 
 def horizon(run: Sample, argument: str) -> Value:
-    """Time up to which that derivative is trusted, time; its error comes from the seeds alone."""
+    """Time up to which the derivative is trusted; the scatter of the seeds gives its error."""
     found, _ = _diagnosis(run, argument)
     if found.trust is None:
         raise InputError(found.failed["trust"])

@@ -63,7 +63,7 @@ class AloneCheck(AuditCheck):
         def energy(
             what: str, there: Atoms, expected: float | None = None, lone: slice = slice(None), size: int = 1
         ) -> float | None:
-            """Record the energy, and the net force on lone groups of `size` atoms."""
+            """Record the energy, and the net force on each isolated group of `size` atoms."""
             answer = subject.fresh().try_both(there)
             if isinstance(answer, CalculatorError):
                 self.refused.append((what, answer))

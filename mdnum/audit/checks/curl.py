@@ -1,4 +1,4 @@
-"""Check the work around small closed loops, which is zero for a force that derives from an energy."""
+"""Check the work around small closed loops: the work is zero if the forces derive from an energy."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class CurlCheck(AuditCheck):
 
 
 def agreed(tried: Sequence[Loop]) -> Loop:
-    """Return the loop with the smallest error, increased if a loop of another radius disagrees.
+    """Return the loop with the smallest error; the error is increased if a loop of another radius disagrees.
 
     The curl is the same for every small circle, while the work due to a jump of the forces depends on the
     radius.

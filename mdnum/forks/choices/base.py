@@ -246,7 +246,7 @@ def summing(both: str | None) -> str:
 
 
 def summed(simulation: Simulation, both: str | None = None) -> Simulation:
-    """Return a simulation with another order of its force sums, such as "exact" or "permuted:3".
+    """Return a simulation that sums forces in another order, such as "exact" or "permuted:3".
 
     A many-body potential has a fixed order of sums, so an `InputError` is raised.
     """

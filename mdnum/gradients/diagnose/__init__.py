@@ -168,7 +168,7 @@ def compare(
 
     Args:
         unit: unit roundoff of the run's state or forces, whichever is coarser.
-        growth: factor by which the gradient by the state grew over the run; 1 if unknown.
+        growth: factor by which the gradient with respect to the state grew in the run; 1 if unknown.
         jumps: whether the force jumps at the cutoff.
     """
     a, b = (np.asarray(found.gradient[name], np.float64) for found in (one, reference))

@@ -152,7 +152,7 @@ def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
 def growth(
     problem: Problem, names: Sequence[str], *, saltation: bool = True, progress: Progress | None = None
 ) -> GradientGrowth:
-    """Compute the gradient for every horizon, from one reverse pass.
+    """Compute the gradient for every horizon (length of the run), from one reverse pass.
 
     Raises:
         InputError: a parameter does not exist, or flips were requested without a pair potential.
@@ -404,7 +404,7 @@ def spectrum(
 
     Args:
         values: number of singular values. extra: additional vectors, for faster convergence.
-        rounds: forward and backward passes of the block. seed: of the random block.
+        rounds: forward and backward passes of the block. seed: seed of the random block.
         tape: the run, if already made.
 
     Raises:

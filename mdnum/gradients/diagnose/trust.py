@@ -115,7 +115,7 @@ def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Pr
 
 @dataclass(frozen=True)
 class Horizons:
-    """Losses and gradients of runs of several lengths."""
+    """Losses and gradients of several runs that differ in length."""
 
     at: Int[np.ndarray, "points"]  # horizons, steps
     columns: tuple[ParameterEntry, ...]  # the numbers that are differentiated by
@@ -292,7 +292,7 @@ def trust(
         NumericalError: the run blew up.
 
     Error: horizons are resolved to the spacing of the points. Turning points are located on the cubic through
-    two steps' distances and rates. Terms of near misses are those of the whole run.
+    two steps' distances and rates. Terms of near misses are computed for the whole run.
     """
     simulation = problem.simulation
     full = parameters.resolve(simulation, names)
@@ -528,7 +528,7 @@ def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "poi
 def last_below(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the longest horizon before values exceed a limit for good, and whether they do.
+    """Return the longest horizon before values exceed a limit at all later horizons, and whether they do so.
 
     A single point beyond the limit does not count: a gradient that changes sign is small near its zero, where
     any error is relatively large.

@@ -382,7 +382,7 @@ class Failed:
 
 @dataclass
 class CaseAnswers:
-    """Results of all test cases, by case number, and the failures reduced to a few atoms.
+    """Results of all test cases, by number of the case, and the failures reduced to a few atoms.
 
     A resumed examination draws the same test cases from the same seed, so the test cases are not stored.
     """
