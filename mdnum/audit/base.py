@@ -227,7 +227,7 @@ class AuditCheck:
 
 
 def _above_limits(result: CheckResult) -> Iterator[Observed]:
-    """Yield a finding for each figure above its limit that no finding of the check reports."""
+    """Yield a finding for each number that exceeds its limit and that no finding of the check reports."""
     codes = {one.code for one in result.findings}
     for name, (limit, reports) in result.limits.items():
         value = result.numbers.get(name)

@@ -374,7 +374,7 @@ def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, fl
 
 
 def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float], float]:
-    """Return a function that is flat except for jumps: force minus its slope, or energy minus the work."""
+    """Return a function that is flat except for jumps: force minus a line, or energy minus the work."""
     if row == 1:
         back = left - (right - left)
         slope_before = (curve(left)[1] - curve(back)[1]) / (left - back)

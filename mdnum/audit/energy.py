@@ -189,7 +189,7 @@ def account(
 
 
 def _unexplained(curve: Curve, low: float, high: float) -> float:
-    """Energy gained plus work done, by Simpson's rule; 0 if the force is the energy's derivative."""
+    """Energy change plus work of the force, by Simpson's rule; 0 if the force is the energy's derivative."""
     if high <= low:
         return 0.0
     (before, first), (after, last) = curve(low), curve(high)

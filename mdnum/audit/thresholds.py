@@ -249,7 +249,7 @@ def _seen(
 ) -> tuple[float, float, float, float] | None:
     """Return (from, to, force step detectable at half of the places, force step detectable at all places).
 
-    Places close to a known threshold, which would hide another one, and places beyond the end of the
+    Places close to a known threshold (which would hide another threshold) and places beyond the end of the
     interaction are not counted.
     """
     felt = places < end
@@ -364,7 +364,7 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
 def _beyond(
     subject: CalculatorSubject, pair: Pair, start: float, noise: Float[np.ndarray, "2"], calls: float
 ) -> Beyond | None:
-    """Search outward from a distance, as long as the remaining energy could be lost at a cutoff.
+    """Search outward from a distance, as long as a cutoff farther out could still remove energy.
 
     None is returned if no distance could be evaluated: in a periodic cell, where images of the particles come
     near, or if the calculator fails.
@@ -424,7 +424,7 @@ def _at(low: float, high: float) -> Float[np.ndarray, "nodes"]:
 def _rough(
     curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 ) -> Iterator[tuple[float, float]]:
-    """Yield narrow intervals in which the force is not smooth, or the energy differs from its work."""
+    """Yield narrow intervals in which the force is not smooth, or the energy change is not minus its work."""
     if high <= low or _smooth(curve, low, high, noise):
         return
     if high - low < _NARROW:

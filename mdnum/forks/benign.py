@@ -388,7 +388,7 @@ def benign(
 
 
 def _check(twin: Twin) -> None:
-    """Raise an error if an ensemble of one program cannot be used to judge the other."""
+    """Raise an error if an ensemble of one program cannot be used to judge the other program."""
     twin.a.check(twin.b)
     keys = [one.simulation.integrator.random for one in (twin.a, twin.b)]
     a, b = (() if key is None else np.asarray(jax.random.key_data(key)) for key in keys)

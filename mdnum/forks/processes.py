@@ -426,7 +426,7 @@ def _ask(
     timeout: float | None = None,
     settings: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Run a process that answers a question; return the reason for a failure, or "".
+    """Run a process that answers a question; return the reason if the process fails, and "" otherwise.
 
     `heard` is called with each line that the process prints; `settings` are environment variables.
     """

@@ -332,7 +332,7 @@ class _Search:
 def _required(keys: list[int], search: _Search, until: int) -> list[int]:
     """Find a sufficient set of pairs by bisecting for one required pair after another (QuickXplain).
 
-    Each pair takes about log2(n) runs, whereas delta debugging takes the square of the number of pairs. The
+    Each pair takes about log2(n) runs; delta debugging takes as many runs as the number of pairs squared. The
     method assumes that additional pins never do harm, and stops after `until` runs.
 
     Source: Junker, QuickXplain, AAAI 2004.

@@ -365,7 +365,7 @@ def _normal(v):
 
 
 def _events(problem: BallProblem, run: BallRun) -> tuple[int, int]:
-    """Count the contacts of a run, and the grazing ones among them."""
+    """Count the contacts of a run, and the grazing contacts among them."""
     world, contact = problem.world, run.contact
     free = jax.vmap(lambda step: world.free(step, contact.shape[1:]))(jnp.arange(run.steps))
     free, v = np.asarray(free, np.float64), run.v[:-1].astype(np.float64)

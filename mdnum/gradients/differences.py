@@ -483,7 +483,7 @@ class SmoothedDifferences(Method):
 
 
 def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable[[], None]):
-    """Return the loss of every start at shifted parameters, and the set of its crossings by step and pair."""
+    """Return the loss of every start at shifted parameters, and the set of crossings by step and pair."""
     found = []
     for start in starts:
         made, met = start.at(values), set()

@@ -86,7 +86,7 @@ _LINKED = (".parquet", ".py", ".json", ".toml", ".extxyz", ".npz", ".traj")
 
 
 def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Finding]]]:
-    """Return the findings without a cause among the others, each with the findings that it causes."""
+    """Return the findings that no other finding causes, each with the findings that it causes."""
     findings = list(findings)
     codes = {finding.code for finding in findings}
     below: dict[str, list[Finding]] = {}

@@ -275,7 +275,7 @@ class TableStream:
         self._replace(self.merged_path, groups, self._describe(cast(pa.Schema, self._schema)))
 
     def _whole(self, table: pa.Table, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return rows completed by the columns that they omit, in order; all columns if none are named."""
+        """Return rows with the columns that they omit added, in order; all columns if none are named."""
         there = table.column_names
         known = [name for name in self._known if name in there or name in self._usual]
         names = columns or [*known, *(name for name in there if name not in self._known)]

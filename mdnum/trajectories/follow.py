@@ -252,7 +252,7 @@ def _hand_on(
 
 
 def _threshold(rule: Rule, members: Members) -> tuple[float, bool]:
-    """Return (usual distance of a pair that enters or leaves, True if the order of distances decides)."""
+    """Return (usual distance at which a pair enters or leaves, True if the order of distances decides)."""
     if isinstance(rule, CutoffRule | SpeciesCutoffs):
         return rule.reach, False
     if not len(members):

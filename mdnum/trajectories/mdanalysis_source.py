@@ -115,7 +115,7 @@ class LibraryFrames:
         return reading(file_of(self.trajectory) or "the trajectory", number)
 
     def _refuse_cut_text(self, number: int) -> None:
-        """Reject the last frame of a text file if its last number is cut off; no other frame can be."""
+        """Reject the last frame of a text file if its last number is cut off; no other frame can be cut."""
         trajectory = self.trajectory
         if number != trajectory.n_frames - 1 or (found := _text(trajectory)) is None:
             return

@@ -341,7 +341,7 @@ class LammpsDump(TextTrajectory):
         return Frame(number, time, positions, box, velocities, labels, identified=True)
 
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
-        """Return the order of the rows by id; the ids must be those of the first frame."""
+        """Return the order of the rows by id; the ids must be the same as in the first frame."""
         if "id" not in columns:
             message = "the dump has no ids, and LAMMPS changes the order of atoms as they move"
             raise self._refused(message, "Dump the column id")

@@ -425,7 +425,7 @@ def _follow(before, now, order, home, vectors, change, inverse, periodic, center
 
 @njit
 def _stays(boxes, around, drift):
-    """Return True if each box is inside its surrounding box, reduced by the drift."""
+    """Return True if each box is inside the box around it, after this is reduced by the drift."""
     out = 0
     for k in range(boxes.shape[0]):
         for c in range(3):

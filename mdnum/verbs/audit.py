@@ -288,7 +288,7 @@ def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
 
 
 def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: Path) -> LoadedCalculator:
-    """Return the calculator of an audit that is resumed."""
+    """Return the calculator with which an audit that is resumed was started."""
     if calculator is None and not state.named:
         raise InputError(
             "the calculator of this audit was an object without a name",
@@ -383,7 +383,7 @@ def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _named(value: Any, given: units.Units) -> Any:
-    """Return a check's values with the names of units in place of their placeholders."""
+    """Return the values of a check, with the names of units in place of placeholders."""
     if isinstance(value, units.Measured):
         return value.to("", vars(given))
     if isinstance(value, str):
@@ -459,7 +459,7 @@ def _judge(view: AuditView) -> Verdict:
 
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
-    """State both conclusions, the checks that are missing from them, and the most severe finding."""
+    """State both conclusions, the checks that these lack, and the most severe finding."""
     shown, early = state.shown, conclusion.to_come(state.shown, state.checks)
     said, begun = conclusion.answers(shown, state.checks), {one.name for one in shown}
     name = TEXTS("on", name=state.name, formula=state.atoms.get_chemical_formula())

@@ -99,7 +99,7 @@ def page(view: BallView, verdict: Verdict) -> Page:
 
 
 def _groups(x: np.ndarray, y: np.ndarray, *groups: tuple[np.ndarray, str, Role]) -> tuple[Series, ...]:
-    """Return a set of points for each group that has finite points."""
+    """Return the points of each group as a set, if any point of the group is finite."""
     return tuple(
         Series(label, x[mine], y[mine], "points", role)
         for mine, label, role in groups

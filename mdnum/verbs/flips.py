@@ -588,7 +588,7 @@ def _both(table: AtomTable, pairs: Any) -> dict[str, Any]:
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:
-    """Order a pair of classes as the two selections, if only one order is consistent with them."""
+    """Order two classes of atoms like the two selections, if only one order is consistent with these."""
     if groups[0] is None or groups[1] is None:
         return row
     first, second = ({classes.names[at] for at in np.unique(classes.of[group])} for group in groups)

@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """Yield the gain from raising single roles to double precision, or the loss from lowering them."""
+    """Yield the gain from double precision in a single role, or the loss from lower precision in a role."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip

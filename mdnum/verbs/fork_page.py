@@ -84,7 +84,7 @@ def _has(table: Mapping[str, np.ndarray], name: str) -> bool:
 
 
 def _separation(view: View) -> Iterator[Plot | str]:
-    """Yield figures of the separation of A from B, free and under imposed decisions, with the three dates."""
+    """Yield figures of the separation of A from B, with free and with imposed decisions."""
     s, table = view.summary, view.table("separation")
     if not _has(table, "free"):
         return

@@ -235,7 +235,7 @@ def _diagnosed(
 
 
 def _brief(part: Any) -> Any:
-    """Return a part of a diagnosis without its rows, and without pairs that did not nearly flip."""
+    """Return a part of a diagnosis without rows, and without pairs that were far from a flip."""
     return part and plain({name: value for name, value in vars(part).items() if name not in _ROWS})
 
 

@@ -73,7 +73,7 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def _of_methods(view: View) -> Iterator[Finding]:
-    """Yield findings on the results of methods, missing results, and their possible misinterpretation."""
+    """Yield findings on the results of methods, on missing results, and on likely misinterpretations."""
     summary, methods, section = view.summary, view.summary["methods"], "By method"
     where = summary.get("detective") or {}
     variants = []

@@ -150,8 +150,8 @@ def run(
 def _compile_beside() -> None:
     """Start another process that compiles the loop's functions, if the compilation cache is empty.
 
-    This is the case for the first command after an installation, most of whose time is compilation; a single
-    process compiles on only one processor.
+    The cache is empty for the first command after an installation; most of its time is compilation, and a
+    single process compiles on only one processor.
     """
     kept = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     with contextlib.suppress(OSError):

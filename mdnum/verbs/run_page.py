@@ -213,7 +213,7 @@ def _numbers(run: RunView) -> dict[str, Any]:
 
 
 def _what(run: RunView) -> list[tuple[str, str]]:
-    """Return rows on the system that was run, without those absent from the system file."""
+    """Return rows on the system that was run; rows without an entry in the system file are left out."""
     units, system, time = run.units, run.system, run.series["time"]
     lengths: dict[str, str] = dict.fromkeys(("radius", "onset", "skin"), units.length)
 

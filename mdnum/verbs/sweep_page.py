@@ -23,7 +23,7 @@ _ROWS, _POINTS, _VALUES = 500, 300, 20
 
 
 def _shown(view: View, name: str) -> str:
-    """Return the name of a measure, with the part of its path that distinguishes it from others."""
+    """Return the name of a measure, with the part of its path that distinguishes it from other measures."""
     parts, others = Path(name).parts, [one["name"] for one in view.summary["measures"] if one["name"] != name]
     ends = ["/".join(parts[-k:]) for k in range(1, len(parts))] if ".py:" in name else []
     return next((end for end in ends if not any(one.endswith(f"/{end}") for one in others)), name)
@@ -201,7 +201,7 @@ def _differences(view: View) -> list[Any]:
 
 
 def _with_error(row: Mapping[str, Any]) -> str:
-    """A value with the digits that its error leaves, and the error."""
+    """A value, rounded to the digits that its error leaves valid, and the error."""
     value, error = row["value"], row["error"]
     if not error:
         return number(value, 5)

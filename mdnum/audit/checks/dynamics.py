@@ -360,7 +360,7 @@ class TwoRuns:
 
 
 class _Bridge(Calculator):
-    """An ASE calculator that wraps the audited calculator and saves structures on which this fails."""
+    """An ASE calculator that wraps the audited calculator and saves structures on which the latter fails."""
 
     implemented_properties = ["energy", "forces"]  # noqa: RUF012
 

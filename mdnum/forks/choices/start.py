@@ -136,7 +136,7 @@ def _is_symmetry(word: str, atoms: Any) -> bool:
 
 
 def _read(word: str) -> tuple[list[int], list[float]]:
-    """Parse a symmetry such as "-x-yz" into the axis in each place and its sign."""
+    """Parse a symmetry such as "-x-yz" into the axis in each place and the sign of the axis."""
     parts = re.findall("-?[xyz]", word)
     return ["xyz".index(part[-1]) for part in parts], [-1.0 if part[0] == "-" else 1.0 for part in parts]
 

@@ -422,7 +422,7 @@ def _unseen(part: StretchTangents) -> None:
 
 
 def _digits(*relative: float) -> int:
-    """Return the number of digits that two derivatives share, by the larger of their relative differences."""
+    """Return the number of digits in which two derivatives agree, by their larger relative difference."""
     worst = max(relative)
     if not np.isfinite(worst):
         return 0
@@ -486,7 +486,7 @@ def _left_out(
     made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
     tolerance: float,
 ) -> Limit | None:  # fmt: skip
-    """Return a limit if grazing flips, or jumps of a loss of single frames, contribute too much."""
+    """Return a limit if grazing flips, or jumps of a loss that uses single frames, contribute too much."""
     tape, met = made.tape, made.crossings[::-1]
     energy, virial, speed, weight, slow = (
         joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")

@@ -58,7 +58,7 @@ def _two(apart: float) -> ndarray:
 
 
 def _beside(apart: float) -> ndarray:
-    """Return positions of two atoms at a given distance along x, the first fixed in the middle."""
+    """Return positions of two atoms at a given distance along x, the first atom fixed in the middle."""
     return np.array([_MIDDLE, _MIDDLE + np.array([apart, 0, 0])])
 
 

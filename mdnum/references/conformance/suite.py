@@ -378,7 +378,7 @@ def _too_long(report: Report, case: Case) -> str | None:
 
 
 def _refusals(examiner: Examiner) -> list[RefusalKind]:
-    """Return each kind of rejected test case, with its variants that are answered.
+    """Return each kind of rejected test case, with those of its variants that the list answers.
 
     Each variant of the test case is run in a new process, or with a new object.
     """
