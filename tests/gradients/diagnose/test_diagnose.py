@@ -78,7 +78,7 @@ def test_parts_that_cannot_be_had_say_why():
     assert found.trust is None and found.flips is None and found.growth is None
     assert set(found.failed) == {"trust", "flips", "growth"}
     assert all(found.failed.values())
-    with pytest.raises(InputError, match="part 'grwth'"):
+    with pytest.raises(InputError, match="'grwth'"):
         diagnose(problem, ("v0",), parts=("grwth",))
 
 
