@@ -313,7 +313,7 @@ class CalculatorSubject:
         return asked
 
     def _nearly(self, atoms: Atoms) -> bool:
-        """Return whether ASE would treat a structure as unchanged although a bit differs."""
+        """Return whether ASE would treat a structure as unchanged although its bits changed."""
         check = getattr(self.calculator, "check_state", None)
         if not callable(check):
             return False

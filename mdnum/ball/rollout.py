@@ -352,7 +352,7 @@ def cross_decisions(a: BallRun, b: BallRun, last: int | None = None) -> list[Cro
 
 
 def _stops(a: BallRun, b: BallRun, rows: int) -> list[CrossDecision]:
-    """List the solves whose numbers of iterations differ."""
+    """List the solves that took a different number of iterations in the two runs."""
     row, ball = np.nonzero(_unequal_counts(a, b, rows))
     if a.iterations.ndim == b.iterations.ndim == 1:
         ball = np.full(len(row), -1)

@@ -199,7 +199,7 @@ def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
 
 
 def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
-    """Print the outcome of a verb as JSON, or its page in brief for people; return the exit code."""
+    """Print a command's result as JSON, or as a short form of its page; return the exit code."""
     code = exit_code(outcome.verdict.findings, outcome.summary.get("status", "complete"))
     if as_json:
         print_json({**outcome.summary, "folder": outcome.folder})

@@ -118,7 +118,7 @@ def _chosen(problem: Problem, names: Sequence[str], word: Method | str) -> tuple
 
 
 def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) -> Gradient:
-    """Compute the gradient; warn of a derivative that is exactly zero, as training loops show no notes."""
+    """Compute the gradient; issue a Python warning if a derivative is exactly zero."""
     found = chosen(problem, names)
     for name, value in found.gradient.items():
         if not np.any(np.asarray(value)):

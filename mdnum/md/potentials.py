@@ -494,7 +494,7 @@ class Channels(eqx.Module):
 def each_term(
     model: CutPotential | Channels, change: Callable[[CutPotential], CutPotential]
 ) -> CutPotential | Channels:
-    """Return the model after a function was applied to every term; outside jit."""
+    """Return a copy of the model with a function applied to every term; not for use inside jit."""
     made = {name: change(term) for name, term in model.terms.items()}
     return made[""] if "" in made else Channels.of_terms(made)
 

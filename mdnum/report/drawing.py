@@ -52,7 +52,7 @@ MARKS = 1500
 
 
 def draw(figure: Figure | Plot) -> Canvas:
-    """Draw a figure of a page with matplotlib."""
+    """Draw a figure for a report page with matplotlib."""
     if isinstance(figure, Plot):
         height = 2.9 if figure.region is None else 5.6 if figure.y_names else 3.3
         return canvas(lambda empty: _plot(figure, empty), height)

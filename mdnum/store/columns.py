@@ -1,4 +1,4 @@
-"""Metadata of parquet files: unit and description of every column, and the folder that wrote the file."""
+"""Metadata of parquet files: unit and description of every column, and the folder of its run."""
 
 from __future__ import annotations
 

@@ -338,7 +338,7 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
             f"variant {name!r} has {spec.balls} balls, but the system has {base.balls}; "
             "their decisions cannot be compared",
             where=where,
-            remedy="Keep the number of balls",
+            remedy="Use the same number of balls in both",
         )
     return spec
 

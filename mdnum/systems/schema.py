@@ -610,7 +610,7 @@ class SystemSpec(TomlTable):
     def _cutoff_fits_potential(self) -> SystemSpec:
         if (self.potential is None) != bool(self.terms) or (self.terms and self.cutoff):
             raise ValueError(
-                "give either [potential], with [cutoff] for pairs, or [terms.NAME.potential] alone"
+                "give either [potential] (with [cutoff] for pairs) or [terms.NAME.potential], not both"
             )
         if self.potential is not None:
             check_interaction(self.potential, self.cutoff)

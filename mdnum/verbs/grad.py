@@ -75,7 +75,7 @@ def grad(
             requires a run and a tangent pass.
         also: names of further parts of the diagnosis, from `ALSO`, or "all".
         half_step: repeat the run and its gradient at half the time step, which about doubles the work;
-            without it no gradient is called trusted, and the number of digits is unknown. Not for a ball.
+            without it no gradient has the verdict "trusted", and its digits are unknown. Not for a ball.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:

@@ -174,7 +174,7 @@ class Translate(Summed):
 
 @choice("unwrapped")
 class Images(Choice):
-    """Atoms started in other periodic images.
+    """Start of the atoms in other periodic images.
 
     Positions are wrapped before the first step, so this choice cannot change a bit if the images can be
     represented exactly: the sum of a position and a lattice vector is rounded. Both runs start at positions

@@ -90,7 +90,7 @@ def _lennard_jones(sigma: Any, epsilon: Any) -> tuple[Callable[[Any], Any], Call
 def _enclosed(
     potential: PairPotential, **constants: Any
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Return functions for 2 du/d(r²) and u of any potential, evaluated operation by operation."""
+    """Return functions that compute 2 du/d(r²) and u of a potential, one operation at a time."""
 
     def evaluate(r2, *values):
         leaves = {name: value[None] for name, value in zip(constants, values, strict=True)}
