@@ -235,7 +235,7 @@ def functions() -> DoctorRow:
 
 
 def reassociation() -> DoctorRow:
-    """Test that sums keep their order: (x + c) - c is not folded, an error-free transformation is exact."""
+    """Test that sums keep their order: (x + c) - c is not folded, error-free transformations stay exact."""
     x, c = _numbers(5) * 1e-3, np.full(_COUNT, 1e3)
 
     def two_sum(a: Any, b: Any) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""Ranges of numbers, and the effect of narrower formats on them; without jax."""
+"""Ranges of numbers, and the effect of narrower formats on them. No jax is imported."""
 
 from __future__ import annotations
 

@@ -206,7 +206,7 @@ def first_line(error: BaseException) -> str:
 
 
 class _Lines(io.TextIOWrapper):
-    """A text file that stops a reader that, trusting a count in the header, reads beyond the end."""
+    """A text file that raises an error if a reader, misled by a count in the header, reads beyond the end."""
 
     _at_end = 0
 

@@ -45,7 +45,7 @@ Parameters = Mapping[str, complex]
 
 
 class _Motion:
-    """Shared base of both motions: checks of the start, derivatives, height and velocity.
+    """Base class of both motions: checks of the start, derivatives, height and velocity.
 
     Source: complex-step derivatives, which involve no cancellation (Squire & Trapp, SIAM Review 40 (1998)
     110).
@@ -98,7 +98,7 @@ class _Motion:
 
 
 def _down(p: Parameters) -> tuple[complex, complex]:
-    """Return the time and speed of the first contact; if the ball falls, (v0 + s) / g would cancel."""
+    """Return time and speed of the first contact, without cancellation if the ball moves downward."""
     y0, v0, g = p["y0"], p["v0"], p["gravity"]
     speed = np.sqrt(v0 * v0 + 2 * g * y0)
     return (v0 + speed) / g if v0.real >= 0 else 2 * y0 / (speed - v0), speed

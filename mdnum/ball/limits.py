@@ -1,4 +1,4 @@
-"""Largest numbers of the ball's formats, and the smallest tolerance that its solver can meet; without jax."""
+"""Largest numbers of the ball's formats, and the smallest tolerance of its solver. No jax is imported."""
 
 from __future__ import annotations
 

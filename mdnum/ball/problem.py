@@ -24,7 +24,7 @@ class BallLoss(Protocol):
     """Protocol of a loss: a sum over steps and a final term, of shape () and in the dtype of their input."""
 
     def step(self, state: BallState, record: BallRecord, dtype: Any) -> Float[Array, ""]:
-        """Return the contribution of the step that made this state."""
+        """Return the contribution to the loss of the step that made this state."""
         ...
 
     def end(self, state: BallState, steps: int, total: Float[Array, ""]) -> Float[Array, ""]:
@@ -190,7 +190,7 @@ def loss_of(
 
 
 def loss_at(bare, world, y0, v0, values, imposed):
-    """Evaluate `loss_of` for given parameter values; all inputs are arguments, so that fences survive.
+    """Evaluate `loss_of` for given parameter values. All inputs are arguments, so that XLA keeps fences.
 
     Args:
         bare: number of steps, and loss.

@@ -24,7 +24,7 @@ from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
 
 @dataclass(frozen=True)
 class ImposedDecision:
-    """One decision that is imposed on a run, while the run makes all other decisions itself."""
+    """One decision that is imposed on a run; the run makes all other decisions itself."""
 
     channel: Literal["contact", "stop"]
     step: int  # from 1
@@ -125,7 +125,7 @@ class BallProgram:
         return run
 
     def _pinned(self, steps: int) -> BallDecisions | None:
-        """Return the pins as imposed decisions, -1 for free decisions; None without pins."""
+        """Return the pinned decisions as imposed decisions, -1 for free ones; None if nothing is pinned."""
         if not self.pins:
             return None
         world = self.problem.world
@@ -261,7 +261,7 @@ class BallProgram:
         return DecisionHistory(every, digest, x, value, float("nan"), "", first=1)
 
     def differing(self, other: BallProgram, steps: int, step: int, key: str) -> Differing:
-        """Return the first decision that differs at a step, with the gradients of the loss on both sides."""
+        """Return the first decision at a step that differs between the programs, and both loss gradients."""
         problems = [replace(one.problem, steps=steps) for one in (self, other)]
         runs = [problem.run(history=True) for problem in problems]
         flips = [flip for flip in cross_decisions(runs[0], runs[1], step) if flip.step == step]

@@ -421,7 +421,7 @@ def overridden(
 
 
 def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
-    """Return which iteration counts differ, shape (rows, 1) if one rule stops all balls, else per ball."""
+    """Return where iteration counts of two runs differ: shape (rows, 1) for a shared rule, else per ball."""
     counts = [run.iterations.reshape(run.steps, -1)[:rows] for run in (a, b)]
     differ = counts[0] != counts[1]
     if _counted(a) != _counted(b):

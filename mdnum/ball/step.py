@@ -1,4 +1,4 @@
-"""One step of a ball: integration schemes, and contact models: a force, an iterated constraint, or an impact.
+"""One step of a ball: integration schemes and contact models (force, iterated constraint or impact).
 
 Every scheme defines the height at which the contact decision is made; the record contains this height. All
 products are rounded before they are added (no fused multiply-add), so numpy in the same dtype gives the same
@@ -49,7 +49,7 @@ class BallDecisions(NamedTuple):
 
 
 class BallRecord(NamedTuple):
-    """Record of one step: height, contact decision, remaining penetration and solve."""
+    """Record of one step: height, contact decision, remaining penetration and iterative solve."""
 
     height: Float[Array, "balls"]  # what the contact decision compared with zero, m, shape (balls,)
     contact: Bool[Array, "balls"]  # the decision, shape (balls,)
@@ -64,7 +64,7 @@ class BallRecord(NamedTuple):
 
 
 class Rounding(eqx.Module):
-    """Fence that rounds a value, such as a product, before its use; it holds the required zero."""
+    """Fence that forces a value, such as a product, to be rounded before use; it stores the zero for this."""
 
     zero: Int[Array, ""]  # an integer zero that the compiler must not know (see mdnum.numerics.exact)
 

@@ -52,7 +52,7 @@ class _Verbs(TyperGroup):
         )
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Writes the verbs of `--help`, by the question that they answer."""
+        """Write the verbs of `--help`, grouped by the question that they answer."""
         below: dict[str, list[tuple[str, str]]] = {}
         for name in (names := self.list_commands(ctx)):
             made = self.get_command(ctx, name)
@@ -94,7 +94,7 @@ def _top(
 
 
 class _Questions(TyperGroup):
-    """Command group of one verb's questions; a first word that names no question goes to the usual one."""
+    """Command group of one verb; a first word that is no subcommand goes to the verb's usual subcommand."""
 
     group: Mapping[str, Any]
 
@@ -200,7 +200,7 @@ def _flags(name: str, said: Mapping[str, Any]) -> list[str]:
 
 
 def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> int:
-    """Call the function of a command with the typed values, print its answer, and return the exit code."""
+    """Call a command's function with values from the command line, print the answer; return the exit code."""
     typed = {**said["arguments"], **said["options"]}
     if given.get("resume") == given.get("out"):
         given.pop("out", None)
@@ -249,7 +249,7 @@ def _folder(path: Path) -> Any:
 
 
 def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert typed options to function arguments; naming code on the command line allows its execution."""
+    """Convert options to function arguments; code that is named on the command line is allowed to run."""
     options = {}
     for name in given.keys() & said["options"].keys():
         off = said["options"][name].get("type") == "flag" and name.startswith("no_")

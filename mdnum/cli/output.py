@@ -70,7 +70,7 @@ def print_json(document: Mapping[str, Any]) -> int:
 
 
 def print_reply(reply: Reply, as_json: bool) -> int:
-    """Print an immediate reply, as JSON or for people; return the exit code."""
+    """Print an immediate reply, as JSON or as text for people; return the exit code."""
     if as_json:
         print_json(reply.document)
     for one in () if as_json else reply.shown:
@@ -199,7 +199,7 @@ def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
 
 
 def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
-    """Print a command's result as JSON, or as a short form of its page; return the exit code."""
+    """Print a command's result as JSON, or as a short form of its report page; return the exit code."""
     code = exit_code(outcome.verdict.findings, outcome.summary.get("status", "complete"))
     if as_json:
         print_json({**outcome.summary, "folder": outcome.folder})

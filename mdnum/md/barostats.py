@@ -320,7 +320,7 @@ class CellRescaling(Barostat):
         return root, (2 * part + self.kT) / root, excess - part * unit(excess)
 
     def _shear(self, root, after):
-        """Mobility of a traceless strain between two volumes, by their roots: the same on the way back."""
+        """Mobility of a traceless strain between two volumes, from their roots; the same for the way back."""
         return 4 / 3 * self._mobility / (root * after)
 
     def finish(self, v, extra, at, time):

@@ -34,7 +34,7 @@ class AtCutoff(NamedTuple):
 
 
 class Undecided(Exception):
-    """Raised if a ball straddles a threshold, so the decision is not proven at this precision."""
+    """Raised if an interval contains a threshold, so that the decision is not proven at this precision."""
 
 
 class Cutoff(ABC):
@@ -104,7 +104,7 @@ class Cutoff(ABC):
     def enclose(
         self, pull: Callable[[Any], Any], energy: Callable[[Any], Any], at: AtCutoff
     ) -> Callable[[Any], Any]:
-        """Return 2 denergy/d(r²) of the cut potential in ball arithmetic, as a function of the ball r².
+        """Return 2 denergy/d(r²) of the cut potential in ball arithmetic, as a function of the interval r².
 
         If a cutoff does not override this method, the operations of `cut` are executed one by one.
 

@@ -168,7 +168,7 @@ def _within(x, y, z, xi, yi, zi, r2_list, mask):
 
 @njit
 def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
-    """Like `_within`, if an axis has a single bin and the nearest image of each pair must be found."""
+    """Like `_within`, for a box with a single bin along an axis, where the nearest image must be found."""
     for k in range(len(x)):
         dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         f = np.rint(dx * inverse[0, 0] + dy * inverse[1, 0] + dz * inverse[2, 0])

@@ -208,7 +208,7 @@ class Integrator(eqx.Module):
 
     @property
     def moves_cell(self) -> bool:
-        """Whether it has its own `deform`; if not, the box is a constant and no row records it."""
+        """Whether the integrator has its own `deform`; if not, the box is constant and no row records it."""
         return type(self).deform is not Integrator.deform
 
     def check(self, cell: Cell) -> None:

@@ -190,7 +190,7 @@ def listed(
     format: Format,
     code: Any = 0,
 ) -> NeighborList:
-    """Make a NeighborList like `as_neighbor_list`, from entries that already have the format."""
+    """Make a NeighborList like `as_neighbor_list`, from entries that already have jax-md's format."""
     partition = upstream().partition
     return partition.NeighborList(
         idx=idx,

@@ -1,4 +1,4 @@
-"""Tables of pairs inside and their flips, for simulations and external trajectories."""
+"""Tables of the pairs inside the cutoff and of their flips, for simulations and external trajectories."""
 
 from __future__ import annotations
 

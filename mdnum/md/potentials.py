@@ -458,7 +458,7 @@ class Channels(eqx.Module):
 
     @property
     def terms(self) -> dict[str, CutPotential]:
-        """As of a `CutPotential`."""
+        """Same as for a `CutPotential`."""
         return {name: term for part in self.parts for name, term in part.terms.items()}
 
     @property
@@ -482,12 +482,12 @@ class Channels(eqx.Module):
         return jnp.concatenate([part.r_cut for part in self.parts])
 
     def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
-        """As of a `CutPotential`, by kinds of decisions."""
+        """Same as for a `CutPotential`, by kind of decision."""
         sides = zip(*(part.jumps() for part in self.parts), strict=True)
         return np.stack([np.asarray(block_diag(*one)) for one in sides])
 
     def astype(self, dtype) -> Channels:
-        """As of a `CutPotential`."""
+        """Same as for a `CutPotential`."""
         return Channels(tuple(part.astype(dtype) for part in self.parts))
 
 

@@ -96,7 +96,7 @@ def stepwise(
     enter: Callable[[Any], Any] = _same,
     leave: Callable[[Any], jax.Array] = _same,
 ) -> Callable[..., Any]:
-    """Return a function of arrays that is traced at each call and computed operation by operation by a rule.
+    """Return a function of arrays that is traced at each call; a rule computes each of its operations.
 
     Args:
         function: may close over other arrays.
@@ -157,7 +157,7 @@ def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
 
 
 def rounded(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
-    """Return the function with every sixteen-bit result rounded, one operation after the other.
+    """Return the function with a rounding after every operation that has a sixteen-bit result.
 
     XLA on a CPU computes float16 and bfloat16 expressions in float32, and may omit the roundings between two
     operations. Here a fence follows each operation: numpy with ml_dtypes then gives the same bits for + - * /

@@ -1,4 +1,4 @@
-"""Evaluation of jax traces by numpy and scipy, operation by operation: an independent program, uncompiled.
+"""Evaluation of jax's programs by numpy and scipy, one operation at a time: independent and not compiled.
 
 This evaluation serves as a reference: the formula is the same, but the elementary functions and loops are
 independent. Nothing is compiled, because compiling a formula's operations one by one would take longer than

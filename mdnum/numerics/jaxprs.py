@@ -122,7 +122,7 @@ def is_inexact(leaf: Any) -> bool:
 
 @dataclass
 class _Interpreter:
-    """Interpreter that runs a program to its end, operation by operation."""
+    """Interpreter that runs a program to its end, one operation at a time."""
 
     mended: list[int]  # numbers of operations whose results are made finite
     found: Operation | None = None  # the first operation at fault
@@ -130,7 +130,7 @@ class _Interpreter:
     rounds: list[int] = field(default_factory=list)  # of the loops that it is in
 
     def closed(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
-        """Return the results of a program, which is run operation by operation."""
+        """Run a program one operation at a time, and return its results."""
         return interpreted(program, inputs, self._equation)
 
     def _equation(self, equation: Any, inputs: list[Any]) -> list[Any]:
@@ -199,7 +199,7 @@ class _Interpreter:
 
 
 def _written(equation: Any) -> tuple[str, tuple[str, ...]]:
-    """Return where an operation was written, and the functions on the way there, outermost first."""
+    """Return where an operation is in the source code, and the functions that lead there, outermost first."""
     traceback, inside = equation.source_info.traceback, f"{Path(jax.__file__).parent}/"
     frames = [
         one

@@ -33,7 +33,7 @@ _ALIKE = 4
 
 @dataclass(frozen=True)
 class Delay:
-    """The steps at which one pair of runs splits, left alone and under the first run's decisions."""
+    """The steps at which a pair of runs splits, both free and with the first run's decisions imposed."""
 
     # free, imposed: steps of the two splits; None for one that was not seen
     free: int | None
@@ -456,7 +456,7 @@ def _kept(
 
 
 def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason, ...]:
-    """Return the separation at the end of a horizon without a split, and its expected growth, as reasons."""
+    """Return reasons for a verdict without a split: the last separation, and its expected growth."""
     seen = float(free[np.isfinite(free)][-1])
     now: Reason = ("outlook", {"steps": len(free) - 1, "separation": seen, "tolerance": tolerance})
     more = expected(free, tolerance)

@@ -222,8 +222,7 @@ def write_row(record: EpochRecord, row, **values) -> EpochRecord:
 def over_rows(
     step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, used: Any, *, backward: bool = False
 ) -> tuple[Any, Any]:
-    """Scan like `jax.lax.scan`, but only over the first `used` rows; `backward` begins with the last row.
-    first.
+    """Scan like `jax.lax.scan`, but only over the first `used` rows; `backward` starts with the last row.
 
     Buffers have the size of the longest segment so that one program serves all segments; a loop over the
     whole buffer would spend most of its time on empty rows. Outputs of unused rows are zero.

@@ -198,7 +198,7 @@ class PairRecorder:
         self._by_type = np.stack([thresholds, *simulation.jumps()])
 
     def inside(self, bits: UInt8[np.ndarray, "words atoms"]) -> int:
-        """Return the number of pairs inside; a full list contains each pair twice."""
+        """Return the number of pairs inside the cutoff; a full list contains each pair twice."""
         return self._once(int(count_set(bits)))
 
     def _once(self, both: int) -> int:
@@ -210,7 +210,7 @@ class PairRecorder:
         return both // 2
 
     def counts(self, segment: Segment) -> Int[np.ndarray, "rows"]:
-        """Return the number of pairs inside at every step of a segment."""
+        """Return the number of pairs inside the cutoff at every step of a segment."""
         if segment.changes is None:
             return np.array([self.inside(bits) for bits in segment.rows_of("bits")], np.int64)
         return np.array([self._once(int(both)) for both in segment.rows_of("inside")], np.int64)
@@ -331,14 +331,14 @@ class PairRecorder:
         return (margin >= 0 if inclusive else margin > 0) != ledger.entered
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
-        """Return the keys of the pairs inside at the last step, if a list ended with this step."""
+        """Return the keys of the pairs inside the cutoff at the last step, if a list ended with this step."""
         if self._held_segment is not None:
             table, bits, _ = self._held_segment
             self._held_keys = _keys(self.simulation, table, np.asarray(bits))
         return self._held_keys
 
     def _cannot_differ(self, segment: Segment) -> bool:
-        """True if the old and the new list certainly have the same pairs inside."""
+        """True if the old and the new list certainly have the same pairs inside the cutoff."""
         rule = self.simulation.rule
         if self._held_segment is None or not rule.safe:
             return False
@@ -376,7 +376,7 @@ def pair_keys(
 
 
 def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "words atoms"]):
-    """Return the sorted keys of the pairs inside."""
+    """Return the sorted keys of the pairs inside the cutoff."""
     keys = np.empty(count_set(bits), np.int64)
     return keys[: _write_keys(bits, table.index, table.order, table.place, keys)].copy()
 

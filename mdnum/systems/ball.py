@@ -39,7 +39,7 @@ Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
 
 
 class BoundaryTable(TomlTable):
-    """A batch at rest whose penetrations sum to exactly stop.tol: one is an ulp smaller, the others tiny."""
+    """A batch at rest whose penetrations sum to exactly stop.tol: one is an ulp below it, the others tiny."""
 
     terms: int = Field(
         default=8, ge=1, le=1_000_000, description="how many small penetrations make up the missing ulp"
@@ -137,7 +137,7 @@ class PenaltyContact(_Contact):
 
 
 class ProjectionContact(_Contact):
-    """Iterate y <- y + alpha k p, p = max(0, -y), until [stop] ends it; then clamp y to the floor."""
+    """Iterate y <- y + alpha k p, p = max(0, -y), until the rule in [stop] holds; then set y to max(y, 0)."""
 
     kind: Literal["projection"]
     k: Positive = Field(description="gain (no unit)")
@@ -179,31 +179,31 @@ class _Tolerance(TomlTable):
 
 
 class SumRule(_Tolerance):
-    """Stop on the sum of the residuals of all balls, added in the order of precision.reduction."""
+    """The solver is stopped by the sum of the residuals of all balls, added in the order precision.reduction."""
 
     rule: Literal["sum"]
 
 
 class PerInstanceRule(_Tolerance):
-    """Stop each ball on its own residual."""
+    """The solver stops for each ball separately, by the residual of this ball."""
 
     rule: Literal["per-instance"]
 
 
 class MaximumRule(_Tolerance):
-    """Stop on the largest residual of the batch."""
+    """The solver is stopped by the largest residual of the batch."""
 
     rule: Literal["maximum"]
 
 
 class RelativeRule(_Tolerance):
-    """Stop on the sum of the residuals, relative to the sum before the first iteration."""
+    """The solver is stopped by the sum of the residuals, relative to the sum before the first iteration."""
 
     rule: Literal["relative"]
 
 
 class FixedRule(TomlTable):
-    """Make a fixed number of iterations, whatever the residual."""
+    """The solver makes a fixed number of iterations, whatever the residual."""
 
     rule: Literal["fixed"]
     count: int = Field(ge=1, le=_MOST, description="iterations of every solve")

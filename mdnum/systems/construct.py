@@ -44,7 +44,7 @@ _INSIDE, _STEEP = 1e-7, 1e4
 
 @dataclass(frozen=True)
 class Cut:
-    """The end of a pair potential: the kind of cutoff and its radius.
+    """The cutoff of a pair potential: its kind and its radius.
 
     Example:
         >>> Cut("switched", 8.5, onset=7.0)

@@ -147,7 +147,7 @@ class EmbeddedAtomTable(ManyBodyTable):
 
 
 class PythonTable(PairPotentialTable):
-    """A pair potential given as a function u(r, ...) or u(r2, ...) in a Python file, executed if allowed."""
+    """A pair potential as a function u(r, ...) or u(r2, ...) in a Python file, executed only if allowed."""
 
     kind: Literal["python"]
     function: str = Field(description='file and name, "mine.py:morse", relative to this file')

@@ -103,7 +103,7 @@ class Trial:
     # --- the programs ---------------------------------------------------------------------------------
 
     def _lists(self) -> None:
-        """Find the format of the function's own list, whether atoms list themselves, and the parameters."""
+        """Find the format of the function's own list, whether an atom lists itself, and the parameters."""
         model, lists, own = self.model, self.model.lists, None
         if lists is not None:
             for x in (self.x / self.call.length, self.x @ np.linalg.inv(self.cell)):
