@@ -179,7 +179,7 @@ class _Tolerance(TomlTable):
 
 
 class SumRule(_Tolerance):
-    """The solver is stopped by the sum of the residuals of all balls, added in the order precision.reduction."""
+    """The solver is stopped by the sum of all residuals, added in the order of precision.reduction."""
 
     rule: Literal["sum"]
 
