@@ -361,7 +361,7 @@ def screen(
     """
     choices = list(shipped(world_of(system)).values()) if choices is None else choices
     if not choices:
-        raise InputError("no choice to screen was given", remedy="Give at least one")
+        raise InputError("no choice to screen was given", remedy="Give at least one choice")
     rows: list[Screened] = []
     for done, choice in enumerate(choices):
         if progress is not None:

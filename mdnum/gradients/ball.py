@@ -233,10 +233,10 @@ def _note(name: str, found: Dependence, slope: float, problem: BallProblem, run:
     if not found.written:
         return f"the program has no path from {name} to the loss: the loss does not depend on {name}"
     if not found.used:
-        why = f"nothing that ran used {name}"
+        why = f"no operation of the run used {name}"
         assert run is not None
         if not run.contact.any():
-            why = f"no ball touched the floor, and nothing else used {name}"
+            why = f"no ball touched the floor, and no other operation used {name}"
         elif isinstance(problem.world.contact, Projection) and not run.iterations.any():
             why = f"the loop ended before {name} was used"
         return f"{why}: the loss does not depend on {name}"

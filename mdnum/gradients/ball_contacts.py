@@ -295,7 +295,7 @@ class ThroughContacts(BallMethod):
             events, flagged = _events(problem, run)
         if flagged:
             raise NumericalError(
-                f"contacts that only graze the floor: {int(flagged)}; their time has no derivative",
+                f"contacts that only graze the floor: {int(flagged)}; their times have no derivative",
                 remedy="Change the start or the time step so that the ball hits the floor, or smooth it.",
             )
         use = used(problem, names, slopes, run, own=located or smooth)

@@ -281,7 +281,7 @@ class Replicas:
     def __post_init__(self):
         if self.count < 2 or self.settle < 0:
             seen = f"replicas = {self.count}, settle = {self.settle}"
-            raise InputError(f"{seen}; expected at least 2 replicas, and settle of at least 0")
+            raise InputError(f"{seen}; expected at least 2 replicas, and at least 0 steps to settle")
 
     def of(self, problem: Problem) -> list[Problem]:
         """Return the problem with each of these starts, as a list."""
@@ -321,7 +321,7 @@ def settled(simulation: Simulation, steps: int) -> Simulation:
     """
     *_, last = Engine(simulation, steps).segments()
     if last.closes in FAILURES:
-        raise NumericalError(f"a replica ended in a {last.closes} at step {last.last} of its preparation")
+        raise NumericalError(f"a replica ended with a {last.closes} at step {last.last} of its preparation")
     x, v, images = (last.unsorted(name, last.rows - 1) for name in ("x", "v", "images"))
     cell = last.cell_of(last.rows - 1)
     x = unwrapped(np.asarray(cell.matrix), x, images)

@@ -259,7 +259,7 @@ class EinsteinDiffusion(Loss):
 
     def looks_at(self, steps, last):
         if last < self.first + self.every:
-            seen = f"a slope needs two frames, and up to step {last} there is one at most"
+            seen = f"a slope needs two frames, but there is at most one frame up to step {last}"
             raise self.wrong(seen, "Run longer, or evaluate the loss earlier or more often")
         return super().looks_at(steps, last)
 
@@ -291,7 +291,7 @@ class GreenKuboDiffusion(Loss):
 
     def looks_at(self, steps, last):
         if last < self.until:
-            seen = f"the integral goes up to step {self.until}, the run to step {last}"
+            seen = f"the integral ends at step {self.until}, but the run ends at step {last}"
             raise self.wrong(seen, "Run longer, or integrate less far")
         return super().looks_at(steps, last) & (steps <= self.until)
 

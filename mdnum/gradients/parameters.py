@@ -117,8 +117,8 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
                 f"no loss is differentiable with respect to {whole}: {_INTEGERS[whole]}", where=word
             )
         if shared := parameters.shared_radius(simulation.model, word):
-            message = f"one decision of a pair is that of {', '.join(shared)}, which have the same radius"
-            remedy = "Differentiate by cutoff.radius, which moves that of all terms, or let theirs differ"
+            message = f"{', '.join(shared)} have the same radius and share one decision per pair"
+            remedy = "Differentiate by cutoff.radius, which moves all terms, or give different radii"
             raise InputError(message, where=word, remedy=remedy)
         out += below or [parameters.resolve(simulation, word, known)]
     if not out:

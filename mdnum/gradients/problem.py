@@ -73,7 +73,7 @@ class Problem:
             seen = getattr(made, "shape", None) or jax.tree.structure(made)
             raise InputError(f"the loss has shape {seen}; expected a scalar", remedy="Reduce it to a number")
         if not np.issubdtype(made.dtype, np.inexact):
-            remedy = "A count has no gradient: make a float of it that varies smoothly"
+            remedy = "A count has no gradient: replace it by a float that varies smoothly"
             raise InputError(
                 f"the loss has dtype {made.dtype}; expected a floating-point type", remedy=remedy
             )
@@ -218,11 +218,11 @@ def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: boo
             if missing:
                 notes[name] = "without what the flips add: the force jumps at the cutoff; event-aware adds it"
             continue
-        why = "in this run: no step on the way to the loss depends on it, or what does cancels"
+        why = "in this run: the loss does not depend on it, or its contributions cancel"
         if name.endswith("cutoff.radius") and missing:
             why = (
                 "because it only decides which pairs interact, and decisions are not differentiated; "
-                "event-aware adds what they do"
+                "event-aware adds their contribution"
             )
         notes[name] = f"exactly 0 {why}"
     return notes

@@ -186,7 +186,7 @@ class RunTape:
                 remedy = "Use a smaller time step, or a start without overlapping atoms"
                 if segment.closes == NARROW:
                     remedy = "Use a larger system, a smaller skin, or fewer steps"
-                message = f"the run ended in a {segment.closes} at step {segment.last}"
+                message = f"the run ended with a {segment.closes} at step {segment.last}"
                 raise NumericalError(message, remedy=remedy)
             self._add(segment)
             if progress is not None:

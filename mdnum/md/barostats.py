@@ -126,7 +126,7 @@ class Barostat(Integrator):
             raise InputError(seen, where="dynamics.box")
         if not all(cell.pbc):
             axis = "abc"[cell.pbc.index(False)]
-            message = f"{self.name} needs a box that is periodic along every axis, and {axis} is free"
+            message = f"{self.name} needs a box that is periodic along every axis, but {axis} is not periodic"
             raise InputError(message, where="dynamics.kind", remedy="Use nose-hoover, csvr or langevin")
 
     def motion(self, v: Vector, masses: Masses) -> Float[Array, "3 3"]:

@@ -273,7 +273,7 @@ def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Con
     names = [one.name.lower() for one in placed]
     if placed and (names[0] in _GRAPHS or "Graph" in str(placed[0].annotation)):
         raise InputError(
-            f"{name} takes a graph, not a neighbor list, so mdnum cannot pass its list to it",
+            f"{name} takes a graph, not a neighbor list, so mdnum cannot pass its neighbor list",
             remedy="Wrap it in a function energy(parameters, R, neighbor, cell) that makes the graph from "
             "neighbor.idx and mdnum.md.jaxmd.displacement(cell)",
         )

@@ -351,7 +351,7 @@ def without_kick(integrator: Integrator) -> str | None:
 def check_kick(integrator: Integrator) -> None:
     """Raise `InputError` for an integrator that a linearization does not support."""
     if why := without_kick(integrator):
-        raise InputError(f"the run cannot be linearized here: {why}", where="dynamics.kind")
+        raise InputError(f"the equations of the run cannot be linearized: {why}", where="dynamics.kind")
 
 
 def check_one_box(integrator: Integrator, what: str) -> None:

@@ -326,7 +326,7 @@ class PairSearch:
             with standard_promotion(), _quiet_scatter():
                 found = self._allocate(folded)
             if bool(found.did_buffer_overflow):
-                raise CapacityError("jax-md's neighbor list overflows immediately after its allocation")
+                raise CapacityError("jax-md's neighbor list overflows right after its allocation")
             self._list = found
         idx = np.asarray(found.idx)
         vectors = positions[np.minimum(idx, atoms - 1)] - positions[:, None, :]

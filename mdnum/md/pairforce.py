@@ -291,7 +291,7 @@ class ChannelForce(PairForce):
         raise InputError(
             "each term with its own radius has its own decision, but here a single decision per pair "
             "is expected",
-            remedy="Give all terms the same radius",
+            remedy="Give all terms the same cutoff radius",
         )
 
 

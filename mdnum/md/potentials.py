@@ -212,7 +212,7 @@ class PairFunction(PairPotential):
                 f"the first argument is called {arguments[0] if arguments else 'nothing'!r}; expected r, the "
                 "distance, or r2, its square",
                 where=_name_of(function),
-                remedy="Name it r or r2",
+                remedy="Name the first argument r or r2",
             )
         try:
             inspect.signature(function).bind(0.0, **parameters)

@@ -20,7 +20,7 @@ def check_not_forked() -> None:
     """
     if _forked:
         raise InputError(
-            "this process was forked from one in which jax had been used, and jax would deadlock in it",
+            "this process was forked from a process that had used jax, so jax would deadlock here",
             remedy="Start workers with multiprocessing.get_context('spawn'), or use mdnum only in "
             "the workers (docs/pools.md)",
         )

@@ -429,7 +429,7 @@ def running_sum_table(
     if not np.isfinite(terms.astype(np.float64)).all():
         raise InputError("a term is not finite, so partial sums cannot be recorded")
     if not isinstance(reduction, Serial):
-        remedy = "Give sequential, reversed, permuted or sorted"
+        remedy = "Use the reduction sequential, reversed, permuted or sorted"
         raise InputError(f"{reduction} is not a sequential loop over the terms", remedy=remedy)
     with np.errstate(all="ignore"):
         rows = tuple(_loop(terms, reduction.places(terms)))

@@ -55,7 +55,7 @@ def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
         said = {name: table and table.model_dump(exclude_none=True) for name, table in made._asdict().items()}
     else:
         if isinstance(potential, PairPotential) != isinstance(cutoff, Cut):
-            message = "a pair potential needs cutoff=mdnum.Cut(kind, radius), and no other takes one"
+            message = "a pair potential needs cutoff=mdnum.Cut(kind, radius), but no other takes a cutoff"
             raise InputError(message, where="MdnumCalculator")
         end, said = cutoff, {"potential": potential, "cutoff": cutoff}
 

@@ -58,7 +58,7 @@ class NamedObject:
         try:
             node = ast.parse(self.call, mode="eval").body
         except SyntaxError:
-            message = f"{self.call!r} is not a name with arguments"
+            message = f"{self.call!r} is not the name of a function or class, with or without arguments"
             raise self._wrong(message, "Write thing(argument=value)") from None
         if not isinstance(node, ast.Call):
             return self._attribute(node, module)
@@ -102,12 +102,12 @@ class NamedObject:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # whatever a module raises while it is imported, SystemExit too
-            remedy = "Correct what it does when it is imported"
+            remedy = "Correct the code that runs when the module is imported"
             if isinstance(error, ImportError):
                 missing = getattr(error, "name", None)
-                remedy = f"Install {missing}, or correct the name" if missing else "Install what it needs"
+                remedy = f"Install {missing}, or correct the name" if missing else "Install its dependencies"
             elif isinstance(error, SyntaxError):
-                remedy = "Correct that line"
+                remedy = "Correct this line"
             message = f"cannot be imported: {in_a_line(error)}"
             raise InputError(message, where=self.home, remedy=remedy) from error
 

@@ -276,7 +276,7 @@ class PairRecorder:
         found, both, _ = np.asarray(changes.count).tolist()
         if 2 * found != both:
             raise MdnumError(
-                "a flip was recorded for one atom of the pair only", remedy="Report this as a bug"
+                "a flip was recorded for only one of the two atoms of a pair", remedy="Report this as a bug"
             )
         pairs, ends = np.asarray(changes.pairs), np.asarray(changes.ends)
         kept = np.searchsorted(pairs[:found, 0], segment.rows)
@@ -308,7 +308,7 @@ class PairRecorder:
         if contradicted:
             raise MdnumError(
                 "a recorded margin contradicts its decision",
-                remedy="Run `mdnum doctor`; the compiled arithmetic is not the one expected",
+                remedy="Run `mdnum doctor`; the compiled arithmetic differs from the expected arithmetic",
             )
         margin, bound, jump, distance, speed, force_jump, by_box = numbers
         if self.simulation.pairwise and self.simulation.model.weights:

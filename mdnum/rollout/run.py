@@ -378,7 +378,7 @@ def run(
         if system is not given or save_every is not None or overrides:
             raise InputError(
                 "a resumed run keeps its own system, settings and save_every",
-                remedy="Give only the folder and, to extend the run, steps",
+                remedy="Give only the folder; to extend the run, also give steps",
                 where=str(resume),
             )
         finished = _finished(Path(resume), steps, given)
@@ -386,7 +386,7 @@ def run(
             return finished
         rollout = _resumed(Path(resume), layout, given, steps, progress, began)
     elif system is None:
-        raise InputError("no system given", remedy="Give a system, or a folder to resume")
+        raise InputError("no system was given", remedy="Give a system, or a folder to resume")
     else:
         simulation = build(system, overrides)
         rollout = _fresh(simulation, layout, out, steps, save_every, progress, began)

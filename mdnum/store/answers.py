@@ -67,7 +67,7 @@ def take(path: str | Path, layout: Layout) -> RunFolder:
     folder = RunFolder.open(path)
     if folder.kind != layout.kind or not (folder.path / NAME).is_file():
         other = f"Resume it with `mdnum {folder.layout.command} --resume {path}`"
-        remedy = other if manifest.resumable(folder.path) else f"Begin a new `mdnum {layout.command}`"
+        remedy = other if manifest.resumable(folder.path) else f"Start a new `mdnum {layout.command}`"
         raise FolderError(f"no `mdnum {layout.command}` to resume here", remedy=remedy, where=str(path))
     folder.take(layout)
     return folder

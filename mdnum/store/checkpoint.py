@@ -56,7 +56,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             arrays = _arrays(file)
         meta, store = (json.loads(str(arrays.pop(name))) for name in (_META, _STORE))
         if not isinstance(meta, dict) or not isinstance(store, dict):
-            raise ValueError("its row counts are not a table")
+            raise ValueError("the row counts of the checkpoint are not a table")
         return arrays | meta, store
     except FolderError:
         raise

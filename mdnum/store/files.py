@@ -243,11 +243,11 @@ def load(root: Path) -> Manifest | None:
         held = json.loads(text)
         stated = held.pop("digest")
         if stated != digest_of(_canonical(held)):
-            raise ValueError("its digest does not match its content")
+            raise ValueError("the digest of the manifest does not match its content")
         files = {str(name): [str(one) for one in allowed] for name, allowed in held["files"].items()}
         # names of files in the folder, or in one of the folders in it
         if not all(map(_INSIDE.fullmatch, files)):
-            raise ValueError("it lists files outside of the folder")
+            raise ValueError("the manifest lists files outside of the folder")
         layout = None
         if "kind" in held:
             # an earlier mdnum described columns of its own alone

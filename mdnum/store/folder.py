@@ -183,9 +183,9 @@ class RunFolder:
             FolderError: the folder has no manifest, or its manifest is from a version that stored no layout.
         """
         if self._layout is None:
-            seen = "is missing; it says what the tables of the folder are"
+            seen = "is missing, although it must list the tables of the folder"
             if (self.path / manifest.NAME).exists():
-                seen = "does not say what the tables of the folder are; an earlier version of mdnum wrote it"
+                seen = "does not list the tables of the folder; an earlier version of mdnum wrote the file"
             remedy = "Run again in a new folder; the parquet files can be read one by one"
             raise FolderError(seen, remedy=remedy, where=str(self.path / manifest.NAME))
         return self._layout
@@ -777,7 +777,7 @@ def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
         seen = f"is not empty (it holds {present[0]!r})"
         raise FolderError(seen, remedy="Choose an empty or a new folder", where=str(path))
     made = manifest.load(path)
-    remedy = "Choose another folder, or remove it"
+    remedy = "Choose another folder, or remove this folder"
     if manifest.resumable(path):
         remedy = f"{_again(path)}, or choose another folder"
     elif made is not None and not made.finished:

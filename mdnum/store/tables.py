@@ -130,7 +130,7 @@ class TableStream:
             raise ValueError(f"table {self.name!r}: missing columns {missing}, unexpected columns {unknown}")
         lengths = {name: len(one) for name, one in columns.items() if not isinstance(one, str)}
         if len(set(lengths.values())) > 1:
-            raise ValueError(f"table {self.name!r}: columns of different length: {lengths}")
+            raise ValueError(f"table {self.name!r}: the columns have different lengths: {lengths}")
         self._schema, rows = schema, max(lengths.values())
         if not rows:
             return
@@ -189,7 +189,7 @@ class TableStream:
         if have < rows:
             raise FolderError(
                 f"table {self.name!r} has {have} rows, but its checkpoint counts {rows}",
-                remedy="The folder was changed since; run again in a new folder",
+                remedy="The folder was changed afterward; run again in a new folder",
                 where=str(self.merged_path.parent),
             )
         # parts of a merge that was killed before it removed them: their rows are in the merged file
@@ -433,7 +433,7 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
             head, size = file.metadata, os.fstat(raw.fileno()).st_size
             held = 8 * head.num_rows * head.num_columns
             if held > _MOST_UNPACKED + _MOST_TIMES * size:
-                said = f"{size:,} bytes claim to hold {held:,}, which no table of mdnum unpacks to"
+                said = f"{size:,} bytes claim to unpack to {held:,} bytes, more than any table of mdnum"
                 raise FolderError(said, where=str(path), remedy=_RESTORE)
             yield file
     except (OSError, pa.ArrowException, MemoryError) as error:

@@ -214,7 +214,7 @@ def _tolerances(plan: Plan, means: Means) -> dict[str, float]:
     if isinstance(given, Mapping):
         if unknown := [name for name in given if name not in plan.names]:
             message = f"a tolerance is given for {unknown[0]}, which is not measured"
-            raise InputError(message, remedy="Add it to --measure")
+            raise InputError(message, remedy="Add this measure to --measure")
         return {name: float(value) for name, value in given.items()}
     sizes = {
         measure.name: abs(means[measure.name, plan.origin].value)

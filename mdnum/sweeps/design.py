@@ -70,7 +70,7 @@ def parse(text: str) -> Axis:
     if found := _RANGE.fullmatch(rest):
         return Axis(key, _range(text, *map(scalar, found.groups())))
     if re.fullmatch(r"[-+.\deE]+(:[-+.\deE]*)+", rest):
-        raise InputError(f"--over {text!r} is not a range", remedy=_REMEDY)
+        raise InputError(f"--over {text!r} is not a range of values", remedy=_REMEDY)
     # lists of a file ([4, 4, 4]) have commas of their own
     parts = re.split(r",(?![^\[]*\])", rest)
     return checked(Axis(key, tuple(scalar(part.strip()) for part in parts)))
@@ -136,7 +136,7 @@ def points(
     """
     keys = [axis.key for axis in axes]
     if twice := [key for key in keys if keys.count(key) > 1]:
-        raise InputError(f"{twice[0]} is given twice", remedy="Give each choice once, with all its values")
+        raise InputError(f"{twice[0]} is given twice", remedy="Give each setting once, with all its values")
     if design == "factorial":
         count = math.prod(len(axis.values) for axis in axes)
         if count * len(seeds) > MOST_POINTS:

@@ -300,7 +300,7 @@ def computed(
                     continue
                 idle += 1
                 if idle > _IDLE or (broken and engine.end is None):
-                    remedy = "Is it running, and does its environment have mdnum?"
+                    remedy = "Check that the engine is running and that mdnum is installed in its environment"
                     raise InputError(f"no worker responds: {failed[:300]}", where="the engine", remedy=remedy)
                 sleep(min(idle - 1, 10))
                 if broken:

@@ -420,7 +420,7 @@ def chosen(words: Sequence[str], world: str) -> list[Measure]:
     measures = [_named(word) for word in words]
     if other := [measure.name for measure in measures if measure.world != world]:
         known = ", ".join(name for name in MEASURES.shipped if MEASURES[name].world == world)
-        raise InputError(f"{other[0]} is no measure of such a system", remedy=f"Its measures are {known}")
+        raise InputError(f"{other[0]} is not a measure of this system", remedy=f"Choose from {known}")
     return measures
 
 
@@ -456,7 +456,7 @@ def _of_file(word: str) -> Measure:
             top = one.partition(".")[0]
             if not top or any((file.parent / end).exists() for end in (f"{top}.py", f"{top}/__init__.py")):
                 raise InputError(
-                    f"the file imports {one} from its folder, which no digest covers",
+                    f"the file imports {one} from its folder, which the digest of the measure does not cover",
                     where=str(file), remedy="Put everything that the measure needs into one file",
                 )  # fmt: skip
 

@@ -112,7 +112,7 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
     axes = _axes(over)
     seeds = list(range(question.seeds)) if isinstance(question.seeds, int) else list(question.seeds)
     if not seeds:
-        raise InputError("no random seed was given", remedy="Give at least one")
+        raise InputError("no random seed was given", remedy="Give at least one seed")
     overrides = dict(overrides or {})
     if isinstance(system, System):
         # one that was loaded takes no overrides any more, its simulation does

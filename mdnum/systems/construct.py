@@ -156,7 +156,7 @@ def simulation(
     pairwise = isinstance(potential, PairPotential)
     if pairwise != (cutoff is not None):
         message = "has no cutoff" if pairwise else "carries its own cutoff"
-        remedy = "Add cutoff=mdnum.Cut(kind, radius)" if pairwise else "Leave the cutoff out"
+        remedy = "Add cutoff=mdnum.Cut(kind, radius)" if pairwise else "Omit the cutoff"
         raise InputError(f"the potential {message}", where=name, remedy=remedy)
     model: Any = potential
     if isinstance(potential, PairPotential) and cutoff is not None:
@@ -179,8 +179,8 @@ def simulation(
     given = {key: one for key, one in optional.items() if one is not None} | dict(dynamics or {})
     if isinstance(integrator, Integrator):
         if also := [*given, *(["timestep"] if timestep is not None else [])]:
-            message = f"the integrator is an object, and {', '.join(also)} was given as well"
-            raise InputError(message, where=name, remedy="Leave it out, or give the integrator by its name")
+            message = f"the integrator is an object, but {', '.join(also)} was given as well"
+            raise InputError(message, where=name, remedy="Omit it, or give the integrator by its name")
         _check_instance(integrator, system, name)
     else:
         if timestep is None:
@@ -392,7 +392,7 @@ def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, 
                 raise InputError(message, where=what, remedy="Give one number for each pair")
         missing = [one for one in names if pair_key(*one.split("-")) not in given]
         if missing:
-            remedy = "Give one for every pair of species, or one number for all"
+            remedy = "Give a number for every pair of species, or one number for all pairs"
             raise InputError(f"no value was given for {', '.join(missing)}", where=what, remedy=remedy)
         value = [given[pair_key(*one.split("-"))] for one in names]
     return np.broadcast_to(_finite(value, what), (len(names),)).copy()
@@ -463,7 +463,7 @@ def assembled(
     integrator.check(cell)
     if integrator.moves_cell and not pairwise and getattr(model, "fixed_box", False):
         message = f"{origin.name} has a potential with a fixed box, but {integrator.name} changes the box"
-        remedy = "Let it take box= (jax_md.space.periodic_general)"
+        remedy = "Let the potential take the argument box= (jax_md.space.periodic_general)"
         raise InputError(message, where="dynamics.kind", remedy=remedy)
     velocities = draw.velocities(masses, units, None if draw.drawn else atoms.get_velocities())
     made = Simulation(
@@ -509,7 +509,7 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
         model = each_term(model, of_kinds)
         if model.weights and not np.array_equal(atoms.numbers, simulation.structure.numbers):
             remedy = "Give atoms of the same species in the same order"
-            message = "the potential has weights of single atoms, and the species of these atoms differ"
+            message = "the potential has weights of single atoms, but the species of these atoms differ"
             raise InputError(message, where=simulation.name, remedy=remedy)
     return assembled(
         Origin(simulation.name, simulation.origin.about), atoms, simulation.units, model,
@@ -524,7 +524,7 @@ def in_fixed_point(simulation: Simulation) -> Simulation:
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(
-            'state = "lattice" needs float64 forces, and decides and sums in fixed-point arithmetic; '
+            'state = "lattice" needs float64 forces, and makes decisions and sums in fixed point; '
             "no other precision can be given",
             where="precision",
             remedy="Omit the keys force, decision and accumulate",

@@ -270,7 +270,7 @@ class BallSystem:
         """
         name = name or ", ".join(f"{key}={value}" for key, value in changes.items())
         if name in self.variants:
-            raise InputError(f"the variant {name!r} is defined twice", remedy="Define it once")
+            raise InputError(f"the variant {name!r} is defined twice", remedy="Define each variant once")
         given = {".".join(key): value for key, value in read_overrides(changes).items()}
         variant = vary(name, given, self.spec, f"--against {name}")
         tables = {**self.spec.variants, name: given}
@@ -316,7 +316,7 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
         raise InputError(
             f"variant {name!r} changes no key",
             where=where,
-            remedy="Give a key to change, or remove the variant",
+            remedy="Add a key to the variant, or remove the variant",
         )
     data = base.model_dump(exclude_none=True, exclude={"variants", "name"})
     values = {toml.dotted(key): value for key, value in changes.items()}

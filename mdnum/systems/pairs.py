@@ -78,8 +78,8 @@ def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tu
         radius = np.full(len(names), np.nan if cutoff.radius is None else cutoff.radius)
     radius = np.array([given.get(name, own) for name, own in zip(names, radius.tolist(), strict=True)])
     if np.isnan(radius).any():
-        message = f"no radius for {names[np.isnan(radius).argmax()]} (it has {', '.join(given)})"
-        remedy = "Add it, or give a radius for every other pair as the key cutoff.radius"
+        message = f"no radius for {names[np.isnan(radius).argmax()]} (radii are given for {', '.join(given)})"
+        remedy = "Add this radius, or give the radius of all other pairs as cutoff.radius"
         raise InputError(f"[cutoff.pairs] has {message}", remedy=remedy)
     if not cutoff.switches:
         return radius, None

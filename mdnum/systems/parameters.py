@@ -369,7 +369,7 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
         if len(ends) == 1:
             return ends[0]
         if ends:
-            several = f"{word!r} could be any of {', '.join(ends)}"
+            several = f"{word!r} is ambiguous: it could be any of {', '.join(ends)}"
             raise InputError(several, remedy="Give the full name of one of them")
     if entry(simulation, word).index:
         return word

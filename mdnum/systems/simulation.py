@@ -388,8 +388,8 @@ class Simulation:
         """Return the system in another box."""
         check_radius(cell, self.r_cut, 0.0)
         if not self.pairwise and getattr(self.model, "fixed_box", False):
-            message = f"{self.model.name} keeps the box that it was made with"
-            remedy = "Let it take box= (jax_md.space.periodic_general)"
+            message = f"{self.model.name} always uses the box with which it was made"
+            remedy = "Let the potential take the argument box= (jax_md.space.periodic_general)"
             raise InputError(message, where=self.name, remedy=remedy)
         cell = cell if self.fixed_point is None else self.fixed_point.cell(cell)
         return replace(self, cell=cell, decider=replace(self.decider, reach=cell.reach(self.positions)))

@@ -130,7 +130,7 @@ def _read(path: Path, index: int) -> Atoms:
         raise InputError(
             "the structure has constraints (fixed atoms), which mdnum does not support",
             where=str(path),
-            remedy="Remove them from the structure",
+            remedy="Remove the constraints from the structure",
         )
     return found
 

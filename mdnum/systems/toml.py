@@ -259,7 +259,7 @@ class TomlTable(BaseModel):
                 if number and name != "tol" and not _SMALLEST <= abs(number) <= 1 / _SMALLEST:
                     raise ValueError(
                         f"{name} = {number:g}; expected 0 or a size from {_SMALLEST:g} to {1 / _SMALLEST:g}, "
-                        "so that its square is representable"
+                        "so that the number can be squared"
                     )
         return self
 
@@ -402,7 +402,7 @@ def checked(root: type[Root], data: Mapping[str, Any], source: Source) -> Root:
     others = dict.fromkeys(".".join(_place(one, root, data)) for one in details)
     if others := [one for one in others if one and one != ".".join(key)]:
         remedy += "" if remedy.endswith((".", "?")) else "."
-        remedy = f"{remedy} Something is wrong with {', '.join(others[:3])}, too"
+        remedy = f"{remedy} There are also errors in {', '.join(others[:3])}"
     raise InputError(message, remedy=remedy, where=source.place(key))
 
 
@@ -515,9 +515,9 @@ def apply_overrides(data: dict[str, Any], values: Mapping[Key, Any], root: type[
             table = table.setdefault(part, {})
             if not isinstance(table, dict):
                 raise InputError(
-                    f"{'.'.join(key[:depth])} is a value and not a table",
+                    f"{'.'.join(key[:depth])} is a value, not a table",
                     where=f"--set {'.'.join(key)}",
-                    remedy=f"Set {'.'.join(key[:depth])} itself",
+                    remedy=f"Set the value of {'.'.join(key[:depth])}",
                 )
         table[key[-1]] = value
     for key in values:

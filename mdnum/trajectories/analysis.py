@@ -233,7 +233,7 @@ class NeighborFlips(AnalysisBase):
         back = np.flatnonzero(np.diff(self._numbers) <= 0)
         if back.size:
             after, before = self._numbers[back[0] + 1], self._numbers[back[0]]
-            message = f"the frames go backward or stand still: frame {after} after frame {before}"
+            message = f"the times of the frames do not increase: frame {after} after frame {before}"
             raise InputError(message, remedy="Give the frames in ascending order of time")
         sample, raw, changed = [], [], 0.0
         for number in self._numbers[:SAMPLE]:
@@ -252,7 +252,7 @@ class NeighborFlips(AnalysisBase):
             self._check.pbc = sample[0].box.pbc
             if self._bound is None and (self.library.replaced or changed > self._bound_of(sample[-1])):
                 why = f"they change distances by up to {changed:.3g} Å"
-                why = "they have replaced what was read in memory" if self.library.replaced else why
+                why = "they have replaced the coordinates in memory" if self.library.replaced else why
                 raise InputError(
                     f"the transformations of the trajectory hide the resolution of its coordinates: {why}",
                     remedy=(
@@ -397,7 +397,7 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
     tables, done, last = [FlipTable.none()], 0, None
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):
-            message = f"two processes found other pairs at the frame between them (number {done - 1} of all)"
+            message = f"two processes found different pairs at the same frame (number {done - 1} of all)"
             raise InputError(message, remedy="The file was changed while it was read; run again")
         for table in part.flips:
             # a part after the first has counted the frame before its own too
@@ -425,7 +425,7 @@ def _group_of(atoms: Any, name: str) -> AtomGroup:
     if not isinstance(atoms, AtomGroup):
         raise InputError(
             f"expected a Universe or an AtomGroup; got {type(atoms).__name__}",
-            remedy="Give for example universe.select_atoms(...)",
+            remedy="Give a group of atoms, such as universe.select_atoms(...)",
         )
     if len(atoms) == 0:
         raise InputError(f"the group {name} is empty", remedy="Check the selection")
@@ -443,7 +443,7 @@ def _rules_of(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
     if not rules:
         raise InputError(
             "no cutoff was given",
-            remedy="Give r_cut=8.5 (Å), several as a list, or a rule of mdnum.trajectories.rules",
+            remedy="Give r_cut=8.5 (in Å), a list of radii, or a rule of mdnum.trajectories.rules",
         )
     for one in rules:
         if not isinstance(one, Rule):
@@ -466,4 +466,4 @@ def _cutoff(value: Any) -> Rule:
         return CutoffRule(length(value))
     except (TypeError, ValueError):
         message = f"r_cut = {value!r}; expected a length in Å, or lengths by pair of species"
-        raise InputError(message, remedy='Give r_cut=8.5, {("O", "H"): 2.5}, or a list of them') from None
+        raise InputError(message, remedy='Give r_cut=8.5, {("O", "H"): 2.5}, or a list of both') from None

@@ -45,7 +45,7 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
     if found.dtype.kind not in kinds or (found.dtype.kind == "f" and found.dtype.itemsize < 4):
         expected = "float32 or float64" if "f" in kinds else "integers"
         held = next((one for one in ("position", "positions") if hasattr(values, one)), None)
-        remedy = f"Give state.{held}" if held else "Convert them"
+        remedy = f"Give state.{held}" if held else "Convert the array"
         raise InputError(f"{name} has dtype {found.dtype}; expected {expected}", remedy=remedy, where=name)
     return found
 
@@ -84,14 +84,14 @@ class ArrayFrames(Trajectory):
         """
         here, x = self._box_of(cell, box, pbc), host(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
-            message = f"positions of shape {x.shape}; expected (atoms, 3)"
+            message = f"the positions have shape {x.shape}; expected (atoms, 3)"
             raise InputError(message, remedy="Give one frame; use see_many for several", where="positions")
         bits, x = 32 if x.dtype == np.float32 else 64, np.array(x, np.float64)
         if not self._first:
             self._begin(x, here, bits)
         if bits != self.bits:
-            message = f"positions were float{self.bits} and are float{bits} at step {step}"
-            raise InputError(message, remedy="Give all frames in one dtype", where="positions")
+            message = f"positions were float{self.bits} at earlier steps, but are float{bits} at step {step}"
+            raise InputError(message, remedy="Give all frames the same dtype", where="positions")
         v = None if self.time == "step" else velocities
         v = None if v is None else np.array(host(v, "velocities"), float)
         if v is not None and v.shape != x.shape:
@@ -119,7 +119,7 @@ class ArrayFrames(Trajectory):
             given = np.asarray(cellpar_to_cell(given))
         if (cell is not None and box is not None) or given.shape not in ((), (1,), (3,), (3, 3)):
             message = f"{name} of shape {given.shape}" if cell is None or box is None else "both cell and box"
-            remedy = "Give one length, three, or three vectors: in rows as cell, or in columns as box"
+            remedy = "Give one or three lengths, or three vectors: the rows of cell, or the columns of box"
             raise InputError(message, remedy=remedy, where=name)
         matrix = np.eye(3) * given if given.ndim < 2 else np.array(given if box is None else given.T, float)
         if box is not None and np.triu(matrix, 1).any():
@@ -136,8 +136,8 @@ class ArrayFrames(Trajectory):
             message = f"all coordinates lie between 0 and 1, in a box of {box.shortest:g} and more"
             raise InputError(message, remedy=remedy, where="positions")
         if fractional and (not box.pbc.all() or (x.size and (x.min() < -1 or x.max() > 2))):
-            message = f"fractional coordinates from {x.min():.3g} to {x.max():.3g}, box {box.matrix.tolist()}"
-            remedy = "Say fractional=False for lengths; wrap fractions (x % 1), and give them a box"
+            message = f"fractions lie from {x.min():.3g} to {x.max():.3g}, box {box.matrix.tolist()}"
+            remedy = "Give fractional=False for lengths; for fractions, wrap them (x % 1) and give a box"
             raise InputError(message, remedy=remedy, where="positions")
         words = ["X"] * len(x) if self.named is None else list(map(str, np.asarray(self.named).tolist()))
         if len(words) != len(x):

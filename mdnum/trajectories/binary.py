@@ -157,7 +157,7 @@ class XtcFile(XdrFile):
         self._file.seek(self.start(number))
         head = _HEAD.unpack(self._read(_HEAD.size))
         if head[0] not in _MAGIC or head[1] != head[-1] or head[1] < 0:
-            raise ValueError("damaged: a frame header is missing where one is expected")
+            raise ValueError("damaged: the header of a frame is missing")
         return head
 
     def _stream(self, number: int, look: bool = False) -> None:
@@ -182,7 +182,7 @@ class XtcFile(XdrFile):
         stream = np.frombuffer(self._read(size), np.uint8)
         self._read(-size % 4)
         if (_walk(stream, atoms, bits, small) + 7) // 8 != size:
-            raise ValueError("damaged: the compressed coordinates do not end where their length requires")
+            raise ValueError("damaged: the compressed coordinates do not have the given length")
 
 
 @njit
@@ -245,7 +245,7 @@ class TrrFile(XdrFile):
         width = box // 9 if box else max(vectors, default=0) // max(3 * atoms, 1)
         fits = all(size == 3 * width * atoms for size in vectors) and box in (0, 9 * width)
         if (magic, word) != _TRR_BEGIN or width not in (4, 8) or not fits or min(sizes) < 0:
-            raise ValueError("damaged: a frame header is missing where one is expected")
+            raise ValueError("damaged: the header of a frame is missing")
         return atoms, width, sizes
 
     def has_box(self, number: int) -> bool:

@@ -155,7 +155,7 @@ class FrameCheck:
         for axis in frame.box.broken:
             vector = frame.box.matrix[axis].tolist()
             what = f": the box repeats along {'abc'[axis]}, but its vector there is {vector}"
-            yield what, "Give the frames a box, or say that this direction does not repeat"
+            yield what, "Give the frames a box, or make this direction non-periodic"
         if not np.isfinite(frame.furthest_of(atoms)):
             bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
             yield f": {place(_named(bad[0], atoms))}{_and_others(bad.size)}", failed
@@ -173,7 +173,7 @@ class FrameCheck:
         some, far = x[:: max(1, len(x) // _SOME)], _LEAP_BOXES * frame.box.longest
         if lay := self.collective.left(some, len(x)):
             what = f" is the first in which not all atoms have {lay}: the frames before it cannot be right"
-            remedy = f"Leave them out, and begin with this one (@{frame.index}:)"
+            remedy = f"Leave out the earlier frames: begin with this frame (@{frame.index}:)"
             message = f"frame {frame.index}{what}"
             raise EarlierFramesError(message, frame=frame.index, remedy=remedy, where=self.where)
         if (why := self.collective.refuse(some, len(x), frame.box.shortest, far)) is not None:
@@ -230,7 +230,7 @@ def far_out(
         return _named(at, atoms), int(np.count_nonzero(away > limit)), why
     if unit * top > radius:
         largest = np.abs(x).max(axis=1)
-        why = f"so far out that float{bits} tells distances no better than to {unit * top:.2g}"
+        why = f"so far out that float{bits} resolves distances only to {unit * top:.2g}"
         return _named(np.argmax(largest), atoms), int(np.count_nonzero(unit * largest > radius)), why
     return None
 

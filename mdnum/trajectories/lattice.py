@@ -85,8 +85,8 @@ def _reduced(rows: bytes, periodic: bytes) -> ReducedLattice:
     matrix, pbc = np.frombuffer(rows).reshape(3, 3).copy(), np.frombuffer(periodic, bool).copy()
     broken, matrix = Box(matrix, pbc).broken, np.where(pbc[:, None], matrix, 0.0)
     for axis in broken:
-        message = f"the box repeats along direction {axis}, but its vector there is {matrix[axis].tolist()}"
-        remedy = "Give the frame a box, or say that this direction does not repeat"
+        message = f"axis {axis} of the box is periodic, but its vector is {matrix[axis].tolist()}"
+        remedy = "Give the frame a box, or make this direction non-periodic"
         raise InputError(message, remedy=remedy, where="box")
     combination, vectors = np.eye(3, dtype=np.int64), matrix
     if pbc.any():

@@ -185,7 +185,7 @@ class ListCheck:
         """Return the neighbor list as a `GivenList`: the same object if it did not change."""
         if self._newest is None:
             if self._rule.directed:
-                message = f"a neighbor list is compared with a cutoff, and the rule is {self._rule.name}"
+                message = f"a neighbor list needs a cutoff, but the rule is {self._rule.name}"
                 raise InputError(message, remedy="Give r_cut first", where="neighbors")
             self._kinds, self._radii = self._rule.table(species)
         parts = arrays_of(neighbors, len(self._kinds))

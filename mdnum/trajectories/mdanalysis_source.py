@@ -417,7 +417,7 @@ class NetcdfTrajectory(Trajectory):
         file = netcdf_of(path)
         atoms = 0 if file is None else file.dimensions.get("atom")
         if file is None or "coordinates" not in file.variables or not atoms:
-            raise self._refused("it is no Amber NetCDF file, or one that ends in its head")
+            raise self._refused("the file is not an Amber NetCDF file, or ends within its header")
         self._file, self._count = file, file.whole + 1
         if not file.whole:
             raise self._unreadable(0, self._ends)

@@ -63,7 +63,7 @@ def open_trajectory(
     file, words = split_path(str(path))
     if words and slice:
         raise InputError(
-            f"frames are selected twice, by @{words} and by {slice!r}", remedy="Select them once"
+            f"frames are selected twice, by @{words} and by {slice!r}", remedy="Select frames once"
         )
     frames = parse_slice(slice or words, where=str(path))
     if file.is_dir() and (file / "trajectory.traj").exists():
@@ -72,7 +72,7 @@ def open_trajectory(
         RunFolder.open(file).check("trajectory.traj")
         file = file / "trajectory.traj"
     if file.is_dir() and (file / "summary.json").exists():
-        message = "this folder holds results, and no trajectory"
+        message = "this folder holds results, but no trajectory"
         remedy = "Give the trajectory file; a run writes one with --save-every 1 (or another number)"
         raise InputError(message, remedy=remedy, where=str(file))
     if file.is_dir() and file.suffix != ".bundle":
@@ -161,7 +161,7 @@ def parse_slice(words: str, where: str = "") -> slice:
     """
     match = _SLICE.fullmatch(words.strip())
     if match is None:
-        message = f"{words!r} names no frames"
+        message = f"{words!r} is not a range of frames"
         remedy = "Write START:STOP:STEP, for example 100: or ::10 or -50:, or the number of one frame"
         raise InputError(message, remedy=remedy, where=where or None)
     colon = match[2]
@@ -169,7 +169,7 @@ def parse_slice(words: str, where: str = "") -> slice:
     if colon is None:
         return slice(None) if start is None else slice(start, start + 1 or None)
     if step is not None and step < 1:
-        message = f"the frames {words!r} go backward or nowhere"
-        remedy = "Write a stride of 1 or more: flips follow time"
+        message = f"the stride of the frames {words!r} is not positive"
+        remedy = "Use a stride of 1 or more: flips need frames in order of time"
         raise InputError(message, remedy=remedy, where=where or None)
     return slice(start, stop, step or 1)

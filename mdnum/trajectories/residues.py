@@ -56,7 +56,7 @@ class ByResidue:
             raise InputError("the file has no residues, so no contacts between residues", remedy=remedy)
         if directed := [one.name for one in rules if one.directed]:
             remedy = "Use --cutoff, or --pairs for cutoffs by species"
-            raise InputError(f"{directed[0]} is a rule for atoms, not for residues", remedy=remedy)
+            raise InputError(f"the rule {directed[0]} applies to atoms, not to residues", remedy=remedy)
         light, virtual = left_out(table)
         kept = np.ones(len(table), bool) if hydrogens else ~(light | virtual)
         every = np.arange(len(table)) if groups[0] is None else groups[0]

@@ -33,7 +33,7 @@ def _radius(value: float, where: str) -> None:
 
 def _count(value: int, where: str) -> None:
     if isinstance(value, bool) or int(value) != value or value < 1:
-        message = f"{value!r} neighbors; expected a whole number from 1"
+        message = f"{value!r} neighbors; expected an integer of at least 1"
         raise InputError(message, remedy="Give the number of neighbors to keep", where=where)
 
 
@@ -90,15 +90,15 @@ class SpeciesCutoffs(_Membership):
 
     def __post_init__(self):
         if not self.radii:
-            message = "no pair of species"
-            remedy = 'Give at least one, ("O", "H"): 2.5 say'
+            message = "no pair of species was given"
+            remedy = 'Give at least one pair, such as ("O", "H"): 2.5'
             raise InputError(message, remedy=remedy, where="SpeciesCutoffs.radii")
         for pair, value in self.radii.items():
             _radius(value, f"SpeciesCutoffs.radii[{pair}]")
             other = self.radii.get((pair[1], pair[0]), value)
             if other != value:
                 message = f"{pair[0]}-{pair[1]} has two radii, {value:g} and {other:g}"
-                remedy = "Give it once: the rule is the same in both directions"
+                remedy = "Give one radius: the order of the two species does not matter"
                 raise InputError(message, remedy=remedy, where="SpeciesCutoffs.radii")
 
     @property
@@ -127,7 +127,7 @@ class SpeciesCutoffs(_Membership):
         for (a, b), value in self.radii.items():
             if missing := [one for one in (a, b) if one not in place]:
                 message = f"no atom is of species {missing[0]!r}; there are {', '.join(list(place)[:20])}"
-                remedy = "Write species as the trajectory names them"
+                remedy = "Use the names of species in the trajectory"
                 raise InputError(message, remedy=remedy, where=f"SpeciesCutoffs.radii[{(a, b)}]")
             radii[place[a], place[b]] = radii[place[b], place[a]] = value
         return index.reshape(-1).astype(np.int64), radii

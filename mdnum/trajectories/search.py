@@ -158,7 +158,7 @@ def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float)
     pairs = 0.5 * centers * others * images
     if images > _MOST_IMAGES_EACH and pairs > _MOST_REPEATED:
         raise InputError(
-            f"about {pairs:,.0f} pairs lie within {radius:.6g}: any two atoms have about "
+            f"about {pairs:,.0f} pairs lie within {radius:.6g}: each pair of atoms has about "
             f"{images:,.0f} images there "
             f"in a box of widths {np.round(lattice.widths, 3).tolist()}",
             remedy="Check the unit of the cutoff and the box, or select fewer atoms",

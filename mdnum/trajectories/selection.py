@@ -14,7 +14,7 @@ from mdnum.trajectories.topology import AtomTable
 from mdnum.trajectories.trajectory import Trajectory
 
 _LANGUAGE = (
-    'Write it as MDAnalysis does: "name OW", "protein", "element O", "index 0:99", "resname SOL and name OW"'
+    'Use the MDAnalysis syntax: "name OW", "protein", "element O", "index 0:99", "resname SOL and name OW"'
 )
 _SHOWN = 8
 
@@ -36,8 +36,8 @@ def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
         try:
             found = universe.select_atoms(words)
         except (NoDataError, AttributeError) as error:
-            message = f"the selection {words!r} asks for what the file does not tell ({first_line(error)})"
-            remedy = "Give a topology that has it with -s TOPOLOGY, or select by index"
+            message = f"the selection {words!r} needs information that the file lacks ({first_line(error)})"
+            remedy = "Give a topology with this information (-s TOPOLOGY), or select by index"
             raise InputError(message, remedy=remedy, where=where) from error
         except (SelectionError, ValueError, TypeError) as error:
             message = f"{words!r} is not a valid selection ({first_line(error)})"

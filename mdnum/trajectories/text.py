@@ -98,8 +98,8 @@ class AseTrajectory(AseFrames):
         try:
             get_ioformat(format)
         except UnknownFileTypeError:
-            seen = f"--format {format!r} is known to neither MDAnalysis nor ASE"
-            remedy = "Write it as one of them does: XTC, DCD, lammpstrj, extxyz, ..."
+            seen = f"--format {format!r} is not a format of MDAnalysis or ASE"
+            remedy = "Use a name of MDAnalysis or ASE, such as XTC, DCD, lammpstrj, extxyz, ..."
             raise self._refused(seen, remedy) from None
         if format == "traj":
             with reading(path, by="ASE"), TrajectoryReader(str(path)) as reader:
@@ -128,8 +128,8 @@ def format_of(path: Path) -> str:
         with reading(path, by="ASE"):
             return filetype(str(path))
     except UnknownFileTypeError as error:
-        message = "neither MDAnalysis nor ASE knows this format"
-        remedy = "Name the file by its format (.xtc, .dcd, .extxyz, ...), or convert it"
+        message = "neither MDAnalysis nor ASE can read this format"
+        remedy = "Give the file the suffix of its format (.xtc, .dcd, .extxyz, ...), or convert it"
         raise InputError(message, remedy=remedy, where=str(path)) from error
 
 
@@ -329,7 +329,7 @@ class LammpsDump(TextTrajectory):
         names = next((names for names in _COLUMNS if set(names) <= set(columns)), None)
         if names is None:
             seen = f"has no positions among its columns ({' '.join(columns)})"
-            raise self._odd(number, seen, "Dump x y z, xu yu zu or xs ys zs")
+            raise self._odd(number, seen, "Write the dump with the columns x y z, xu yu zu or xs ys zs")
         positions = numbers(names)
         if names[0].startswith("xs"):
             positions = box.origin + positions @ box.matrix
@@ -343,8 +343,8 @@ class LammpsDump(TextTrajectory):
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
         """Return the order of the rows by id; the ids must be the same as in the first frame."""
         if "id" not in columns:
-            message = "the dump has no ids, and LAMMPS changes the order of atoms as they move"
-            raise self._refused(message, "Dump the column id")
+            message = "the dump has no atom ids, but LAMMPS changes the order of atoms as they move"
+            raise self._refused(message, "Write the dump with the column id")
         return self._by_id(number, rows[:, columns.index("id")].astype(np.int64))
 
     def _block(self, lines: Any) -> list[str] | None:
@@ -354,7 +354,7 @@ class LammpsDump(TextTrajectory):
             if not block and not line.strip():
                 continue
             if not block and not line.startswith("ITEM:"):
-                raise ValueError(f"expected ITEM:; found {line.strip()[:40]!r}")
+                raise ValueError(f"expected a line that begins with ITEM:; found {line.strip()[:40]!r}")
             block.append(line)
             if line.startswith("ITEM: NUMBER OF ATOMS"):
                 block.append(next(lines, ""))

@@ -94,8 +94,8 @@ class Tracker:
         self.rule, self.bound = rule, float(bound)
         self._first, self._second = _indices(first, "first"), _indices(second, "second")
         if rule.needs_species and species is None:
-            message = f"{rule.name} needs to know which species the atoms are of"
-            remedy = "Give a topology that names elements or types, or use one cutoff for all"
+            message = f"{rule.name} needs the species of the atoms"
+            remedy = "Give a topology that names elements or types, or use one cutoff for all pairs"
             raise InputError(message, remedy=remedy, where="species")
         self._species = None if species is None else np.asarray(species, str)
         self._atoms = -1
@@ -185,14 +185,14 @@ class Tracker:
             if not self.rule.directed:
                 self._who = _by_place(self._who, frame)
         if atoms != self._atoms:
-            message = f"this frame has {atoms} atoms, the frames before it {self._atoms}"
+            message = f"this frame has {atoms} atoms, but the frames before it have {self._atoms}"
             raise InputError(message, remedy="Split the trajectory where the number of atoms changes")
         positions, largest = _taken(frame.positions, self._who.labels)
         if not np.isfinite(largest):
             broken = np.flatnonzero(~np.isfinite(positions).all(axis=1))
             at = int(broken[np.argmin(self._who.labels[broken])])
             message = f"atom {int(self._who.labels[at])} is at {positions[at].tolist()}"
-            remedy = "Stop before this frame (a slice of the file), and find out why the run broke"
+            remedy = "Select only the frames before this one, and find out why the run failed"
             raise InputError(message, remedy=remedy)
         lattice, radius = lattice_of(frame.box), self._who.radius
         rounding = lattice.rounding(largest, radius if np.isfinite(radius) else 4.0 * largest)
@@ -312,9 +312,9 @@ def _participants(
     for name, chosen in (("first", first), ("second", second)):
         if len(chosen) and chosen.max() >= atoms:
             message = f"atom {int(chosen.max())} is selected, but frames have {atoms} atoms (from 0)"
-            raise InputError(message, remedy="Select atoms that the trajectory has", where=name)
+            raise InputError(message, remedy="Select only atoms that exist in the trajectory", where=name)
     if species is not None and len(species) != atoms:
-        message = f"{len(species)} species for frames of {atoms} atoms"
+        message = f"{len(species)} species were given for frames of {atoms} atoms"
         raise InputError(message, remedy="Use the topology that belongs to the trajectory", where="species")
     centers, others = np.zeros(atoms, bool), np.zeros(atoms, bool)
     centers[first], others[second] = True, True
@@ -355,7 +355,7 @@ def _indices(chosen: Sequence[int] | np.ndarray | None, where: str) -> np.ndarra
     if made.size == 0:
         return np.zeros(0, np.int64)
     if made.ndim != 1 or made.dtype.kind not in "iu" or made.min() < 0:
-        message = f"expected whole numbers from 0, got {made.dtype} of shape {made.shape}"
+        message = f"expected integers of at least 0; found {made.dtype} of shape {made.shape}"
         remedy = "Give the indices of the atoms in the trajectory, from 0"
         raise InputError(message, remedy=remedy, where=where)
     return np.unique(made.astype(np.int64))

@@ -79,7 +79,7 @@ class Trajectory(ABC):
             seen = (
                 f"the topology {self.topology.path.name} has {topology:,} atoms and the trajectory {atoms:,}"
             )
-            remedy = "Give the topology that the trajectory was written with, or a selection of it"
+            remedy = "Give the topology with which the trajectory was written, or a selection of its atoms"
             raise self._refused(seen, remedy)
 
     def _refused(self, message: str, remedy: str = CHECK) -> InputError:
@@ -131,8 +131,8 @@ class Trajectory(ABC):
                         return
                     frame = self.decoded(number, raw)
                 if len(frame.positions) != self.atoms:
-                    seen = f"has {len(frame.positions):,} atoms and the first {self.atoms:,}"
-                    remedy = "Leave out the frames with another number of atoms: a flip needs the pair before"
+                    seen = f"has {len(frame.positions):,} atoms, but the first has {self.atoms:,}"
+                    remedy = "Leave out the frames with another number of atoms"
                     raise self._odd(number, seen, remedy)
                 yield frame
         end = self.in_file or 0
@@ -188,7 +188,7 @@ class Trajectory(ABC):
             lost = np.setdiff1d(known, ids)
             seen = f"lacks atom {lost[0]}" if len(lost) else "has other atoms"
             seen += f" of the first frame: {len(ids):,} atoms, and {len(known):,} there"
-            raise self._odd(number, seen, "Dump one group of atoms that stays the same")
+            raise self._odd(number, seen, "Dump a group of atoms that does not change")
         return order
 
     @contextmanager

@@ -76,7 +76,7 @@ def test_a_system_brings_its_structure_and_temperature():
         ("ase.calculators.lj:LennardJones(rc=-(-8.5))", "not a literal"),
         ("ase.calculators.emt:EMT(**{})", "cannot be used here"),
         ("ase.calculators.emt:EMT().results", "only a name"),
-        ("ase.calculators.emt:EMT(", "a name with arguments"),
+        ("ase.calculators.emt:EMT(", "the name of a function"),
         ("ase.calculators.lj:LennardJones(3)", "could not be constructed: TypeError"),
         ("ase.calculators.tersoff:Tersoff", "Class(argument=value)"),
         ("ase.build:molecule('H2O')", "not an ASE calculator"),

@@ -64,7 +64,7 @@ def test_a_calculator_that_is_not_fine(copper, capsys):
     [
         ("conform", "answers.json", "Resume it with `mdnum conform --resume conform`"),
         ("md", "checkpoint.npz", "Resume it with `mdnum run --resume md`"),
-        ("grad", "gradients.npz", "Begin a new `mdnum audit`"),
+        ("grad", "gradients.npz", "Start a new `mdnum audit`"),
     ],
 )
 def test_what_is_no_audit_names_the_verb_that_resumes_it(kind, kept, remedy, copper, capsys):

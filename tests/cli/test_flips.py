@@ -22,7 +22,7 @@ GRO, XTC, PSF, DCD = (str(getattr(datafiles, name)) for name in ("GRO", "XTC", "
         ((DCD, "-s", PSF, "--most", "3"), "Add --cutoff R"),
         ((DCD, "-s", PSF, "--pairs", "O-H"), "'O-H' … form A-B=LENGTH"),
         ((DCD, "-s", PSF, "--cutoff", "4", "--between", "name CA", "name ("), "is not a valid selection"),
-        ((f"{DCD}@x:", "-s", PSF, "--cutoff", "4"), "'x:' names no frames"),
+        ((f"{DCD}@x:", "-s", PSF, "--cutoff", "4"), "'x:' is not a range of frames"),
         ((DCD, "-s", PSF, "--cutoff", "4", "--format", "foo"), "--format 'foo' is known to neither"),
     ],
 )

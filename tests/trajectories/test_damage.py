@@ -98,7 +98,7 @@ def test_what_is_not_there_is_told_as_what_it_is(tmp_path):
         refuse("no such file", path)
     refuse(r"nowhere.gro: no such file", datafiles.XTC, "nowhere.gro")
     refuse("is a folder", tmp_path)
-    for world, said in (("flips", "holds results, and no trajectory"), ("md", "--save-every 1")):
+    for world, said in (("flips", "holds results, but no trajectory"), ("md", "--save-every 1")):
         (tmp_path / "summary.json").write_text(json.dumps({"world": world}))
         refuse(said, tmp_path)
     path = written(tmp_path, "traj", images())
@@ -157,7 +157,7 @@ def test_the_guard_takes_every_real_file():
         ("dcd", "cut", r"file ends after [\d,]+ bytes"),
         ("trr", "cut", "file ends within"),
         ("trr", "head", "file ends within"),
-        ("trr", "hole", "damaged: a frame header"),
+        ("trr", "hole", "damaged: the header of a frame"),
     ],
 )
 def test_a_file_that_was_cut_or_damaged_is_read_up_to_there(tmp_path, small, kind, damage, said):

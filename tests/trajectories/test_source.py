@@ -177,7 +177,7 @@ def test_lammps_atoms_without_ids_are_refused(tmp_path):
         time=0, step=0, bounds=RIGHT, columns="x y z", rows="O 1 2 3\nH 1 2 3\nH 2 2 2"
     ).replace("id ", "")
     (tmp_path / "run.dump").write_text(text)
-    with pytest.raises(InputError, match="no ids"):
+    with pytest.raises(InputError, match="no atom ids"):
         open_trajectory(tmp_path / "run.dump")
 
 

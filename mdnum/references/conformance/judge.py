@@ -367,7 +367,7 @@ class Failed:
 
     def __post_init__(self) -> None:
         if not self.failures or any(failure.step >= self.case.steps for failure in self.failures):
-            raise ValueError("a failed case needs a failure at one of its steps")
+            raise ValueError("a failed test case needs a failure at one of its steps")
 
     @property
     def worst(self) -> Failure:
