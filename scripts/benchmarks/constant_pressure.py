@@ -1,6 +1,6 @@
 """What does a step at constant temperature or pressure cost beside one at constant energy?
 
-Answer. Thermostats 2 to 3 %, barostats 6 to 10 %, those of a full box 18 to 36 % (docs/speed.md).
+Answer. Thermostats at most 3 %, barostats at most 14 %, those of a full box 13 to 35 % (docs/speed.md).
 It takes five minutes.
 
 The liquid of benchmark.py, float64, hard cutoff, on one core: every integrator makes as many steps as the
