@@ -347,7 +347,7 @@ class _Writing:
         while (table := self._tables.get()) is not None:
             yield table
         if not self._whole:
-            raise RuntimeError("rows are missing")
+            raise RuntimeError("rows of the table are missing")
 
     def put(self, table: pa.Table | None) -> None:
         """Add a table, waiting for space in the queue; raise the error that has ended the writing, if any."""

@@ -140,7 +140,7 @@ def _dask(address: str, workers: int | None) -> _Engine:
     try:
         engine = _Engine(make, 1, 1, lambda _: clients[0].close(timeout=5))
     except OSError as error:
-        remedy = "Start it: dask scheduler; dask worker tcp://host:port"
+        remedy = "Start the scheduler and a worker: dask scheduler; dask worker tcp://host:port"
         raise InputError(f"no dask scheduler responds: {error}", where=address, remedy=remedy) from None
     of_each: Any = clients[0].nthreads()
     threads = list(of_each.values())

@@ -302,7 +302,7 @@ def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> No
     raise InputError(
         f"atoms {a} ({atoms.symbols[a]}) and {b} ({atoms.symbols[b]}) are {distance[worst]:.4g} {length} "
         f"apart, closer than {smallest:.4g} {length}{more}",
-        remedy="They overlap: correct the positions, the cell or the units of the structure",
+        remedy="The atoms overlap: correct the positions, the cell or the units of the structure",
     )
 
 

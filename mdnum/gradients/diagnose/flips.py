@@ -274,7 +274,7 @@ def _edge(
     found = line.boundary(inside, beyond)
     near, far = (line.value(place) for place in (inside, beyond))
     if found is None:
-        raise NumericalError(f"{name} = {far!r}: the run blew up")
+        raise NumericalError(f"the run with {name} = {far!r} blew up")
     i, j = found.subject
     value_near, gradient_near = _gradients(problem, line.at(inside).simulation, name)
     value_far, gradient_far = _gradients(problem, line.at(beyond).simulation, name)
