@@ -48,7 +48,7 @@ def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) 
     neighbors, appears nearly everywhere, or at other positions for another order.
 
     Returns:
-        None if no list position deviates by more than is allowed, or if nearly all do.
+        None if no entry of the list deviates by more than is allowed, or if nearly all entries do.
     """
     key = "places", atoms.positions.tobytes(), atoms.numbers.tobytes()
     if key not in subject.known:

@@ -206,7 +206,7 @@ class Calibration:
 
     @property
     def rate_bounds(self) -> tuple[float, float]:
-        """Exact 95 % interval of the rate of false positives."""
+        """Exact 95 % confidence interval of the false-positive rate."""
         low, high = bounds(self.alone, self.held_out)
         return two_of_three(low), two_of_three(high)
 

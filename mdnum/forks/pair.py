@@ -51,7 +51,7 @@ FLIPS_KEPT = 100_000
 
 @result
 class Fork:
-    """Result of following a pair of runs.
+    """Result of tracking the distance between two runs.
 
     Attributes:
         twin: the pair of programs.

@@ -468,7 +468,7 @@ class ManyBodyForce(eqx.Module):
     def neighbors(
         self, positions: Float[Array, "3 atoms"], tables: Tables, bits: UInt8[Array, "words atoms"]
     ) -> Any:
-        """Return the list for the energy function: only the pairs that are decided to be inside."""
+        """Return the neighbor list for the energy function, with only the pairs inside the cutoff."""
         from mdnum.md import jaxmd
 
         own, atoms = self.potential, positions.shape[1]
@@ -567,7 +567,7 @@ class PairDynamics(eqx.Module):
         return self.force.decide(state.x, self.tables).bits
 
     def step(self, state: MdState, decisions: UInt8[Array, "words atoms"]) -> MdState:
-        """Take one time step, with the forces of the pairs that are decided to be inside."""
+        """Take one time step, with the forces of the pairs inside the cutoff."""
         made = self.force(state.x, self.tables, decisions=False, given=decisions)
         order, cell = self.tables.order, self.force.cell
         end = one_step(self.integrator, cell, self.masses, order, *state, made)

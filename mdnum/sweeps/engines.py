@@ -227,7 +227,7 @@ def opened(on: str | Executor | None, workers: int | None) -> Iterator[_Engine]:
     elif on.endswith(".toml"):
         engine = _executorlib(on, workers)
     else:
-        raise InputError(f"unknown --on {on!r}", remedy="Give tcp://HOST:PORT of dask, or a .toml file")
+        raise InputError(f"unknown engine {on!r}", remedy="Give tcp://HOST:PORT of dask or a .toml file")
     try:
         yield engine
     finally:

@@ -191,7 +191,7 @@ class PerInstanceRule(_Tolerance):
 
 
 class MaximumRule(_Tolerance):
-    """The solver is stopped by the largest residual of the batch."""
+    """The stopping criterion is applied to the largest residual of the batch."""
 
     rule: Literal["maximum"]
 

@@ -87,7 +87,7 @@ class PairPotentialTable(TomlTable):
         if not pairs:
             missing = [key for key in self.constants if getattr(self, key, None) is None]
             if missing:
-                raise ValueError(f"missing: {', '.join(missing)}, which are not in a pairs table either")
+                raise ValueError(f"missing: {', '.join(missing)}, neither here nor in a pairs table")
         return self
 
     @property

@@ -243,7 +243,7 @@ def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
 
 
 def _length_of(trajectory: Any) -> str:
-    """Return the name of the length unit; "" for formats with a unit of their own (GSD)."""
+    """Return the name of the length unit; "" for formats that prescribe none (GSD)."""
     unit = trajectory.units.get("length")
     if unit is None or getattr(trajectory, "convert_units", True):
         return "Å" if unit else ""

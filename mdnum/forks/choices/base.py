@@ -189,7 +189,7 @@ def parse(text: str, world: str | None = None) -> Choice:
     head, _, role = family.partition(".")
     if family in _PROGRAMS:
         raise InputError(
-            f"{text} compares program variants in separate processes and cannot be varied between two runs",
+            f"{text} cannot be varied between two runs, because its variants need separate processes",
             remedy="Run `mdnum fork processes SYSTEM`",
         )
     if head in CHOICES and (argument or not equals) and (both or not at):
