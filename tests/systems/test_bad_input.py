@@ -100,7 +100,7 @@ OWN, PAIR = "epsilon = 0.0103235", "{ sigma = 1.0, epsilon = 1.0 }"
             '"nve"',
             '"langevin"',
             19,
-            "'temperature' missing … [dynamics] … dynamics.friction, too",
+            "'temperature' missing … [dynamics] … dynamics.friction",
         ),
         ("radius = 8.0", "radius = true", 14, "cutoff.radius = true … expected a number"),
         ('"hard"\nradius = 8.0', '"switched"\nradius = 8.0\nonset = 8.0', 12, "not below the radius"),

@@ -125,8 +125,8 @@ DRAWN = np.random.default_rng(0).uniform(0, 15.9, (400, 3))
 @pytest.mark.parametrize(
     ("x", "box", "radius", "message"),
     [
-        (DRAWN, Box(np.zeros((3, 3)), PERIODIC), 1.0, "direction 0"),
-        (DRAWN, Box(np.diag([5.0, np.nan, 5.0]), PERIODIC), 1.0, "direction 1"),
+        (DRAWN, Box(np.zeros((3, 3)), PERIODIC), 1.0, "axis 0"),
+        (DRAWN, Box(np.diag([5.0, np.nan, 5.0]), PERIODIC), 1.0, "axis 1"),
         (DRAWN, Box(np.array([[5.0, 0, 0], [0, 5, 0], [5, 5, 0]]), PERIODIC), 1.0, "one plane"),
         (np.zeros((2, 3)), cube(1.0), 1000.0, "widths"),
         (np.zeros((2000, 3)), cube(2.0), 100.0, "pairs lie within"),
