@@ -176,10 +176,11 @@ class Registry(Generic[T]):
             InputError: no such name, an unexpected argument, or a missing one.
         """
         name, separator, argument = text.strip().partition(self.separator)
-        value: Any = self[name]
+        found = self[name]
+        value: Any = found
         makes = isinstance(value, type) or inspect.isroutine(value)
         if not makes and not separator:
-            return value
+            return found
         arguments = (argument,) if separator else ()
         maker: Any = getattr(value, "parse", value if makes else None) if separator else value
         try:
