@@ -18,7 +18,6 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.compiled import cfunc, njit
-from mdnum.errors import InputError
 from mdnum.md import foreign
 from mdnum.md.cell import Cell
 from mdnum.md.foreign import asked_to_run, buffer, carray, peek, pointer, registered
@@ -27,6 +26,7 @@ from mdnum.md.potentials import of_type
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
 from mdnum.numerics.exact import root, squared_norm
 from mdnum.numerics.rounding import unit_roundoff
+from mdnum.registry import expect_known
 from mdnum.vectors import bits_set, lowest_bit
 
 # slots that the loops over a list take at a time: half a byte of decisions. Measured in float64 on one core,
@@ -54,11 +54,7 @@ class PairDecider:
     state: str = "float64"
 
     def __post_init__(self):
-        if self.compare not in CONVENTIONS:
-            raise InputError(
-                f"unknown convention {self.compare!r}; expected one of {', '.join(map(repr, CONVENTIONS))}",
-                where="cutoff.compare",
-            )
+        expect_known("convention", [self.compare], CONVENTIONS, where="cutoff.compare")
 
     @property
     def convention(self) -> PairDecider:

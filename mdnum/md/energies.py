@@ -236,7 +236,7 @@ def energy_function(
     if not others or not callable(function := others[0 if first else -1]):
         seen = ", ".join(type(part).__name__ for part in parts)
         raise InputError(
-            f"expected an energy function; found {seen}", remedy="Give it, or (neighbor_fn, function)"
+            f"expected an energy function; found {seen}", remedy="Give a function, or (neighbor_fn, function)"
         )
     start = others[0] if not first and len(others) > 1 else None
     if not name:

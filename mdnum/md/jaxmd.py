@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 import mdnum.numerics  # noqa: F401  (switches float64 on before the first array exists)
 from mdnum.errors import CapacityError, InputError, NumericalError
 from mdnum.md.cell import Cell, complete
+from mdnum.registry import expect_known
 
 if TYPE_CHECKING:
     from jax_md.partition import NeighborList
@@ -164,8 +165,7 @@ def as_neighbor_list(
         self_edges: list each atom as its own neighbor, as jax-md does if its `mask_self` is false.
         code: error code of the list, for example as after an overflow.
     """
-    if format not in _FORMATS:
-        raise InputError(f"unknown neighbor list format {format!r}; known formats are {', '.join(_FORMATS)}")
+    expect_known("neighbor list format", [format], _FORMATS)
     atoms = idx_dense.shape[0]
     own = jnp.arange(atoms, dtype=jnp.int32)[:, None]
     idx = jnp.where((idx_dense == own) | (idx_dense >= atoms), atoms, idx_dense).astype(jnp.int32)

@@ -78,7 +78,7 @@ class PairSums(NamedTuple):
 _Pair = Callable[..., Sequence[Any]]
 
 
-class Near(NamedTuple):
+class Shortcut(NamedTuple):
     """A cheaper function of a pair, which the loop evaluates for a vector of pairs none of which is far."""
 
     # whether a pair is far, from the arguments of a function of a pair
@@ -96,7 +96,7 @@ def over_pairs(
     margins: str | None = None,
     inverses: bool = False,
     potential: Any = None,
-    near: Near | None = None,
+    near: Shortcut | None = None,
     totals: int = 0,
 ) -> PairSums | None:
     """Sum a function of pairs over the slots of every atom; inside jit, on a CPU.
@@ -231,7 +231,7 @@ def _whole_power(equation: Any, inputs: list[Any]) -> int:
 
 def _written(
     pair: _Pair,
-    near: Near | None,
+    near: Shortcut | None,
     columns: int,
     flags: int,
     margins: str | None,

@@ -121,7 +121,7 @@ class PairForce(eqx.Module):
         """The comparison of the margin with 0 that holds for a pair inside the cutoff."""
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
-    def _near(self, pair: Callable[..., Any], tensor: bool) -> kernel.Near | None:
+    def _near(self, pair: Callable[..., Any], tensor: bool) -> kernel.Shortcut | None:
         """Return the function for pairs without a minimum image; None if it would save no time."""
         if not any(self.cell.pbc) or (self.cell.orthorhombic and not tensor):
             return None
@@ -130,7 +130,7 @@ class PairForce(eqx.Module):
             d = [b - a for a, b in zip(own[:3], other[:3], strict=True)]
             return d[0] * d[0] + d[1] * d[1] + d[2] * d[2] >= self.cell.nearby2
 
-        return kernel.Near(far, partial(pair, near=True))
+        return kernel.Shortcut(far, partial(pair, near=True))
 
     def _geometry(self, own, other, types, near: bool):
         """Return displacement, difference of positions, squared distance, decision and margin of a pair.

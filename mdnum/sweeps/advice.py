@@ -24,7 +24,7 @@ _ENDS = {
 
 
 @dataclass(frozen=True)
-class Compared:
+class EndComparison:
     """A value of an axis, or a setting, compared with the converged end."""
 
     value: Any
@@ -65,7 +65,7 @@ class Advice:
 
     key: str
     end: Any
-    settings: tuple[Compared, ...]
+    settings: tuple[EndComparison, ...]
     best: Any
     undecided: Any
     converged: bool | None
@@ -106,14 +106,8 @@ def advise(
     rest = [one for one in values if one != end]
     rest.sort(key=lambda one: abs(_size(one) - _size(end)) if _numeric(one, end) else 0.0)
     comparisons = max(1, len(rest) * len(tolerances))
-    settings = [Compared(end, {})]
-    for value in rest:
-        each: dict[str, Within] = {}
-        for name, tolerance in tolerances.items():
-            each[name] = within(
-                *found[name].get(label(value), (np.nan, np.nan, np.nan)), tolerance, comparisons
-            )
-        settings.append(Compared(value, each))
+    settings = [EndComparison(end, {})]
+    settings += [compared_with_end(one, label(one), found, tolerances, comparisons) for one in rest]
     best, undecided = end, None
     for setting in settings[1:]:
         if setting.inside is not True:
@@ -122,6 +116,26 @@ def advise(
         best = setting.value
     converged = settings[1].inside if len(settings) > 1 else None
     return Advice(key, end, tuple(settings), best, undecided, converged)
+
+
+def compared_with_end(
+    value: Any,
+    key: str,
+    found: Mapping[str, Mapping[str, tuple[float, float, float]]],
+    tolerances: Mapping[str, float],
+    comparisons: int,
+) -> EndComparison:
+    """Compare a value, or a setting, with the converged end.
+
+    Args:
+        key: its label in `found`. found, tolerances: as for `advise`. comparisons: their number.
+    """
+    none = (np.nan, np.nan, np.nan)
+    each = {
+        name: within(*found[name].get(key, none), tolerance, comparisons)
+        for name, tolerance in tolerances.items()
+    }
+    return EndComparison(value, each)
 
 
 def _numeric(*values: Any) -> bool:

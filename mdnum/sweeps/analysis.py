@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.sweeps.advice import FREE, Compared, advise, end_of
+from mdnum.sweeps.advice import FREE, advise, compared_with_end, end_of
 from mdnum.sweeps.design import Axis, label
 from mdnum.sweeps.plan import Plan, Setting
 from mdnum.sweeps.points import Workspace
@@ -21,7 +21,6 @@ from mdnum.sweeps.statistics import (
     effects,
     estimates,
     paired,
-    within,
 )
 
 #: Value, error and degrees of freedom of a difference.
@@ -293,11 +292,7 @@ def _together(
     """Return whether the setting with all recommended values is within the tolerances."""
     setting, end = joint
     found = _along(means, results, {"": setting}, end, list(tolerances))
-    each = {
-        name: within(*found[name].get("", (np.nan, np.nan, np.nan)), tolerance, len(tolerances))
-        for name, tolerance in tolerances.items()
-    }
-    one = Compared(setting, each)
+    one = compared_with_end(setting, "", found, tolerances, len(tolerances))
     lost = any(pairs for _, pairs in results.speeds.get(setting, []))
     return _finite({
         "setting": list(setting), "end": list(end), "inside": False if lost else one.inside,

@@ -472,9 +472,11 @@ def _rule_told(
     residues = None if isinstance(of, tuple) else of
     table, groups = (trajectory.table, of) if isinstance(of, tuple) else (of.table, of.sides)
     labels, total, moments = Labels.of(table), None, None
+    named = np.empty(0, object)
     if residues is not None:
         # the species of a residue is its name
         labels = replace(labels, residue_names=None)
+        named = np.array(_words(table, np.arange(len(table))), object)
 
     def append(table: str, columns: Mapping[str, Any]) -> None:
         length = len(next(iter(columns.values())))
@@ -487,9 +489,9 @@ def _rule_told(
         else:
             times = np.append(frames["time"][frames["rule"] == number], np.nan)
             when = {"time": times[stays.begin], "time_end": np.where(stays.ended, times[stays.end], np.nan)}
-            append("contacts", {**vars(stays), **when, **_both(table, stays)})
+            append("contacts", {**vars(stays), **when, "first": named[stays.i], "second": named[stays.j]})
             pairs = Occupancy.of(stays, found.frames)
-            append("occupancy", {**vars(pairs), **_both(table, pairs)})
+            append("occupancy", {**vars(pairs), "first": named[pairs.i], "second": named[pairs.j]})
             begin, now = contacts_over_time(stays, len(table), found.frames)
             moments = now if moments is None else moments + now
         log(part + 1, parts, {"phase": "counting contacts", "unit": "parts"})
@@ -579,12 +581,6 @@ def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
         f"{segment if several else ''} {residue} {number} {name}".strip() if residue else str(name)
         for segment, residue, number, name in rows
     ]
-
-
-def _both(table: AtomTable, pairs: Any) -> dict[str, Any]:
-    """Return the columns with the names of both atoms or residues of each pair."""
-    named = np.array(_words(table, np.arange(len(table))), object)
-    return {"first": named[pairs.i], "second": named[pairs.j]}
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:

@@ -20,6 +20,8 @@ from mdnum.verbs.frame import View
 TEXTS = Texts(Path(__file__).with_name("sweep.py"))
 #: Most rows of a table, points of a plot, and values of a choice in a sentence: 10,000 settings have a page.
 _ROWS, _POINTS, _VALUES = 500, 300, 20
+#: Whether a value is within its tolerances, in a table.
+_INSIDE = {True: "yes", False: "no", None: "not decided"}
 
 
 def _shown(view: View, name: str) -> str:
@@ -107,17 +109,21 @@ def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
 def _advised(view: View, advice: Mapping[str, Any]) -> str:
     """Return a sentence on the recommended value of an axis."""
     key, end, best = advice["choice"], label(advice["end"]), label(advice["best"])
-    seeds = len(view.summary["seeds"])
     if key in FREE:
         return "" if advice["best"] is None else TEXTS("use_fastest", key=key, best=best)
     undecided = next((one for one in advice["settings"] if one["value"] == advice["undecided"]), None)
     if undecided is not None and undecided["more"]:
-        more = max(1, int(np.ceil(seeds * (undecided["more"] - 1))))
+        more = max(1, _further_seeds(view, undecided["more"]))
         return TEXTS("use_undecided", key=key, best=best, value=label(undecided["value"]), more=more,
                      measure=_shown(view, undecided["worst"]))  # fmt: skip
     if best == end:
         return TEXTS("use_end", key=key, end=end)
     return TEXTS("use", key=key, best=best, end=end)
+
+
+def _further_seeds(view: View, factor: float) -> int:
+    """Return by how many seeds a sweep must grow for a given factor."""
+    return int(np.ceil(len(view.summary["seeds"]) * (factor - 1)))
 
 
 def _together(view: View) -> list[str]:
@@ -128,7 +134,7 @@ def _together(view: View) -> list[str]:
     values = {name: _keyed(view, joint[name]) for name in ("setting", "end")}
     if joint["inside"]:
         return [TEXTS("together", **values)]
-    more = int(np.ceil(len(view.summary["seeds"]) * (joint["more"] - 1))) if joint["more"] else 0
+    more = _further_seeds(view, joint["more"]) if joint["more"] else 0
     name = "together_undecided" if more > 0 else "together_unknown"
     return [TEXTS(name, measure=_shown(view, joint["worst"]), more=max(1, more), **values)]
 
@@ -221,7 +227,7 @@ def _settings(view: View) -> list[Any]:
     rows = []
     for advice in view.summary["advice"]:
         for one in advice["settings"]:
-            inside = {True: "yes", False: "no", None: "not decided"}[one["inside"]]
+            inside = _INSIDE[one["inside"]]
             if advice["choice"] in FREE:
                 inside = f"{number(one['speed'], 3)} steps/s" if one["inside"] else "no"
             elif one["value"] == advice["end"]:
@@ -230,8 +236,8 @@ def _settings(view: View) -> list[Any]:
             rows.append({"choice": advice["choice"], "value": str(one["value"]), "within": inside,
                          "by": _shown(view, one["worst"] or ""), "": use})  # fmt: skip
     if (joint := view.summary["joint"]) is not None:
-        inside = {True: "yes", False: "no", None: "not decided"}[joint["inside"]]
-        rows.append({"choice": "together", "value": _keyed(view, joint["setting"]), "within": inside,
+        rows.append({"choice": "together", "value": _keyed(view, joint["setting"]),
+                     "within": _INSIDE[joint["inside"]],
                      "by": _shown(view, joint["worst"] or ""), "": ""})  # fmt: skip
     columns = {"choice": "choice", "value": "value", "within its tolerance": "within", "kept out by": "by"}
     columns[""] = ""
