@@ -563,7 +563,7 @@ def test_a_table_that_unpacks_to_more_than_any_is_refused_from_its_head(finished
     zeros(finished)
     monkeypatch.setattr(tables, "_MOST_UNPACKED", 1 << 20)
     monkeypatch.setattr(pq.ParquetFile, "read_row_group", None)
-    with pytest.raises(FolderError, match=r"series\.parquet: .* 120,000,000"):
+    with pytest.raises(FolderError, match=r"series\.parquet: .*claim to unpack to 120,000,000"):
         RunFolder.open(finished).read("series")
 
 

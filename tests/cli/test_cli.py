@@ -315,7 +315,7 @@ def test_every_option_is_a_parameter_of_what_is_called():
 def test_python_m_mdnum_is_mdnum_and_runs_no_file_of_the_current_folder():
     done = subprocess.run([sys.executable, "-m", "mdnum", "run"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr.startswith("mdnum: no system")
+    assert done.stderr.startswith("mdnum: no system was")
 
 
 class _Terminal(io.StringIO):

@@ -22,8 +22,8 @@ GRO, XTC, PSF, DCD = (str(getattr(datafiles, name)) for name in ("GRO", "XTC", "
         ((DCD, "-s", PSF, "--most", "3"), "Add --cutoff R"),
         ((DCD, "-s", PSF, "--pairs", "O-H"), "'O-H' … form A-B=LENGTH"),
         ((DCD, "-s", PSF, "--cutoff", "4", "--between", "name CA", "name ("), "is not a valid selection"),
-        ((f"{DCD}@x:", "-s", PSF, "--cutoff", "4"), "'x:'"),
-        ((DCD, "-s", PSF, "--cutoff", "4", "--format", "foo"), "--format … 'foo'"),
+        ((f"{DCD}@x:", "-s", PSF, "--cutoff", "4"), "'x:' is not a range"),
+        ((DCD, "-s", PSF, "--cutoff", "4", "--format", "foo"), "--format 'foo' is not a format"),
     ],
 )
 def test_what_cannot_be_asked_is_refused_in_one_line(arguments, message, capsys, tmp_path, monkeypatch):

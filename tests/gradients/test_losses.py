@@ -145,7 +145,7 @@ def test_what_has_no_meaning_is_refused(run):
     well = build("pair/leaving-well")
     for simulation, loss, steps, text in (
         (run.simulation, RadialDistribution(r_max=2.7), STEPS, "beyond half .*r_max"),
-        (run.simulation, GreenKuboDiffusion(until=50), STEPS, "step 50"),
+        (run.simulation, GreenKuboDiffusion(until=50), STEPS, "ends at step 50"),
         (run.simulation, EinsteinDiffusion(first=40), STEPS, "two frames"),
         (well, MeanPressure(), 10, "no volume"),
     ):

@@ -195,6 +195,6 @@ def test_what_is_no_number_is_refused(given, message):
 
 
 def test_a_word_for_several_weights_is_refused(mixture):
-    several = r"'weight' .*layers\.0\.weight, .*layers\.1\.weight"
+    several = r"'weight' is ambiguous.*layers\.0\.weight, .*layers\.1\.weight"
     with pytest.raises(InputError, match=several):
         value_and_grad(mixture, ("weight",))

@@ -184,7 +184,7 @@ LEAST = "smallest usable tolerance is 8.9e-308"
         ("projection", {"stop.enter": "1e-7"}, "stop.enter = 1e-07 is below stop.tol = 1e-06"),
         ("projection", {"stop.rule": "some"}, "rule 'some' … sum, per-instance, maximum"),
         ("projection", {"stop.rule": "fixed"}, "key 'count' missing"),
-        ("projection", {"stop.rule": "relative", "stop.tol": "1"}, "stop.tol"),
+        ("projection", {"stop.rule": "relative", "stop.tol": "1"}, "relative to the first"),
         ("projection", {"contact.hysteresis": "0.1"}, "no meaning for projection … stop.enter"),
         ("projection", {"gradient.of": '["tol"]', "stop.rule": "fixed", "stop.count": "3"}, "rule is fixed"),
         ("projection", {"contact.kind": "impact", "stop.tol": "1e-3"}, "does not iterate"),

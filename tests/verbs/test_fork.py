@@ -554,7 +554,7 @@ def test_the_page_has_a_figure_and_a_table_for_everything_there_is(crystal):
     sizes = {"displacements": [1e-6, 1e-8]}
     own = shown(cause(crystal, repeated=repeated, count=COUNT, **other, **sizes))
     rows = part(own, fork_verdict.TWO_BY_TWO, Table).rows[-4:]
-    assert rows[0][2] == "370 to 380" and rows[1][2].startswith("399 to 399; 1 of 2 ")
+    assert rows[0][2] == "370 to 380" and rows[1][2].startswith("399 to 399; 1 of 2 unknown")
     assert [row[2] for row in rows[2:]] == ["380 to 380", "399 to 399"]
     assert [row[0] for row in rows[1:3]] == [
         fork_verdict.TEXTS("start_displaced", displacement=size, unit="σ") for size in (1e-6, 1e-8)

@@ -78,7 +78,7 @@ def test_parts_that_cannot_be_had_say_why():
     assert found.trust is None and found.flips is None and found.growth is None
     assert set(found.failed) == {"trust", "flips", "growth"}
     assert all(found.failed.values())
-    with pytest.raises(InputError, match="'grwth'"):
+    with pytest.raises(InputError, match="part of a diagnosis 'grwth'"):
         diagnose(problem, ("v0",), parts=("grwth",))
 
 
@@ -86,5 +86,5 @@ def test_parts_that_cannot_be_had_say_why():
 def test_what_nothing_depends_on_is_noted():
     loss = Custom(see=lambda frame, *_: 0 * frame.v[0, 0], first=5)
     found = diagnose(Problem(build("pair/leaving-well"), loss, 5), ("sigma",), parts=("growth",))
-    assert "depends" in found.notes["potential.sigma"]
+    assert "not depend" in found.notes["potential.sigma"]
     assert found.growth is not None and not found.growth.table["size"].any()
