@@ -1,6 +1,6 @@
-"""Flips in any trajectory: the pairs that entered or left a cutoff between the frames of a file.
+"""Detection of flips in any trajectory: pairs that enter or leave a cutoff between the frames of a file.
 
-`NeighborFlips` is an MDAnalysis analysis class; the command `mdnum flips` does the same analysis.
+`NeighborFlips` is an MDAnalysis analysis class; the command `mdnum flips` runs the same analysis.
 """
 
 from __future__ import annotations

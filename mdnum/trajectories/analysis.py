@@ -1,8 +1,9 @@
-"""Flips as an MDAnalysis analysis: `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
+"""Analysis of flips as an MDAnalysis class: `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
 
-Frames may be distributed over processes. A flip compares two successive frames, so each process also examines
-the frame before its first one: no flip is lost between two parts, and the results equal those of a single
-process bit for bit. The pairs that two processes find at a shared frame are compared.
+Frames may be distributed over processes. A flip is found by comparing two successive frames, so each process
+also reads the frame before its first frame. No flip is lost at a process boundary, and the results are
+bitwise identical to those of a single process. If two processes find different pairs at a shared frame, an
+error is raised.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from mdnum.trajectories.trajectory import SAMPLE
 
 @dataclass(frozen=True)
 class RuleResult:
-    """Pairs, flips and contacts found with one membership rule."""
+    """Pairs, flips and contacts found in a trajectory with one membership rule."""
 
     rule: Rule
     flips: FlipTable  # a row per decision that differs from the frame before
@@ -54,15 +55,15 @@ class RuleResult:
 
     @property
     def ambiguous(self) -> float:
-        """Share of the flips that the resolution of the file leaves undecided; nan without flips."""
+        """Fraction of the flips that are uncertain at the resolution of the file; nan without any flips."""
         return float(self.flips.ambiguous.mean()) if len(self.flips) else float("nan")
 
     def entered(self) -> Int[np.ndarray, "frames"]:
-        """Return the number of pairs that entered at each frame."""
+        """Return the number of pairs that entered the cutoff at each frame."""
         return self._per_frame(self.flips.entered)
 
     def left(self) -> Int[np.ndarray, "frames"]:
-        """Return the number of pairs that left at each frame."""
+        """Return the number of pairs that left the cutoff at each frame."""
         return self._per_frame(~self.flips.entered)
 
     def _per_frame(self, rows: Bool[np.ndarray, "flips"]) -> Int[np.ndarray, "frames"]:
@@ -71,7 +72,7 @@ class RuleResult:
 
 @dataclass
 class _ProcessPart:
-    """Results of one process for one rule; frame numbers count from the first frame it examined."""
+    """Results of one process for one rule; frame numbers count from the first frame that the process read."""
 
     flips: list[FlipTable] = field(default_factory=lambda: [FlipTable.none()])  # of frames that have any
     rows: list[tuple[int, int, float]] = field(default_factory=list)  # (pairs, near, smallest margin)
@@ -79,7 +80,7 @@ class _ProcessPart:
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
 
     def end(self, last: Members) -> None:
-        """Store the pairs inside at the last frame, and join the flips to one table, which is sent faster."""
+        """Store the pairs inside the cutoff at the last frame, and join the flips into a single table."""
         self.last, self.flips = last if self.rows else None, [FlipTable.concatenate(self.flips)]
 
 
@@ -99,27 +100,28 @@ class _Guarded:
 
 
 class NeighborFlips(AnalysisBase):
-    """Analysis of the pairs that enter or leave a cutoff between successive frames of a trajectory.
+    """MDAnalysis analysis that finds the pairs entering or leaving a cutoff between successive frames.
 
     After `run` with one rule, `results` has all attributes of `RuleResult` (`flips`, `pairs`, `near`,
-    `min_margin`, `initial`, `last`, `contacts`, `occupancy`); with several rules, each element of
-    `results.rules` has them. Tables have a method `to_pandas()`. With by="residue", pairs are pairs of
-    residues, i and j are rows of `results.residues`, and `results.left_out` counts the atoms that were left
-    out. `results.resolution` is the resolution of positions in the file, and `results.bound` the resulting
-    error bound of a distance, per frame. `results.repeats` lists the frames that repeat earlier ones (see
-    `repeats.RepeatedFrames`). `results.other_box` gives another possible reading of the first frame's box and
-    the reason for it (see `Trajectory.other_box`), or None. `frames` and `times` are those of the frames
-    examined; `FlipTable.frame` is an index into them.
+    `min_margin`, `initial`, `last`, `contacts`, `occupancy`). With several rules, each element of
+    `results.rules` has these attributes. Tables have a method `to_pandas()`. With by="residue", pairs are
+    pairs of residues, i and j are rows of `results.residues`, and `results.left_out` counts the excluded
+    atoms. `results.resolution` is the resolution of positions in the file, and `results.bound` is the
+    resulting error bound of a distance, per frame. `results.repeats` lists the frames that repeat earlier
+    frames (see `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first frame
+    and the reason for it (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and
+    times of the frames analyzed; `FlipTable.frame` is an index into both.
 
-    If a frame cannot be read or holds impossible values, the error names the frame, and the results of the
-    frames before it are kept.
+    If a frame cannot be read or contains impossible values, an error with the frame number is raised; the
+    results of all earlier frames are kept.
 
     Args:
         universe_or_atomgroup: the atoms that form pairs.
         r_cut: the cutoff, Å; {("O", "H"): 2.5} for pairs of species; a list of cutoffs for several rules.
         other: a second group; pairs then have one atom in each group, and an atom may be in both groups.
         rule: one membership rule or several, instead of r_cut or in addition to it.
-        by: "residue" for contacts between residues: inside while their smallest distance is below the cutoff.
+        by: "residue" for contacts between residues, which last while the smallest distance is below the
+            cutoff.
         hydrogens: True if hydrogens and virtual sites count in contacts between residues.
         bound: the largest error of a distance, Å; None for the value that follows from the resolution of the
             file before transformations.
@@ -198,9 +200,9 @@ class NeighborFlips(AnalysisBase):
         Raises:
             InputError: the requested frames are not in ascending order, or a transformation of the trajectory
                 cannot be sent to other processes.
-            UnreadableFrame: a frame cannot be read; `results`, `frames` and `times` hold the frames before
-                it.
-            FrameError: a frame holds impossible values; the frames before it are kept in the same way.
+            UnreadableFrame: a frame cannot be read; `results`, `frames` and `times` hold the earlier frames.
+            FrameError: a frame contains impossible values; `results`, `frames` and `times` hold the earlier
+                frames.
         """
         super().run(*args, **kwargs)
         if (failure := self.results.failure) is not None:
@@ -225,7 +227,7 @@ class NeighborFlips(AnalysisBase):
     def _setup_computation_groups(
         self, n_parts: int, start: Any = None, stop: Any = None, step: Any = None, frames: Any = None
     ) -> list[np.ndarray]:
-        """Split the frames as MDAnalysis does, and determine once the properties that all parts share."""
+        """Split the frames by MDAnalysis's method, and determine the properties common to all groups."""
         groups = super()._setup_computation_groups(n_parts, start, stop, step, frames)
         # who names the frames gets those
         self._to_the_end = frames is None and (stop is None or stop > len(self._trajectory))
@@ -270,7 +272,7 @@ class NeighborFlips(AnalysisBase):
 
     @property
     def library(self) -> LibraryFrames:
-        """Frames as MDAnalysis reads them; the reader is opened at its first use in this process."""
+        """Reader of the trajectory's frames through MDAnalysis, opened at its first use in this process."""
         if self._library is None:
             self._library = LibraryFrames(self._trajectory)
             self._check.labels = self._library.labels(0)
@@ -320,7 +322,7 @@ class NeighborFlips(AnalysisBase):
         self.results.digests[0].append(self._digest)
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
-        """Return (error bound of a distance, flips of each rule) at a timestep."""
+        """Return (error bound of a distance, flips of each rule) at the frame of an MDAnalysis timestep."""
         frame = self._check(self.library.frame(ts, int(ts.frame)))
         self._digest = digest(frame)
         bound = self._bound_of(frame) if self._bound is None else self._bound
@@ -372,7 +374,7 @@ class NeighborFlips(AnalysisBase):
         return str(getattr(self._trajectory, "filename", None) or "the trajectory")
 
     def _behind_the_last(self) -> FrameError | None:
-        """Return an error if the file continues after the last frame that MDAnalysis lists, or None."""
+        """Return an error if the file contains data after the last frame known to MDAnalysis, else None."""
         rest = left_over(self._trajectory) if self._to_the_end and len(self._numbers) else None
         count, where = int(self._trajectory.n_frames), self._where
         said = f"frame {count} cannot be read ({rest})"
@@ -380,7 +382,7 @@ class NeighborFlips(AnalysisBase):
 
 
 def _changed(before: Frame, after: Frame) -> float:
-    """Return the largest change (length) of a distance between successive atoms due to transformations.
+    """Return the largest change (length) that transformations cause in a distance between successive atoms.
 
     Shifts of atoms by lattice vectors and rotations of the system do not count as changes.
     """
@@ -393,7 +395,7 @@ def _changed(before: Frame, after: Frame) -> float:
 
 
 def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
-    """Concatenate the results of all parts; frame numbers count from the first frame of the first part."""
+    """Concatenate the results of all processes, renumbering frames from the first frame of the analysis."""
     tables, done, last = [FlipTable.none()], 0, None
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):
@@ -415,7 +417,7 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
 
 
 def _group_of(atoms: Any, name: str) -> AtomGroup:
-    """Return the group; reject other objects, empty groups, and groups that change from frame to frame."""
+    """Return the atom group; reject other objects, empty groups, and groups that change between frames."""
     if isinstance(atoms, UpdatingAtomGroup):
         raise InputError(
             f"the group {name} changes from frame to frame; a pair that leaves the group would be "

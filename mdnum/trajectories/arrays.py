@@ -1,4 +1,4 @@
-"""Frames held in memory: arrays of numpy, jax or torch that a program passes one after another.
+"""Trajectories in memory: frames as arrays of numpy, jax or torch, passed one after another by a program.
 
 ASE, vesin and torch-sim store lattice vectors as rows of a matrix (`cell`); jax-md stores them as columns of
 an upper triangular matrix (`box`), and often stores positions as fractions of the box.
@@ -30,10 +30,11 @@ _UPPER = (
 
 
 def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
-    """Return values as a numpy array, without a copy.
+    """Return numerical values as a numpy array, without a copy if possible.
 
     Raises:
-        InputError: the numbers are of another kind, floats have fewer than 32 bits, or the values have units.
+        InputError: the numbers have an unexpected dtype, floats have fewer than 32 bits, or the values have
+            units.
     """
     if hasattr(values, "value_in_unit"):
         remedy = "Give numbers: .value_in_unit(openmm.unit.nanometer), with length='nm'"
@@ -51,7 +52,7 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
 
 
 class ArrayFrames(Trajectory):
-    """Trajectory of frames that a program passes one by one; a frame is kept until the next one is examined.
+    """Trajectory of frames passed one by one by a program; each frame is kept until the next is examined.
 
     Args:
         name: name of the frames on a results page.
@@ -129,7 +130,7 @@ class ArrayFrames(Trajectory):
         return Box(matrix, np.array(repeats, bool))
 
     def _begin(self, x: np.ndarray, box: Box, bits: int) -> None:
-        """Check and store the properties that all frames share, using the first frame."""
+        """Check the first frame, and store the properties that all frames share."""
         fractional, remedy = self._fractional, "Say fractional=True, or fractional=False for lengths"
         unit = len(x) >= (_FEW if self.reach > 1 else _MANY) and x.min() >= 0 and x.max() <= 1
         if fractional is None and unit and box.shortest > 2:
@@ -153,7 +154,7 @@ class ArrayFrames(Trajectory):
 
     @classmethod
     def of(cls, frames: Any, reach: float, velocities: Any = None, **options: Any) -> ArrayFrames:
-        """Build a trajectory from a complete array of frames or list of ASE Atoms; reach as in the class."""
+        """Build a trajectory from an array of frames or a list of ASE Atoms; `reach`: longest cutoff."""
         given = {name: options.pop(name) for name in ("cell", "box") if name in options}
         found, given["velocities"] = cls("array", **options), velocities
         found.reach = reach
@@ -177,7 +178,7 @@ class ArrayFrames(Trajectory):
         return self._waiting[0]
 
     def sample(self) -> list[Frame]:
-        """Return the first frames that are available so far."""
+        """Return the first frames, as many as are available so far."""
         return list(self._first)
 
     @contextmanager
@@ -198,7 +199,7 @@ class ArrayFrames(Trajectory):
 
 
 def one_by_one(frames: Any, given: dict[str, Any]) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Yield each frame with its own keyword arguments, from the arguments of `mdnum.Recorder.see_many`."""
+    """Yield each frame with its keyword arguments, taken from the arguments of `mdnum.Recorder.see_many`."""
     frames = frames if isinstance(frames, list | tuple) else host(frames, "positions")
     given = {name: one for name, one in given.items() if one is not None}
     rows = {name for name, one in given.items() if isinstance(one, list) or name in ("energy", "velocities")}

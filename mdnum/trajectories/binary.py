@@ -1,14 +1,14 @@
 """Readers of GROMACS's xtc and trr files that check each frame before it is decoded.
 
-If bytes are wrong, the library that decodes xtc files divides by zero or writes outside its buffers, and all
-earlier results are lost with the process. Each frame is therefore examined first: the compressed stream
-states how many bits each atom takes, so that the header, the number of atoms, the numbers of bits and the
-length can be verified without decoding. Damage that leaves a valid stream is not detected. Source: the
-algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
+On damaged data, the library that decodes xtc files divides by zero or writes outside its buffers; the process
+ends, and all earlier results are lost. Each frame is therefore checked before it is decoded. The compressed
+stream contains the number of bits of each atom's coordinates, so that the header, the number of atoms, the
+bit counts and the length can be verified without decoding. Damage that leaves a valid stream is not detected.
+Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
 
-MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. They write the index through
-symbolic links, and trust it even if it belongs to another file; this module uses no index file. Source of the
-trr format: GROMACS, trrio.
+MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. These readers write the index
+through symbolic links, and trust an index file even if it belongs to another trajectory; this module uses no
+index file. Source of the trr format: GROMACS, trrio.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ _TEN = np.float32(10)
 
 
 def opened(trajectory: Any) -> XdrFile | None:
-    """Open the file of an MDAnalysis trajectory with a reader that checks frames; None for other formats."""
+    """Open an xtc or trr file of an MDAnalysis trajectory with a checking reader; None for other formats."""
     path, kind = file_of(trajectory), {"XTC": XtcFile, "TRR": TrrFile}.get(str(trajectory.format))
     return None if kind is None or path is None else kind(path)
 
 
 class XdrFile:
-    """Frames of a GROMACS file by number; no index file is written or read.
+    """Reader that returns frames of a GROMACS file by number, without reading or writing an index file.
 
     Raises:
-        ValueError: raised by every method if bytes are invalid or the file ends early.
+        ValueError: every method raises it if the data are invalid or the file ends early.
     """
 
     def __init__(self, path: str | Path):
@@ -83,7 +83,7 @@ class XdrFile:
         return number
 
     def ends_at(self, number: int) -> bool:
-        """Return True if the frame before the given one is the last of the file."""
+        """Return True if the file ends directly before the frame with the given number."""
         return self.start(number) == self._size
 
     def start(self, number: int) -> int:
@@ -102,7 +102,7 @@ class XdrFile:
         self.start(number + 1)
 
     def _stream(self, number: int, look: bool = False) -> None:
-        """Move the file position to the end of a frame; with `look`, verify the coordinates on the way."""
+        """Move the file position to the end of a frame; if `look` is true, also verify the coordinates."""
         raise NotImplementedError
 
     def _read(self, count: int) -> bytes:
@@ -140,7 +140,7 @@ class XtcFile(XdrFile):
             self._starts.append(self._file.tell())
 
     def read(self, number: int) -> Any:
-        """Check a frame, and return it as decoded by MDAnalysis's library, in nm and ps."""
+        """Check a frame, and return the frame as decoded by MDAnalysis's library, in nm and ps."""
         self.check(number)
         if self._library is None:
             from MDAnalysis.lib.formats.libmdaxdr import XTCFile
@@ -187,10 +187,11 @@ class XtcFile(XdrFile):
 
 @njit
 def _walk(stream, atoms, whole, small):
-    """Return the number of bits that the coordinates of `atoms` atoms take; -8 if the stream is invalid.
+    """Return the number of bits occupied by the coordinates of `atoms` atoms; -8 if the stream is invalid.
 
-    An atom takes `whole` bits, followed by a flag. If the flag is set, the next five bits state how many of
-    the following atoms are stored as differences of `small` bits each, and whether `small` changes.
+    The coordinates of an atom occupy `whole` bits, followed by a flag. If the flag is set, the next five bits
+    contain the number of following atoms that are stored as differences of `small` bits each, and the change
+    of `small`.
     """
     at, done, run = 0, 0, 0
     most = 8 * stream.shape[0]
@@ -232,11 +233,11 @@ class TrrFile(XdrFile):
 
     @property
     def bits(self) -> int:
-        """Width of the numbers in the file, in bits."""
+        """Width of the floating-point numbers in the file, in bits."""
         return 8 * self.head(0)[1]
 
     def head(self, number: int) -> tuple[int, int, list[int]]:
-        """Read a frame header: (atoms, bytes per number, bytes of the ten blocks); stop at the time field."""
+        """Read a frame header up to the time: (atoms, bytes per number, bytes of the ten blocks)."""
         self._file.seek(self.start(number))
         magic, _, _, word, *numbers = _TRR.unpack(self._read(_TRR.size))
         sizes, atoms, box = numbers[:10], numbers[10], numbers[_BOX]
@@ -249,7 +250,7 @@ class TrrFile(XdrFile):
         return atoms, width, sizes
 
     def has_box(self, number: int) -> bool:
-        """Return True if the frame has a box."""
+        """Return True if the frame contains box vectors."""
         return self.head(number)[2][_BOX] > 0
 
     def _stream(self, number: int, look: bool = False) -> None:
@@ -269,7 +270,7 @@ class TrrFile(XdrFile):
 
 
 class XtcTrajectory(Trajectory):
-    """An xtc trajectory, in Å and ps. Coordinates are integers in the file, and are decoded to float32."""
+    """An xtc trajectory in Å and ps, whose integer coordinates are decoded to float32."""
 
     format = "XTC"
     reader = "MDAnalysis"

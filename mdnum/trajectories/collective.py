@@ -1,7 +1,7 @@
-"""Detection of impossible motions of all atoms together, caused by damage that leaves finite numbers.
+"""Detection of impossible collective motions of all atoms, caused by file damage that leaves finite numbers.
 
-An overflowed counter sets one coordinate of every atom to a single value, and a misread offset shifts all
-atoms. Planar and linear systems, drift, and wrapping are not reported.
+A counter overflow gives every atom the same value of one coordinate, and a misread offset shifts all atoms.
+Planar systems, linear systems, drift and wrapping are not reported.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FAR, _FAR_FEW = 300.0, 1e4
 
 @dataclass
 class Collective:
-    """Extents and positions of some atoms in the frames examined so far."""
+    """Extents and positions of a sample of the atoms in the frames examined so far."""
 
     least: Float[np.ndarray, "3"] | None = None  # the smallest of `spreads` in any of them, length
     last: Float[np.ndarray, "some 3"] | None = None  # positions in the last one
@@ -35,13 +35,14 @@ class Collective:
     level: Bool[np.ndarray, "3"] | None = None  # coordinates that all atoms had in common in each of them
 
     def refuse(self, x: Float[np.ndarray, "some 3"], atoms: int, side: float, far: float) -> str | None:
-        """Return the reason why the atoms cannot have moved to their present positions, or None.
+        """Return the reason why the motion of all atoms to their present positions is impossible, or None.
 
         Args:
             x: positions of a sample of the atoms, which represents all atoms.
             atoms: number of all atoms.
             side: length of the shortest lattice vector; 0 without a periodic direction.
-            far: length from which a displacement between two frames is large in this box; 0 without a box.
+            far: smallest displacement between two frames that counts as large in this box, length; 0 without
+                a box.
         """
         now, least, last, alike = spreads(x), self.least, self.last, self.alike
         share, axis, value = _most_alike(x)
@@ -69,7 +70,7 @@ class Collective:
         return None
 
     def left(self, x: Float[np.ndarray, "some 3"], atoms: int) -> str:
-        """Describe the coordinates that all atoms shared in earlier frames and suddenly lost; "" if none."""
+        """Describe coordinates that all atoms shared in earlier frames and suddenly lost; "" if none."""
         last, was, level = self.last, self.level, (x == x[0]).all(axis=0)
         self.level = level if was is None else was & level
         if last is None or was is None or atoms <= _FEW or not was.any() or np.any(self.level):
@@ -90,11 +91,11 @@ def spreads(x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "3"]:
 
 
 def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> str | None:
-    """Describe the plane, line or point into which all atoms have collapsed; None if they have not.
+    """Describe the plane, line or point into which all atoms have collapsed; None without a collapse.
 
-    Rippled sheets and bent chains may become flat and straight. A collapse is therefore reported only if the
-    earlier spread across the sheet or chain exceeded the distance of neighbors along it or, if a coordinate
-    is constant, a fifth of the largest spread.
+    Rippled sheets may become flat, and bent chains may become straight, without an error. A collapse is
+    therefore reported only if the earlier spread across the sheet or chain exceeded the distance between
+    neighbors along the sheet or chain or, if a coordinate is constant, a fifth of the largest spread.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):
@@ -107,9 +108,10 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
 
 
 def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
-    """Return (share of atoms with the most frequent coordinate, its axis, its value).
+    """Return (fraction of the atoms that have the most frequent coordinate value, its axis, the value).
 
-    The share of the second most frequent coordinate is subtracted: in a crystal, both are equally frequent.
+    The fraction of the second most frequent value is subtracted; in a crystal, both values are equally
+    frequent.
     """
     ordered = np.sort(x, axis=0)
     repeated = np.count_nonzero(ordered[1:] == ordered[:-1], axis=0)
@@ -122,7 +124,7 @@ def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
 
 
 def _shift(before: np.ndarray, now: np.ndarray, far: float) -> float:
-    """Return the length of the common displacement of all atoms; 0 if it is small or not common to all."""
+    """Return the length of the displacement common to all atoms; 0 if it is small or not common to all."""
     moved = now - before
     if len(now) < 2 or not far or np.abs(moved).max() <= far / (2 * _SUDDEN):
         return 0.0

@@ -1,10 +1,10 @@
-"""Meaning of the six box numbers in a DCD file: there are three conventions, and no record of the choice.
+"""Interpretation of the six box numbers in a DCD file, which may follow one of three conventions.
 
-The numbers are lengths and cosines of the angles (NAMD, VMD, LAMMPS, MDAnalysis since 2.10), lengths and
-angles in degrees (CHARMM before version 22, OpenMM, MDAnalysis before), or a symmetric matrix of lattice
-vectors (CHARMM since 22). With a wrong box, atoms overlap across the boundary, and atoms that are wrapped
-between frames seem to leap. If neither is observed, the version number in the header decides: all programs
-except CHARMM write 24.
+The file does not record its convention. The numbers are lengths and cosines of the angles (NAMD, VMD, LAMMPS,
+MDAnalysis since 2.10), lengths and angles in degrees (CHARMM before version 22, OpenMM, MDAnalysis before
+2.10), or a symmetric matrix of lattice vectors (CHARMM since 22). With a wrong box, atoms overlap across the
+boundary, and atoms that are wrapped between frames seem to leap. If several conventions show neither error,
+the version number in the header decides: all programs except CHARMM write 24.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Examined = list[tuple[int, np.ndarray, np.ndarray]]
 
 
 def conventions(cell: Float[np.ndarray, "6"]) -> dict[str, Float[np.ndarray, "3 3"]]:
-    """Return lattice vectors by each convention that yields a box; MDAnalysis's convention comes first."""
+    """Return lattice vectors for each convention that yields a box, with MDAnalysis's convention first."""
     from MDAnalysis.lib.mdamath import triclinic_vectors
 
     angles, found = cell[[4, 3, 1]], {}
@@ -48,10 +48,10 @@ def conventions(cell: Float[np.ndarray, "6"]) -> dict[str, Float[np.ndarray, "3 
 
 
 class DcdBoxes:
-    """Lattice vectors of the frames of a DCD file, by the convention that is consistent with its atoms.
+    """Lattice vectors of a DCD file, by the box convention that is consistent with the positions.
 
     Attributes:
-        convention: name of the convention; None if no examined box depends on the choice.
+        convention: name of the chosen convention; None if no examined box depends on the choice.
         other: name of a second convention that fits equally well; None if the convention is certain.
         notes: the reason for the choice, as a sentence.
     """
@@ -77,7 +77,7 @@ class DcdBoxes:
             self.notes = (f"The box in the file is read as {self.convention}, {why}.",)
 
     def _sample(self, path: str) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """Yield (frame number, positions, six box numbers) of some frames whose box is not rectangular."""
+        """Yield (frame number, positions, six box numbers) of sampled frames whose box is not rectangular."""
         count = len(self._file)
         for number in sorted({*range(min(count, 8)), *np.linspace(0, count - 1, 4).astype(int).tolist()}):
             try:
@@ -91,7 +91,7 @@ class DcdBoxes:
                 yield number, x, cell
 
     def __call__(self, number: int, ts: Any) -> Float[np.ndarray, "3 3"] | None:
-        """Return the vectors of a frame; None if MDAnalysis's are the same, or a user has set others."""
+        """Return the lattice vectors of a frame; None if MDAnalysis's vectors are correct or user-defined."""
         vectors = self._vectors(number, self.convention) if self.convention == _MATRIX else None
         if vectors is None:
             return None
@@ -99,7 +99,7 @@ class DcdBoxes:
         return vectors if any(np.allclose(one, ts.dimensions[:3], rtol=1e-5) for one in lengths) else None
 
     def instead(self, number: int) -> Float[np.ndarray, "3 3"] | None:
-        """Return the vectors of a frame by the other convention, if there is one that fits as well."""
+        """Return the lattice vectors of a frame by the second fitting convention, or None."""
         return self._vectors(number, self.other)
 
     def _vectors(self, number: int, convention: str | None) -> Float[np.ndarray, "3 3"] | None:
@@ -108,7 +108,7 @@ class DcdBoxes:
 
 
 def _plausible(frames: Examined, fit: list[str]) -> list[str]:
-    """Return the conventions that are consistent with both the boxes and the atoms."""
+    """Return the conventions that are consistent with both the box numbers and the atomic positions."""
     gone: dict[str, list[float]] = {name: [] for name in fit}
     for (before, start, _), (number, end, cell) in pairwise(frames):
         moved = end - start - np.median(end - start, axis=0)

@@ -1,7 +1,7 @@
-"""Reading of one trajectory, or of two frame by frame, with checks of frames and flips of neighbors.
+"""Frame-by-frame reading of one trajectory, or of two for comparison, with frame checks and flip detection.
 
-The neighbor sets of two trajectories are compared once, at the first frame. From then on, the flips of both
-trajectories update the difference, so the cost of a frame is proportional to the number of its flips.
+The neighbor sets of two trajectories are compared completely only at the first frame. At later frames, the
+difference is updated with the flips of both trajectories, at a cost proportional to the number of flips.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ def _usable(
     step: Callable[..., Any],
     found: Pass | Compared,
 ) -> Iterator[tuple[list[Frame], Any]]:
-    """Yield (next frame of each file, result of `step`) until a file ends or a frame cannot be used.
+    """Yield (next frame of each file, result of `step`) until a file ends or a frame is unusable.
 
-    All rules process a frame before any result is passed on: a frame that one rule rejects does not enter the
-    ledger of another rule.
+    All rules process a frame before any of its results are stored, so that a frame rejected by one rule does
+    not enter the ledger of another rule.
 
     Raises:
         InputError: the first frame cannot be read or used, so there are no results to keep.
@@ -104,7 +104,7 @@ def _usable(
 
 
 class NeighborCounts:
-    """Number of neighbors of each atom in the first group, updated with the flips of every frame."""
+    """Number of neighbors of each atom in the first group, updated at every frame from the flips."""
 
     def __init__(self, members: Members, atoms: int, groups: Groups, directed: bool):
         self._sides = [None if one is None else np.isin(np.arange(atoms), one) for one in groups]
@@ -115,7 +115,7 @@ class NeighborCounts:
         self._add(members.i, members.j, np.ones(len(members), np.int64))
 
     def step(self, flips: FlipTable) -> None:
-        """Update the numbers of neighbors with the flips of a frame."""
+        """Update the numbers of neighbors with the flips of one frame."""
         self._add(flips.i, flips.j, np.where(flips.entered, 1, -1))
 
     def _add(self, i: np.ndarray, j: np.ndarray, sign: np.ndarray) -> None:
@@ -126,7 +126,7 @@ class NeighborCounts:
             np.add.at(self._now, one, counts)
 
     def count(self) -> tuple[int, float, int]:
-        """Return (fewest, mean, most) neighbors of an atom at this frame; add the frame to the histogram."""
+        """Return (fewest, mean, most) neighbors per atom at this frame; add the frame to the histogram."""
         here = np.bincount(self._now if self._atoms is None else self._now[self._atoms])
         if len(here) > len(self.seen):
             self.seen = np.pad(self.seen, (0, len(here) - len(self.seen)))
@@ -138,7 +138,7 @@ class NeighborCounts:
 
 @dataclass
 class Followed:
-    """State of one rule while frames are read."""
+    """Tracker, neighbor counts and statistics of one membership rule while frames are read."""
 
     rule: Rule
     tracker: Tracker | ResidueTracker  # of it
@@ -151,7 +151,7 @@ class Followed:
 
 @dataclass
 class Pass:
-    """Results of reading a trajectory."""
+    """Results of reading one trajectory."""
 
     rules: list[Followed]
     frames: int = 0  # examined
@@ -162,7 +162,7 @@ class Pass:
 
     @property
     def odd(self) -> dict[str, Any] | None:
-        """Contradiction of displacements with velocities and times, if any; see `separation.odd_flight`."""
+        """Inconsistency of displacements with velocities and times, or None; see `separation.odd_flight`."""
         return odd_flight(self.flights)
 
 
@@ -170,12 +170,11 @@ def follow(
     trajectory: Trajectory, rules: Sequence[Rule], groups: Groups, resolution: Resolution, sink: Sink,
     residues: ByResidue | None = None,
 ) -> Iterator[Pass]:  # fmt: skip
-    """Read the frames once, and send rows of "members", "flips", "frames" and "motion" to the sink.
+    """Read the frames once, and send table rows to the sink: "members", "flips", "frames" and "motion".
 
-    With residues, pairs are pairs of residues; the groups still list atoms. The same `Pass` is yielded after
-    each frame, and iteration may stop at any frame. Memory use is that of one frame and the trackers,
-    whatever the number of frames. Reading ends at a frame that cannot be read or used; earlier results are
-    kept.
+    If `residues` is given, pairs are pairs of residues, but groups still contain atoms. The same `Pass` is
+    yielded after each frame, and iteration may stop at any frame. Memory use does not grow with the number of
+    frames. Reading ends at the first unreadable or unusable frame; earlier results are kept.
 
     Raises:
         InputError: the first frame cannot be read or used, so there are no results to keep.
@@ -224,7 +223,7 @@ def follow(
 def _hand_on(
     sink: Sink, number: int, one: Followed, flips: FlipTable, frame: Frame, at: int, size: tuple[int, Groups]
 ) -> None:
-    """Send the table rows of one frame and one rule to the sink."""
+    """Send the table rows of one frame and one membership rule to the sink."""
     if one.neighbors is None:
         members = one.tracker.members()
         one.neighbors = NeighborCounts(members, *size, one.rule.directed)
@@ -252,7 +251,7 @@ def _hand_on(
 
 
 def _threshold(rule: Rule, members: Members) -> tuple[float, bool]:
-    """Return (usual distance at which a pair enters or leaves, True if the order of distances decides)."""
+    """Return (typical threshold distance of a pair, True if the order of distances defines neighbors)."""
     if isinstance(rule, CutoffRule | SpeciesCutoffs):
         return rule.reach, False
     if not len(members):
@@ -283,7 +282,7 @@ def _measure_flux(one: Followed, frame: Frame, groups: Groups, species: list[str
 
 @dataclass
 class SetDifference:
-    """Pairs (i, j, rank) that are inside in only one of two trajectories, updated by the flips of both."""
+    """Pairs (i, j, rank) that are neighbors in only one of two trajectories, updated with flips of both."""
 
     only_a: set[Pair] = field(default_factory=set)
     only_b: set[Pair] = field(default_factory=set)
@@ -303,7 +302,7 @@ class SetDifference:
         return len(self.only_a) + len(self.only_b)
 
     def step(self, a: FlipTable, b: FlipTable) -> None:
-        """Update the difference with the flips of both trajectories at the next frame."""
+        """Update the difference with the flips of both trajectories at one frame."""
         differed: dict[Pair, bool] = {}
         for flips, mine, others in ((a, self.only_a, self.only_b), (b, self.only_b, self.only_a)):
             columns = (flips.i.tolist(), flips.j.tolist(), flips.rank.tolist(), flips.entered.tolist())
@@ -321,7 +320,7 @@ class SetDifference:
 
 
 def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[np.ndarray, "pairs"]:
-    """Return the distances of pairs through images given by rank, in length units; inf without an image."""
+    """Return distances, in length units, of pairs (i, j, rank of image); inf if there is no such image."""
     i, j, rank = np.array(pairs, np.int64).reshape(-1, 3).T
     at = Placed(np.ascontiguousarray(frame.positions), lattice_of(frame.box), 0.0)
     return image_distances(at, np.minimum(i, j), np.maximum(i, j), rank, directed)
@@ -329,7 +328,7 @@ def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[
 
 @dataclass
 class ComparedSide:
-    """One of two compared trajectories, with its tracker and its resolution."""
+    """One of two compared trajectories, with its tracker, resolution and error bounds."""
 
     trajectory: Trajectory
     tracker: Tracker
@@ -340,7 +339,7 @@ class ComparedSide:
     bound: float = 0.0  # how far a margin can be off
 
     def step(self, frame: Frame) -> FlipTable:
-        """Return the flips of the next frame."""
+        """Process the next frame, and return its flips."""
         self.distance_bound = self.resolution.bound(frame)
         self.box_bound = self.resolution.bound(frame, np.zeros(0, np.int64))
         # a margin among the nearest is the difference of two distances
@@ -348,12 +347,12 @@ class ComparedSide:
         return self.tracker.step(frame, bound=self.bound)
 
     def position_bound(self, periods: int) -> float:
-        """Return the error bound (length) of a position across `periods` box periods at the last frame."""
+        """Return the error bound (length) of a position at the last frame, across `periods` box periods."""
         # a distance has two atoms that are off
         return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
 
     def speed_bound(self, frame: Frame) -> float:
-        """Return the error bound of an atom's velocity, in length per time."""
+        """Return the error bound of one atom's velocity, in length per time."""
         if self.speeds is None or frame.velocities is None:
             return 0.0
         return self.speeds.bound(velocities_of(frame)) / 2
@@ -362,10 +361,10 @@ class ComparedSide:
 def differing_rows(
     pairs: list[Pair], difference: SetDifference, sides: Sequence[ComparedSide], frames: Sequence[Frame]
 ) -> dict[str, np.ndarray]:
-    """Return table columns for pairs that differ: the run in which each pair is inside, distances, margins.
+    """Return table columns for the pairs that are inside the cutoff in only one of the two trajectories.
 
-    A pair is ambiguous if its distance in either file is so close to the threshold that rounding in the file
-    may have moved the pair across the threshold.
+    A pair is ambiguous if rounding of the coordinates in one of the files may have moved the pair across the
+    threshold.
     """
     rule = sides[0].tracker.rule
     i, j, rank = (np.array([pair[k] for pair in pairs], np.int64) for k in range(3))
@@ -388,7 +387,7 @@ def differing_rows(
 def _thresholds(
     i: np.ndarray, j: np.ndarray, inside: np.ndarray, rule: Rule, side: ComparedSide
 ) -> Float[np.ndarray, "pairs"]:
-    """Return the distance (length) below which each pair is inside, by center for nearest neighbors."""
+    """Return the threshold distance (length) of each pair, which for nearest neighbors depends on atom i."""
     if isinstance(rule, CutoffRule):
         return np.full(len(i), rule.radius)
     if isinstance(rule, SpeciesCutoffs):
@@ -401,7 +400,7 @@ def _thresholds(
 
 @dataclass
 class NeighborSets:
-    """Neighbor sets of one rule in the two trajectories, and their difference."""
+    """Neighbor sets of one membership rule in two trajectories, and the difference of the sets."""
 
     rule: Rule
     sides: list[ComparedSide]
@@ -414,7 +413,7 @@ class NeighborSets:
 
 @dataclass
 class Compared:
-    """Results of comparing two trajectories frame by frame."""
+    """Results of a frame-by-frame comparison of two trajectories."""
 
     frames: int = 0
     seed: int | None = None  # first frame whose positions differ at all
@@ -433,9 +432,9 @@ class Compared:
 
 
 def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Iterator[Compared]:
-    """Read two trajectories once, in step, comparing the given atoms; yield one `Compared` after each frame.
+    """Read two trajectories frame by frame, comparing the given atoms; yield a `Compared` after each frame.
 
-    The sink takes rows of the tables "apart" and "differing".
+    Rows of the tables "apart" and "differing" are sent to the sink.
     """
     found, sides = Compared(), sets[0].sides
 
@@ -487,10 +486,10 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 def _apart(
     found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
 ) -> tuple[Separation, float]:
-    """Return (separation, the part that the resolution of both files explains), less a common shift.
+    """Return (separation, the separation that file resolution can explain), both without a common shift.
 
-    A shift of all atoms is removed only if it explains nearly all of the separation: files of one run may
-    have different origins, or the motion of the center of mass was removed in one of them.
+    A common shift is removed only if it explains nearly all of the separation. Such a shift arises from
+    different origins of the files, or from center-of-mass motion removed in one file.
     """
     now = separation(a, b, atoms)
     allowed = sum(side.position_bound(now.periods) for side in sides)
@@ -519,7 +518,7 @@ def _sets_at(
     now: Separation,
     before: Separation,
 ) -> None:
-    """Record the difference of one rule's sets at a frame, and write the pairs that newly differ."""
+    """Record the difference of one rule's neighbor sets at a frame, and write the newly differing pairs."""
     difference, first = one.difference, False
     if one.certain is None and len(difference):
         # all that differ: one that came to differ within the resolution may be beyond it by now
@@ -546,7 +545,7 @@ def _sets_at(
 
 
 def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return the growth rates of the separation before and after the frame at which the sets first differ."""
+    """Return growth rates of the separation before and after the first frame with different neighbor sets."""
     cutoff, furthest = isinstance(one.rule, CutoffRule), float(table["furthest"].max(initial=0.0))
     limit = 0.1 * (one.rule.reach if cutoff else furthest)
     cut = frames if one.first is None else one.first["frame"]

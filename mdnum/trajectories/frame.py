@@ -1,8 +1,8 @@
-"""One frame of a trajectory in float64, and checks for values that no simulation writes.
+"""One frame of a trajectory in float64, and checks for values that no simulation can produce.
 
-Formats with plain floats (dcd, trr, netcdf) accept any bytes as coordinates; damage often leaves a huge
-number. Such a number would count as a position, and would increase the rounding bound of every other pair of
-the frame.
+Formats with plain floats (dcd, trr, netcdf) accept any bytes as coordinates; file damage often produces a
+huge coordinate. Unless rejected, this coordinate would increase the rounding bound of every pair in the
+frame.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ AtomIndices = Int[np.ndarray, "chosen"] | None
 
 @dataclass(frozen=True)
 class Box:
-    """Lattice vectors of a box, and the directions in which they repeat."""
+    """Lattice vectors of a box, and the directions in which the box is periodic."""
 
     # rows, length; those of directions that do not repeat do not matter
     matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
@@ -45,24 +45,24 @@ class Box:
 
     @property
     def periodic(self) -> bool:
-        """True if the box repeats along at least one direction."""
+        """True if the box is periodic along at least one direction."""
         return bool(self.pbc.any())
 
     @cached_property
     def longest(self) -> float:
-        """Length of the longest lattice vector; 0 unless all directions repeat and all vectors are finite."""
+        """Length of the longest lattice vector; 0 unless the box is periodic along all axes and finite."""
         if not np.all(self.pbc) or not np.isfinite(self.matrix).all():
             return 0.0
         return float(np.linalg.norm(self.matrix, axis=1).max())
 
     @cached_property
     def shortest(self) -> float:
-        """Length of the shortest lattice vector among the periodic directions; 0 without such a direction."""
+        """Length of the shortest lattice vector along periodic directions; 0 if no direction is periodic."""
         return float(np.linalg.norm(self.matrix[self.pbc], axis=1).min()) if self.periodic else 0.0
 
     @cached_property
     def broken(self) -> Int[np.ndarray, "axes"]:
-        """Axes along which the box repeats although their lattice vector is zero or not finite."""
+        """Indices of the periodic axes whose lattice vector is zero or not finite."""
         vectors = self.matrix.any(axis=1) & np.isfinite(self.matrix).all(axis=1)
         return np.flatnonzero(self.pbc & ~vectors)
 
@@ -85,7 +85,7 @@ class Frame:
 
     @cached_property
     def furthest(self) -> float:
-        """Largest absolute coordinate, in length units; not finite if any coordinate is not; 0 if empty."""
+        """Largest absolute coordinate, in length units; inf or nan if any coordinate is; 0 without atoms."""
         return furthest(self.positions)
 
     def furthest_of(self, atoms: AtomIndices) -> float:
@@ -95,14 +95,14 @@ class Frame:
 
 @dataclass
 class FrameCheck:
-    """Check that rejects frames that no simulation writes, and frames that do not match the first frame.
+    """Check that rejects frames with impossible values, and frames inconsistent with the first frame.
 
     Raises:
-        FrameError: a coordinate is not finite; an atom is farther out than any atom gets, or so far out that
-            floats do not resolve distances of length `radius`; more than one atom is at exactly 0, 0, 0; all
-            atoms made an impossible common move; the box repeats along other axes than in the first frame
-            (most often, the box is missing) or along an axis without a vector; or the label of an atom
-            differs from the first frame, and the file has no ids or a rule needs species.
+        FrameError: a coordinate is not finite; an atom is impossibly far away, or so far away that floats do
+            not resolve distances of length `radius`; several atoms are at exactly 0, 0, 0; the common motion
+            of all atoms is impossible; the periodic axes differ from the first frame (most often, the box is
+            missing), or one has no lattice vector; or the label of an atom differs from the first frame, and
+            the file has no ids or a rule needs species.
     """
 
     atoms: AtomIndices = None  # those that matter, ascending; None for all
@@ -121,7 +121,7 @@ class FrameCheck:
         return frame
 
     def _wrong(self, frame: Frame) -> Iterator[tuple[str, str]]:
-        """Yield (problem, remedy) for each failed check; later checks assume that the earlier ones passed."""
+        """Yield (problem, remedy) for each failed check; each check assumes that previous checks passed."""
         atoms = self.atoms
         self.pbc = pbc = frame.box.pbc if self.pbc is None else self.pbc
         self.labels = labels = frame.labels if self.labels is None else self.labels
@@ -201,12 +201,12 @@ def far_out(
     bits: int = 64,
     before: Float[np.ndarray, "some 3"] | None = None,
 ) -> tuple[int, int, str] | None:
-    """Return the most distant atom if it is impossibly far out; arguments as in `FrameCheck`.
+    """Return the most distant atom if its distance is impossibly large; arguments as in `FrameCheck`.
 
-    Positions of some atoms one frame earlier give the size of the system even if half the frame is damaged.
+    The system size is also estimated from positions one frame earlier, since this frame may be damaged.
 
     Returns:
-        (the atom, the number of atoms too far out, the reason in words); None if no atom is too far out.
+        (the atom, the number of such atoms, the reason in words); None if there is no such atom.
     """
     x = frame.positions if atoms is None else frame.positions[atoms]
     if len(x) < 2:
@@ -236,9 +236,9 @@ def far_out(
 
 
 def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, float] | None:
-    """Return the atom with the largest displacement since the previous frame, if it is larger than possible.
+    """Return the atom with the largest displacement since the previous frame, if impossibly large.
 
-    Wrapping of one atom, or of all atoms at once after a long time, is not a leap.
+    A jump by a lattice vector, when one atom or all atoms are wrapped into the box, does not count.
 
     Returns:
         (the atom, the length of its displacement); None if there is no leap.
@@ -258,11 +258,11 @@ def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, flo
 
 
 def furthest(x: Float[np.ndarray, "atoms 3"]) -> float:
-    """Return the largest absolute value; 0 for an empty array."""
+    """Return the largest absolute value of an array; 0 for an empty array."""
     # twice as fast as through their absolute values, and six times as by atom
     return float(max(x.max(initial=0.0), -x.min(initial=0.0)))
 
 
 def _named(at: Any, atoms: AtomIndices) -> int:
-    """Return the number in the file of an atom, given its position among the selected atoms."""
+    """Return the number of an atom in the file from its index among the selected atoms."""
     return int(at if atoms is None else atoms[at])

@@ -1,6 +1,6 @@
-"""History of every pair over the frames: its flips, its contacts, and the flips that larger strides leave.
+"""History of every pair over the frames: flips, contacts, and the flips still found at larger strides.
 
-The module `lost` estimates from such counts how many flips are lost between frames.
+From the counts at several strides, the module `lost` estimates the number of flips missed between frames.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _ROOM = 2**62
 
 
 class Sums:
-    """Counts for a subset of the pairs; addition combines two subsets field by field, and keeps None."""
+    """Counts for a subset of the pairs; adding two objects gives the counts for both subsets together."""
 
     # what is the same for all pairs
     _common: tuple[str, ...] = ()
@@ -36,7 +36,7 @@ class Sums:
 
 @dataclass(frozen=True)
 class History:
-    """Pairs that were ever inside or flipped, each with its flips in order of frames."""
+    """Flips, in frame order, of each pair that was inside the cutoff at the first frame or flipped later."""
 
     i: Int[np.ndarray, "pairs"]  # the pairs, sorted, each once; see `ledger.Members`
     j: Int[np.ndarray, "pairs"]
@@ -58,9 +58,9 @@ class History:
         """Build the histories of pairs from a ledger of flips.
 
         Args:
-            flips: all flips of some of the pairs, in the order of frames, or their columns frame, entered, i,
-                j, rank and ambiguous.
-            first: the pairs among them that are inside at the first frame, or their columns i, j and rank.
+            flips: all flips of a subset of the pairs, in frame order: a table, or its columns frame, entered,
+                i, j, rank and ambiguous.
+            first: the pairs of this subset inside at the first frame: a table, or its columns i, j and rank.
             frames: number of frames examined, at least 1.
         """
         flips, first = (one if isinstance(one, Mapping) else vars(one) for one in (flips, first))
@@ -95,7 +95,7 @@ class History:
 
 
 def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return (a stable order that sorts by all columns, mask of sorted rows that begin a new group)."""
+    """Return (indices that sort rows stably by all columns, mask of the first sorted row of each group)."""
     if not len(columns[0]):
         return np.zeros(0, np.int64), np.zeros(0, bool)
     sizes = [int(column.max()) + 1 for column in columns]
@@ -113,10 +113,10 @@ def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Contacts(Columns):
-    """Contacts (periods in which a pair is inside), sorted by (i, j, rank, begin).
+    """Contacts (periods in which a pair is inside the cutoff), sorted by (i, j, rank, begin).
 
-    A contact means that the pair was inside at the frames `begin`, ..., `end - 1`. The pair entered some time
-    between the frames `begin - 1` and `begin`, and may have been outside for a while between two frames.
+    During a contact, the pair is inside at the frames `begin`, ..., `end - 1`. The pair entered between the
+    frames `begin - 1` and `begin`. Absences shorter than the time between two frames are not detected.
     """
 
     i: Int[np.ndarray, "stays"]  # the pair; see `ledger.Members`
@@ -129,7 +129,7 @@ class Contacts(Columns):
 
     @property
     def length(self) -> Int[np.ndarray, "stays"]:
-        """Number of frames of each contact."""
+        """Duration of each contact, in frames."""
         return self.end - self.begin
 
 
@@ -137,7 +137,7 @@ def contacts(history: History) -> Contacts:
     """Return all contacts of every pair.
 
     Raises:
-        ValueError: the flips of a pair do not enter and leave alternately, so one is missing.
+        ValueError: a flip is missing: the flips of a pair do not alternate between entering and leaving.
     """
     pair, inside, entered = history.pair, history.inside, history.entered
     odd = (np.arange(len(pair)) - history.rows[pair]) % 2 == 1
@@ -157,7 +157,7 @@ def contacts(history: History) -> Contacts:
 
 
 def mended(stays: Contacts, gap: int) -> Contacts:
-    """Merge contacts of a pair that are at most `gap` frames apart (intermittent contacts)."""
+    """Merge contacts of a pair that are separated by at most `gap` frames (intermittent contacts)."""
     if gap < 1 or not len(stays):
         return stays
     same = np.all([column[1:] == column[:-1] for column in (stays.i, stays.j, stays.rank)], axis=0)
@@ -172,7 +172,7 @@ def mended(stays: Contacts, gap: int) -> Contacts:
 
 @dataclass(frozen=True)
 class Strides(Sums):
-    """Number of flips that remain if only every nth frame is examined."""
+    """Number of flips that are still found if only every nth frame is examined."""
 
     _common = ("stride",)
 
@@ -184,7 +184,7 @@ class Strides(Sums):
 
     @classmethod
     def of_history(cls, history: History, strides: Sequence[int]) -> Strides:
-        """Count remaining flips: an odd number of a pair's flips between two kept frames leaves one flip."""
+        """Count flips found at each stride; an odd number of a pair's flips per stride gives one flip."""
         found = []
         for stride in strides:
             rows = np.flatnonzero(history.frame <= (history.frames - 1) // stride * stride)
@@ -198,12 +198,12 @@ class Strides(Sums):
 
     @property
     def share(self) -> Float[np.ndarray, "strides"]:
-        """Share of the flips that remain at each stride; nan without flips."""
+        """Fraction of the flips that are still found at each stride; nan if there are no flips."""
         return np.divide(self.flips, self.of, out=np.full(len(self.of), np.nan), where=self.of > 0)
 
 
 def doublings(frames: int) -> list[int]:
-    """Return the strides 1, 2, 4, ... that leave at least four intervals."""
+    """Return the strides 1, 2, 4, ... for which the frames span at least four intervals."""
     strides = [1]
     while (frames - 1) // (2 * strides[-1]) >= 4:
         strides.append(2 * strides[-1])
@@ -213,11 +213,12 @@ def doublings(frames: int) -> list[int]:
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:
     """Count the decisions that change if all atoms move in straight lines for a short time.
 
-    The root mean square displacement in this time is the length `move`: small compared with the distance over
-    which paths bend, and large enough that many pairs cross. `count` returns the flips between two frames.
+    The root mean square displacement in this time is the length `move`. It should be small compared with the
+    distance over which paths bend, but long enough for many pairs to cross. `count` returns the number of
+    flips between two frames.
 
     Returns:
-        (number of flips, the time in the unit of the velocities); None if no atom moves.
+        (number of flips, duration of the motion in the time unit of the velocities); None if no atom moves.
     """
     if frame.velocities is None:
         return None

@@ -1,7 +1,8 @@
-"""Pairs identified by (i, j, shift), in a box so narrow that several images of an atom are inside.
+"""Flips of pairs identified by (i, j, shift), for boxes so narrow that several images can be neighbors.
 
-The ledger of flips identifies images by rank, which wrapping of atoms does not change. If two images of a
-pair exchange places at the cutoff within one frame, the ledger has no flip, and this module counts two.
+The ledger of flips identifies an image by its rank in distance, which does not change if atoms are wrapped.
+If one image of a pair leaves and another enters between two frames, the ledger contains no flip, but this
+module counts two flips.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _TOGETHER, _APART = 1_000_000, 256
 
 
 def pair_keys(i: np.ndarray, j: np.ndarray, shifts: np.ndarray, atoms: int) -> Int[np.ndarray, "pairs"]:
-    """Return an integer key for each pair, or for each image of a pair if shifts have columns."""
+    """Return an integer key for each pair (i, j), or for each image (i, j, shift) if shifts have columns."""
     keys = i * np.int64(atoms) + j
     for column in shifts.T:
         keys = keys * _APART + column % _APART
@@ -30,7 +31,7 @@ def pair_keys(i: np.ndarray, j: np.ndarray, shifts: np.ndarray, atoms: int) -> I
 
 
 def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """Return (lattice vectors as rows, completed by normals; the inverse matrix)."""
+    """Return (lattice vectors as rows, with unit normals for nonperiodic axes; the inverse matrix)."""
     from ase.geometry import complete_cell
 
     matrix = complete_cell(np.where(frame.box.pbc[:, None], frame.box.matrix, 0.0))
@@ -38,12 +39,13 @@ def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
 
 
 def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
-    """Return the shifts of images given by rank; x[j] + shift @ box is an image, as in ASE, vesin and jax-md.
+    """Return the lattice shifts of images given by rank: the image of j is at x[j] + shift @ box.
 
-    Images of an atom itself come in ± pairs; the shift whose first nonzero component is positive is returned.
+    This is the convention of ASE, vesin and jax-md. An atom's own images come in ± pairs; the shift whose
+    first nonzero component is positive is returned.
 
     Args:
-        pairs: object with i, j, rank and distance, such as `Members`.
+        pairs: object with arrays i, j, rank and distance, such as `Members`.
     """
     x, pbc, (matrix, inverse) = frame.positions, frame.box.pbc, cell_of(frame)
     most = pairs.distance.max(initial=0.0) * np.linalg.norm(inverse, axis=0) + 0.5
@@ -62,13 +64,13 @@ def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
 
 
 class ImageFlips:
-    """Flips of pairs identified by image, between successive frames."""
+    """Flips between successive frames, for pairs identified by image."""
 
     def __init__(self) -> None:
         self._before: tuple[Frame, np.ndarray] | None = None
 
     def step(self, frame: Frame, pairs: Members) -> dict[str, Any] | None:
-        """Return the columns of a frame's flips, or None; `pairs` are those inside by a symmetric rule."""
+        """Return table columns of a frame's flips, or None; `pairs` are neighbors by a symmetric rule."""
         matrix, inverse = cell_of(frame)
         now = np.column_stack([pairs.i, pairs.j, image_shifts(frame, pairs)])
         known, self._before = self._before, (frame, now)

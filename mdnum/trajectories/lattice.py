@@ -1,17 +1,17 @@
-"""Reduced lattice of a box, binning of atoms, and the loop that finds near pairs.
+"""Lattice reduction of a box, sorting of atoms into bins, and the loop that finds pairs within a radius.
 
-Lattice vectors are reduced first, so that a strongly skewed box costs no more than the compact box with the
-same lattice. Every decision uses the same number: the length of
+Lattice vectors are reduced first, so that a search in a skewed box is as fast as in the compact box with the
+same lattice. Every decision is based on the length of the vector
 
     (x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2
 
-with the coordinates as they are stored, i < j, integers s and the reduced vectors a, in this order of
-operations. A decision therefore does not depend on the search that found the pair.
+The vector is computed in this order from stored coordinates x, i < j, integers s and reduced vectors a. A
+decision therefore does not depend on the search algorithm that found the pair.
 
-Bins divide the coordinates of the reduced lattice. Nonperiodic directions have bins too, folded onto a fixed
-number of them, so that one distant atom neither creates many bins nor puts all others into one. For each bin,
-the atoms of all bins in reach are gathered with the lattice vectors that bring them near (an atom several
-times if the box is small); then every atom of the bin is compared with all gathered atoms.
+Bins divide the coordinates of the reduced lattice. Coordinates along a nonperiodic direction are folded onto
+a limited number of bins, so that a distant atom does not enlarge the grid. For each bin, the atoms of all
+bins within reach are gathered at their nearby images (several per atom in a small box). Every atom of the bin
+is then compared with all gathered atoms.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ INSIDE, DIRECTED = 0, 2
 
 
 class ReducedLattice(NamedTuple):
-    """Properties of a box that a search needs, as a tuple that compiled loops accept."""
+    """Properties of a box needed by a neighbor search, as a tuple that compiled loops accept."""
 
     vectors: Float[np.ndarray, "3 3"]  # reduced, as rows, length; zero along directions that do not repeat
     periodic: Bool[np.ndarray, "3"]  # which rows repeat
@@ -48,16 +48,16 @@ class ReducedLattice(NamedTuple):
 
     @property
     def narrowest(self) -> float:
-        """Smallest width of the box, in length units; no lattice vector is shorter."""
+        """Smallest width of the box, in length units: a lower bound of the lengths of lattice vectors."""
         return float(self.widths.min())
 
     @property
     def volume(self) -> float:
-        """Volume of the box; a nonperiodic direction counts as one unit of length."""
+        """Volume of the box; along a nonperiodic direction, a width of one unit of length is assumed."""
         return float(1.0 / abs(np.linalg.det(self.inverse)))
 
     def rounding(self, largest: float, radius: float) -> float:
-        """Return the rounding error, a length, of a distance near `radius`, for coordinates up to `largest`.
+        """Return the rounding error (length) of a distance near `radius`, for coordinates up to `largest`.
 
         Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1.
         """
@@ -70,7 +70,7 @@ def lattice_of(box: Box) -> ReducedLattice:
     """Return the reduced lattice of a box.
 
     Raises:
-        InputError: the vector of a periodic direction is zero, not finite, or in the plane of the others.
+        InputError: a lattice vector of a periodic direction is zero, not finite, or coplanar with the others.
     """
     return _reduced(np.asarray(box.matrix, np.float64).tobytes(), np.asarray(box.pbc, bool).tobytes())
 
@@ -107,10 +107,10 @@ def _reduced(rows: bytes, periodic: bytes) -> ReducedLattice:
 def shortest(
     moved: Float[np.ndarray, "atoms 3"], box: Box
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """Return (displacements through the nearest image, numbers of lattice vectors removed).
+    """Return (displacements to the nearest image, numbers of lattice vectors removed).
 
-    The image is the nearest one if an atom moved by less than half the width of the box. With an invalid box,
-    displacements are returned unchanged.
+    The result is correct for an atom that moved by less than half the width of the box. If the box is
+    invalid, displacements are returned unchanged.
     """
     try:
         lattice = lattice_of(box)
@@ -121,7 +121,7 @@ def shortest(
 
 
 def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
-    """Return the squared lengths of lattice vectors up to `radius`, one of each ± pair, ascending."""
+    """Return squared lengths, ascending, of the lattice vectors up to `radius`, with one of each ± pair."""
     if not lattice.periodic.any() or radius < lattice.narrowest * (1 - 1e-9):
         return np.zeros(0)
     vectors, most = lattice.vectors, np.where(lattice.periodic, radius / lattice.widths + 1, 0).astype(int)
@@ -136,7 +136,7 @@ def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "ima
 # inlined: a call that takes arrays costs more than what is done here
 @njit(inline="always")
 def square_of(x, i, j, s0, s1, s2, vectors):
-    """Return the squared distance from atom i to an image of atom j, i < j: the number that decides."""
+    """Return the squared distance, used in every decision, from atom i to an image of atom j, i < j."""
     if s0 == 0 and s1 == 0 and s2 == 0:
         d0, d1, d2 = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
     else:
@@ -148,11 +148,11 @@ def square_of(x, i, j, s0, s1, s2, vectors):
 
 @njit(inline="never")
 def near_squares(x, i, j, lattice, y, squares):
-    """Compute `square_of` for pairs, at the image found by rounding; y is a work array of shape (3, block).
+    """Compute `square_of` for pairs at their rounded nearest image; y is a work array of shape (3, block).
 
-    The loop has no branch: adding a sum of zeros changes no square, and vectors are zero along nonperiodic
-    directions. Coordinates are gathered first, so that all other operations are vector instructions; the
-    lattice is read once.
+    The loop has no branch: a zero shift changes no square, and lattice vectors are zero along nonperiodic
+    directions. Coordinates are gathered first, so that all other operations are vector instructions, and the
+    lattice is loaded only once.
     """
     vectors, inverse = lattice.vectors, lattice.inverse
     y0, y1, y2 = y[0], y[1], y[2]
@@ -178,9 +178,9 @@ def near_squares(x, i, j, lattice, y, squares):
 
 @njit
 def image_square(x, i, j, rank, lattice):
-    """Return the squared distance to the image of j that has `rank` nearer images; inf without such an image.
+    """Return the squared distance to the image of j that has `rank` nearer images; inf if there is none.
 
-    Atoms have i < j, or i == j for images of an atom itself, of which one of each ± pair counts.
+    Atoms have i < j, or i == j for images of an atom itself, of which one of each ± pair is counted.
     """
     vectors, periodic, widths = lattice.vectors, lattice.periodic, lattice.widths
     # the image that rounding names; nearest where that is near enough
@@ -231,7 +231,7 @@ def image_square(x, i, j, rank, lattice):
 
 @dataclass(frozen=True)
 class Participants:
-    """Atoms that take part in a rule, numbered consecutively."""
+    """Atoms to which a membership rule applies, numbered consecutively."""
 
     labels: Int[np.ndarray, "atoms"]  # their numbers in the file
     centers: Bool[np.ndarray, "atoms"]  # whose neighbors are wanted
@@ -241,29 +241,29 @@ class Participants:
 
     @property
     def radius(self) -> float:
-        """Largest radius of all pairs of species, in length units."""
+        """Largest cutoff radius of all pairs of species, in length units."""
         return float(self.radii.max(initial=0.0))
 
     @property
     def squares(self) -> Float[np.ndarray, "species species"]:
-        """Squared radius of each pair of species; negative for pairs that are never inside."""
+        """Squared cutoff radius of each pair of species; negative for pairs that are never neighbors."""
         return np.where(self.radii >= 0, self.radii * self.radii, -1.0)
 
     @property
     def both(self) -> Bool[np.ndarray, "atoms"]:
-        """Mask of the atoms on both sides: images of such an atom can be its own neighbors."""
+        """Mask of the atoms in both groups, whose own images can be their neighbors."""
         return self.centers & self.others
 
     @cached_property
     def kinds(self) -> list[Int[np.ndarray, "some"]]:
-        """Groups of atoms with the same species and on the same sides, smallest group first."""
+        """Groups of atoms with equal species and equal group membership, smallest group first."""
         kind = 4 * self.species + 2 * self.centers + self.others
         return sorted((np.flatnonzero(kind == one) for one in np.unique(kind)), key=len)
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Positions and lattice, at one frame, of the atoms that take part in a rule."""
+    """Positions of the atoms to which a rule applies, and the reduced lattice, at one frame."""
 
     positions: Float[np.ndarray, "atoms 3"]  # as stored, anywhere, length
     lattice: ReducedLattice  # of the box
@@ -271,7 +271,7 @@ class Placed:
 
 
 class SearchLimits(NamedTuple):
-    """Squared distances that bound the pairs of a search, by species."""
+    """Lower and upper limits of squared distances in a pair search, by species."""
 
     kind: int  # `INSIDE` or `DIRECTED`
     low: Float[np.ndarray, "species species"]  # pairs nearer than this are inside for certain
@@ -280,14 +280,14 @@ class SearchLimits(NamedTuple):
 
     @classmethod
     def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> SearchLimits:
-        """Return limits for pairs that are inside their radius or within the band around it."""
+        """Return limits for pairs inside their radius, or within a band of undecided pairs around it."""
         low = np.where(radii >= 0, np.maximum(radii - band, 0.0) ** 2, np.inf)
         high = np.where(radii >= 0, (radii + band) ** 2, -1.0)
         return cls(kind, low, high, float((radii.max(initial=0.0) + band) ** 2))
 
 
 class Candidates(NamedTuple):
-    """Output buffers for the pairs of a search; pairs that do not fit are only counted."""
+    """Output buffers for the pairs of a search; pairs beyond the capacity are only counted."""
 
     i: Int[np.ndarray, "room"]  # pairs that are inside for certain
     j: Int[np.ndarray, "room"]
@@ -299,13 +299,13 @@ class Candidates(NamedTuple):
 
     @classmethod
     def room(cls, certain: int, open: int) -> Candidates:
-        """Allocate buffers for the given numbers of certain and open pairs."""
+        """Allocate buffers for the given numbers of certain pairs and of pairs still to be decided."""
         i, j, i_open, j_open, code = (np.empty(n, np.int32) for n in (certain, certain, open, open, open))
         return cls(i, j, i_open, j_open, code, np.empty(open), np.zeros(3, np.int64))
 
 
 class Binned(NamedTuple):
-    """Atoms of one frame sorted into bins: the input of the search loop."""
+    """Atoms of one frame sorted into bins, as input of the search loop."""
 
     lattice: ReducedLattice  # of the frame
     species: Int[np.ndarray, "atoms"]
@@ -325,10 +325,10 @@ class Binned(NamedTuple):
 
 
 def binned(placed: Placed, who: Participants, reach: float) -> Binned:
-    """Sort atoms into bins for a search of pairs within reach.
+    """Sort atoms into bins for a search of pairs up to the distance `reach`.
 
     Raises:
-        InputError: the box repeats too often within reach.
+        InputError: the box is so small that too many images are within this distance.
     """
     positions, lattice, atoms = placed.positions, placed.lattice, len(placed.positions)
     extent = np.zeros(3)
@@ -350,10 +350,10 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
 
 
 def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[np.ndarray, "3"]):
-    """Return (bins, reach, step): bins along each axis, how many bins apart a pair can be, width of a bin.
+    """Return (numbers of bins, reach of a search in bins, width of a bin), each along the three axes.
 
-    There are no more than about twice as many bins as atoms. `extent` is the length that atoms span along
-    each nonperiodic axis.
+    The number of bins is at most about twice the number of atoms. `extent` is the extent of the atoms along
+    each nonperiodic axis, in length units.
     """
     bins, reach, step = np.ones(3, np.int64), np.ones(3, np.int64), np.ones(3)
     room = max(64.0, 2.0 * atoms)
@@ -382,7 +382,7 @@ def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[n
 
 @njit
 def wrap(x, lattice, bins, step):
-    """Wrap all atoms; return wrapped positions, the lattice vectors removed, and the bin of each atom."""
+    """Wrap all atoms; return wrapped positions, numbers of lattice vectors removed, and bins of the atoms."""
     wrapped, home, bin_of = np.empty(x.shape), np.empty(x.shape, np.int64), np.empty(x.shape[0], np.int64)
     vectors, inverse, periodic = lattice.vectors, lattice.inverse, lattice.periodic
     for i in range(x.shape[0]):
@@ -412,7 +412,7 @@ def wrap(x, lattice, bins, step):
 
 @njit
 def _sorted_by_bin(bin_of, chosen, total):
-    """Return (start, order) of the chosen atoms by a counting sort that keeps their order within a bin."""
+    """Return (first index of each bin, indices of the chosen atoms by bin) from a stable counting sort."""
     start = np.zeros(total + 1, np.int64)
     count = 0
     for i in range(bin_of.shape[0]):
@@ -432,14 +432,14 @@ def _sorted_by_bin(bin_of, chosen, total):
 
 @njit
 def lattice_vector(code):
-    """Decode the three integers of a lattice vector from its code."""
+    """Decode the three integer coefficients of a lattice vector from their code."""
     code = np.int64(code)
     return (code >> 20) - 512, ((code >> 10) & 1023) - 512, (code & 1023) - 512
 
 
 @njit
 def _run(d0, d1, d2, b0, b1, b2, bins, last):
-    """Return the run of bins at offset d from a bin: lattice vector, first and last bin, next d2."""
+    """Return the contiguous bins at offset d from a bin: lattice vector, first and last bin, next d2."""
     n0, n1, n2 = (b0 + d0) // bins[0], (b1 + d1) // bins[1], (b2 + d2) // bins[2]
     c0, c1, low = b0 + d0 - n0 * bins[0], b1 + d1 - n1 * bins[1], b2 + d2 - n2 * bins[2]
     high = min(bins[2] - 1, low + last - d2)
@@ -449,7 +449,7 @@ def _run(d0, d1, d2, b0, b1, b2, bins, last):
 
 @njit
 def _most_around(bins, reach, start):
-    """Return upper limits of the number of atoms and the number of runs around any bin."""
+    """Return upper limits of the number of atoms and of contiguous runs of bins around any bin."""
     atoms, runs = 0, 0
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
@@ -470,7 +470,7 @@ def _most_around(bins, reach, start):
 # candidate, and the loop its vector instructions.
 @njit(inline="never")
 def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
-    """Compute squared distances from x to near[:, first:last]; choose and count those up to `largest`."""
+    """Compute squared distances from x to near[:, first:last]; list and count those up to `largest`."""
     near0, near1, near2 = near[0, first:last], near[1, first:last], near[2, first:last]
     for k in range(near0.shape[0]):
         y0, y1, y2 = near0[k] - x0, near1[k] - x1, near2[k] - x2
@@ -487,10 +487,10 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
 
 @njit
 def meet(atoms, limits, found):
-    """Record the pairs of all centers; return the numbers of certain and of open pairs.
+    """Record the neighbor pairs of all centers; return the numbers of certain and of undecided pairs.
 
-    Pairs within one set are visited once, by examining half of the bins around each bin. Otherwise all bins
-    around each center are examined; a pair of atoms that are on both sides is visited twice and counted once.
+    Pairs within one group are visited once, by examining half of the bins around each bin. For two groups,
+    all bins around a center are examined; a pair of atoms in both groups is visited twice and counted once.
     """
     written, left = 0, 0
     start, bins, reach, species = atoms.start, atoms.bins, atoms.reach, atoms.species

@@ -1,8 +1,8 @@
-"""Pairs inside a cutoff that are missing from a program's own neighbor list, with their duration.
+"""Pairs inside a cutoff that are missing from the neighbor list of a program, with the duration of the gap.
 
-A list may be incomplete because the skin was exceeded, a buffer overflowed or images are not supported; in
-all cases the program is affected by the pairs that are missing while they are inside the cutoff. Missing
-pairs within the error bound of the cutoff are due to rounding and are not counted.
+A neighbor list may be incomplete because the skin was exceeded, a buffer overflowed, or images are not
+supported. In each case, the program omits the interactions of the missing pairs inside the cutoff. Missing
+pairs whose distance equals the cutoff within its error bound are not counted.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _KNOWN = (
 
 @njit
 def _same(given, known):
-    """Return True if two arrays hold the same numbers."""
+    """Return True if two arrays of equal length contain the same numbers."""
     for begin in range(0, len(known), 8192):
         some, others, differ = given[begin : begin + 8192], known[begin : begin + 8192], 0
         for k in range(len(some)):
@@ -50,7 +50,7 @@ def _same(given, known):
 
 
 class GivenList(NamedTuple):
-    """A program's neighbor list without padding, sorted by the first atom of each entry."""
+    """Neighbor list of a program, without padding and sorted by the first atom of each entry."""
 
     shifted: bool  # whether it says which image each neighbor is; else the nearest alone
     full: bool  # whether it has each pair from both of its atoms; else from the lower one here
@@ -61,7 +61,7 @@ class GivenList(NamedTuple):
 
     @classmethod
     def of(cls, parts: list[np.ndarray], atoms: int) -> GivenList:
-        """Build a list, in int32, from the arrays that `arrays_of` returns."""
+        """Build a neighbor list, in int32, from the arrays returned by `arrays_of`."""
         i, j, *shifts = parts
         image = _image(*shifts[0].T) if shifts else np.zeros(len(i), np.int32)
         there = (i >= 0) & (i < atoms) & (j >= 0) & (j < atoms) & ((i != j) | (image != 0))
@@ -92,11 +92,11 @@ class GivenList(NamedTuple):
         return cls(shifted, full, np.searchsorted(i, np.arange(atoms + 1, dtype=i.dtype)), i, j, image)
 
     def has(self, i: np.ndarray, j: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, "pairs"]:
-        """Return True for each given entry that the list contains; the search is fastest if i is sorted."""
+        """Return True for each given pair that the list contains; the search is fastest if i is sorted."""
         return _has(self.first, self.j, self.image, i, j, image, self.shifted)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
-        """Return, for each pair, from how many of its atoms it is missing: up to 1, or 2 in a full list."""
+        """Return the number of entries missing from the list for each pair: up to 1, or 2 in a full list."""
         i, j, image, near = pairs.i, pairs.j, np.zeros(len(pairs), np.int64), pairs.rank == 0
         if self.shifted:
             image, near = _image(*image_shifts(frame, pairs).T), np.True_
@@ -120,7 +120,7 @@ def _shift(image: np.ndarray) -> Int[np.ndarray, "images 3"]:
 
 
 def _opposite(image: np.ndarray) -> Int[np.ndarray, "images"]:
-    """Return the codes of the opposite shifts."""
+    """Return the integer codes of the opposite lattice shifts."""
     return _image(*-_shift(image).T)
 
 
@@ -150,7 +150,7 @@ def _has(first, other, images, i, j, image, shifted):
 
 
 def arrays_of(neighbors: Any, atoms: int) -> list[np.ndarray]:
-    """Return i, j and shifts, if any, of a neighbor list in a form that `mdnum.Recorder.see` accepts."""
+    """Return i, j and optional shifts of a neighbor list in any form supported by `mdnum.Recorder.see`."""
     given = getattr(neighbors, "idx", neighbors)
     shifts = getattr(neighbors, "shifts", None)
     given = [*(given if isinstance(given, tuple) else (given,)), *(() if shifts is None else (shifts,))]
@@ -169,7 +169,7 @@ def arrays_of(neighbors: Any, atoms: int) -> list[np.ndarray]:
 
 
 class ListCheck:
-    """Comparison of a neighbor list with the pairs inside, frame by frame, or by flips while unchanged."""
+    """Comparison of a neighbor list with the pairs inside the cutoff at each frame."""
 
     def __init__(self, rule: Rule) -> None:
         self._rule = rule
@@ -182,7 +182,7 @@ class ListCheck:
         self._open: dict[tuple[int, int, int], tuple[int, int, int, float]] = {}
 
     def given(self, neighbors: Any, species: np.ndarray) -> GivenList:
-        """Return the neighbor list as a `GivenList`: the same object if it did not change."""
+        """Return the neighbor list as a `GivenList`; an unchanged list gives the same object again."""
         if self._newest is None:
             if self._rule.directed:
                 message = f"a neighbor list needs a cutoff, but the rule is {self._rule.name}"
@@ -207,11 +207,11 @@ class ListCheck:
         flips: Mapping[str, np.ndarray],
         now: GivenList,
     ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """Compare list and pairs inside; return (results at the frame, rows of pairs no longer missing).
+        """Compare list and pairs; return (results of the frame, table rows of pairs missing no longer).
 
         Args:
             at: index of the frame among the frames examined.
-            tracker, flips: tracker of the rule after this frame, and the flips of the frame by columns.
+            tracker, flips: tracker of the rule after this frame, and the table columns of the frame's flips.
             now: the neighbor list in use.
         """
         new, earlier, before = now is not self._list, self._list, self._before
@@ -250,7 +250,7 @@ class ListCheck:
         return row, self.ended(at, tracker.bound, {key: known[key] for key in gone})
 
     def _drops(self, earlier: GivenList, now: GivenList, frame: Frame, before: Frame, placed: Placed) -> bool:
-        """Return True if a list may lack inside pairs that the previous list contained."""
+        """Return True if the list may lack pairs that are inside the cutoff and were in the previous list."""
         i, j, image, reach = earlier.i, earlier.j, earlier.image, self._rule.reach
         x, (matrix, inverse) = placed.positions, cell_of(frame)
         if (earlier.shifted, earlier.full) != (now.shifted, now.full):
@@ -273,7 +273,7 @@ class ListCheck:
         return bool((distance <= self._radii[self._kinds[i], self._kinds[j]] + placed.rounding).any())
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
-        """Return rows of pairs that were missing up to a frame; by default, of all pairs still missing."""
+        """Return table rows of pairs that were missing until a frame; by default, all pairs still missing."""
         names = ("i", "j", "rank", "missing", "begin", "number", "deepest", "end")
         held = sorted((self._open if stays is None else stays).items())
         rows = [(*key, *told, at) for key, told in held if told[-1] > bound]

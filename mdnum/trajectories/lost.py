@@ -1,11 +1,11 @@
-"""Estimate of flips lost between frames: pairs that cross their threshold and return by the next frame.
+"""Estimate of flips missed between frames, when a pair crosses its threshold and returns by the next frame.
 
-The reference is the number of flips that an examination of the run at every time step would count. The
-estimates (thinning, persistence, velocities and flux), the test systems on which constants were chosen, and
-the measured coverage are in docs/lost-flips.md. The first two are extrapolated to finer frames by a family of
-laws: frames a time t apart show flips at a rate (1 + (t/τ)^p)^(-s/p), with p = 2 for smooth paths and 1 if
-velocities change in kicks, s = 1/2 for motion that ends up diffusive and 1 if atoms stay at their sites. The
-laws that fit are averaged.
+The reference is the number of flips found if every time step of the run is examined. The four estimates
+(thinning, persistence, velocities and flux), the test systems used to choose the constants, and the measured
+coverage are described in docs/lost-flips.md. Thinning and persistence are extrapolated to shorter frame
+intervals t with a family of laws for the rate of observed flips, (1 + (t/τ)^p)^(-s/p). The exponent p is 2
+for smooth paths and 1 for abrupt velocity changes; s is 1/2 for diffusive motion and 1 for atoms that stay at
+their sites. The laws that fit the data are averaged.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Estimate = tuple[float, float]
 
 @dataclass(frozen=True)
 class FrameMotion:
-    """Root mean square displacements of atoms from frame to frame."""
+    """Root mean square displacements of the atoms between frames."""
 
     growth: tuple[float, float, float]  # displacement in 1, 2 and 4 frames over that many times the one in 1
     step: float  # displacement of a pair in a frame, along an axis, length
@@ -67,7 +67,7 @@ class FrameMotion:
         *,
         timed: bool = True,
     ) -> FrameMotion | None:
-        """Measure how far atoms move over successive frames; None for too few frames or too little motion."""
+        """Measure the displacements over successive frames; None for too few frames or too little motion."""
         sides = [slice(None) if one is None else one for one in (first, first if second is None else second)]
         atoms, grid = min(len(sample[0].positions[side]) for side in sides), resolution.usual_step(sample[0])
         pairs = list(pairwise(sample))
@@ -76,7 +76,7 @@ class FrameMotion:
             return None
 
         def variance(ways: Float[np.ndarray, "ways atoms 3"]) -> float:
-            """Return the variance along an axis, without the motion common to all atoms."""
+            """Return the variance of displacements along an axis, without the mean motion of all atoms."""
             free = ways - ways.mean(axis=1, keepdims=True)
             return float(np.mean([(free[:, side] ** 2).mean() for side in sides]))
 
@@ -92,7 +92,7 @@ class FrameMotion:
 
 @dataclass(frozen=True)
 class LostFlips:
-    """Estimate of the flips lost between frames, as shares of all flips that happened."""
+    """Estimate of the flips missed between frames, as fractions of the true number of flips."""
 
     # "none_lost" (every second frame alone would lose no flip), "estimate"; or why there is no number:
     # "rounding" (the file's digits may have made what thinning loses), "open" (too wide a range fits)
@@ -109,13 +109,13 @@ class LostFlips:
 def lost_flips(
     found: Strides, motion: FrameMotion | None = None, flux: Any = None, reach: float = math.nan
 ) -> LostFlips | None:
-    """Estimate the flips lost between frames; return None with fewer than three strides, or without flips.
+    """Estimate the flips missed between frames; None if there are fewer than three strides, or no flips.
 
     Args:
-        found: flips that remain at each stride.
+        found: number of flips found at each stride.
         motion: motion of the atoms that form pairs.
-        flux: number of crossings by velocities, "crossed", and the share that is "lost"; None without any.
-        reach: distance of the threshold, in length units, if there is one.
+        flux: number of crossings by velocities, "crossed", and the fraction that is "lost"; or None.
+        reach: threshold distance, in length units; nan if there is none.
     """
     if len(found.stride) < 3 or tuple(found.stride[:3]) != (1, 2, 4) or not found.of.all():
         return None
@@ -147,7 +147,7 @@ def lost_flips(
 
 
 def _of_motion(motion: FrameMotion, reach: float, bound: float) -> dict[str, Estimate]:
-    """Return the estimate by persistence and, if there are velocities, the estimate by velocities."""
+    """Return the persistence estimate and, if there are velocities, the velocity estimate."""
     taken, few = -np.diff(np.log(motion.growth)), 1 / math.sqrt(motion.atoms)
     found = {"persistence": _carried_on(taken, np.hypot((_LAW["persistence"] + few) * taken, _LEAST))}
     if math.isfinite(motion.moved):
@@ -171,7 +171,7 @@ def _of_thinning(found: Strides) -> Estimate:
 
 
 def _carried_on(taken: Float[np.ndarray, "doublings"], error: Float[np.ndarray, "doublings"]) -> Estimate:
-    """Return the loss at stride 1, averaged over the laws that reproduce the loss at each doubling."""
+    """Return the estimated loss at stride 1, averaged over the laws that fit the losses at larger strides."""
     misfit = sum(((law - one) / off) ** 2 for law, one, off in zip(_TAKEN, taken, error, strict=False))
     weight = np.exp(np.min(misfit) / 2 - misfit / 2 - _RARE)
     mean = float(np.average(_LOST, weights=weight))
