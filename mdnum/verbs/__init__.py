@@ -1,8 +1,8 @@
-"""The verbs, one module each; their functions are the functions of `mdnum`.
+"""Commands of mdnum (called verbs), one module each; they are also functions of the package `mdnum`.
 
 Each verb is declared in its module (see `mdnum.verbs.frame`) and in the text file of the same name;
-`__init__.toml` explains the tables of text files. No other file lists commands and folders. The module of a
-verb is imported only when the verb is used.
+`__init__.toml` explains the tables in text files. Commands and kinds of folders are listed in no other file.
+The module of a verb is imported when the verb is first used.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ PARTIAL, UNDECIDED = "partial", "undecided"
 
 @dataclass(frozen=True)
 class Reply:
-    """Result of a command that is printed immediately; the command makes no folder."""
+    """Result of a command that prints its result and makes no folder."""
 
     document: Mapping[str, Any]  # for JSON
     # for people: lines, findings, and tables of a title, columns and rows, or of a title and records
@@ -67,10 +67,10 @@ class Reply:
 
 
 def assigned(text: str, example: str) -> tuple[str, str]:
-    """Split "key=value" into key and value.
+    """Split the text "key=value" into key and value.
 
     Raises:
-        InputError: the text is not of the form key=value; `example`, an option and its value, is shown.
+        InputError: the text is not of the form key=value; the message shows `example`.
     """
     key, equals, value = (part.strip() for part in text.partition("="))
     if not equals or not key:
@@ -80,16 +80,16 @@ def assigned(text: str, example: str) -> tuple[str, str]:
 
 
 def declared(name: str) -> Mapping[str, Any]:
-    """Return the text file of an entry of `VERBS`.
+    """Return the content of the text file that belongs to an entry of `VERBS`.
 
     Raises:
-        InputError: the package that adds the entry has no text file.
+        InputError: the package that adds the entry to `VERBS` has no text file.
     """
     return beside(_file(name))
 
 
 def home(kind: str) -> str:
-    """Return the entry of `VERBS` that declares a kind of folder.
+    """Return the name of the verb, an entry of `VERBS`, whose text file declares a kind of folder.
 
     Raises:
         InputError: no installed verb declares the kind.
@@ -108,7 +108,7 @@ def home(kind: str) -> str:
 
 
 def schema(kind: str) -> dict[str, Any]:
-    """Return the JSON Schema for a kind of document: mdnum's, that of the kind's package, or answer.json.
+    """Return the JSON Schema of a kind of document; the schema of answer.json if the kind has no schema.
 
     Raises:
         InputError: no installed verb makes such documents.
@@ -123,7 +123,7 @@ def schema(kind: str) -> dict[str, Any]:
 
 
 def _file(name: str) -> str:
-    """Return the file of a module, found without importing the module or its packages."""
+    """Return the path of a module's file without importing the module or its packages."""
     first, *rest = VERBS.place(name).split(".")
     spec = importlib.util.find_spec(first)
     places = [] if spec is None else spec.submodule_search_locations or [str(Path(str(spec.origin)).parent)]

@@ -1,8 +1,8 @@
 """`mdnum audit`: tests of whether an ASE calculator is safe to run and to differentiate.
 
 The checks of `mdnum.audit.checks.CHECKS` run in order, and each result is saved in the folder at once. If an
-audit is interrupted, its results so far are in the folder and the remaining checks can be done later. A check
-returns codes and values; the corresponding sentences are in audit.toml.
+audit is interrupted, the completed results are in the folder, and the remaining checks can be run later. A
+check returns codes and values; audit.toml contains the sentences for these codes.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ def audit(
 ) -> Outcome:
     """Test whether a calculator is safe to run and to differentiate.
 
-    The effort is limited by the number of calls, independent of the calculator's speed: about 6,000 calls for
-    one element, and at most 12,000. Calls that lead to a verdict come first. If an audit is interrupted, the
-    completed checks are in its folder.
+    The number of calls of the calculator is limited, independent of its speed: about 6,000 calls for one
+    element, and at most 12,000. Calls that are needed for a verdict come first. If an audit is interrupted,
+    the results of the completed checks are in its folder.
 
     Example:
         >>> mdnum.audit_calculator(ase.calculators.emt.EMT(), "copper.xyz").verdict
@@ -147,7 +147,7 @@ def _ask_all(
     report: bool,
     progress: Progress | None,
 ) -> Outcome:
-    """Run the checks that are not done, save each result, and finish the folder."""
+    """Run the remaining checks, save the result of each check, and write summary and report of the folder."""
     from mdnum.audit.subject import CalculatorSubject
     from mdnum.audit.thresholds import find_thresholds
     from mdnum.deadline import interrupting
@@ -220,9 +220,9 @@ def _ask_all(
 def answer_of(
     check: AuditCheck, subject: CalculatorSubject, log: frame.Progress, before: Iterable[CheckResult]
 ) -> CheckResult:
-    """Return a check's result; a failure of the calculator that ends the check is returned as a finding.
+    """Run a check and return its result; if the calculator fails, the result contains a finding about it.
 
-    A finding is added if the calculator gave two results for one input, unless an earlier result has it.
+    If the calculator gave two different results for the same input, a finding is added (once in an audit).
     """
     named: dict[str, Any] = {"name": check.name, "title": check.title}
     rest = f"the rest of {check.name}"
@@ -243,7 +243,7 @@ def answer_of(
 
 
 def _keep_evidence(folder: RunFolder, loaded: LoadedCalculator, check: AuditCheck) -> None:
-    """Write structures that reproduce a finding to the last bit, and a script that shows it without mdnum."""
+    """Write structures that reproduce a finding bit for bit, and a script that needs no mdnum to do so."""
     from mdnum.audit.record import STRUCTURES, script
 
     _write_structures(folder, check.structures)
@@ -288,7 +288,7 @@ def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
 
 
 def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: Path) -> LoadedCalculator:
-    """Return the calculator with which an audit that is resumed was started."""
+    """Return the calculator of an audit that is resumed; raise an error if a different one was given."""
     if calculator is None and not state.named:
         raise InputError(
             "the calculator of this audit was an object without a name",
@@ -318,7 +318,7 @@ def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator, d
 
 
 def _internal(timestep: float | None, given: units.Units) -> float | None:
-    """Convert a time step from fs (τ for reduced units) to length * sqrt(mass / energy)."""
+    """Convert a time step from fs (τ for reduced units) to the unit length * sqrt(mass / energy)."""
     if timestep is None:
         return None
     if not timestep > 0:
@@ -332,7 +332,7 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
 
 
 def _summary(state: AuditState) -> dict[str, Any]:
-    """Return the content of summary.json, except the verdict."""
+    """Return the content of an audit's summary.json, except the verdict."""
     atoms, given = state.atoms, units.get(state.units)
     texts, said = Texts(__file__, given), conclusion.answers(state.shown, state.checks)
     why = state.why or "not finished"
@@ -367,7 +367,7 @@ def _summary(state: AuditState) -> dict[str, Any]:
 
 
 def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
-    """Return the points of the figures and the data that checks recorded."""
+    """Return the audit's tables: the points of its figures, and the data recorded by its checks."""
     lines = [
         (result.name, f"{result.name}-{place}", label, chart.x, values)
         for result in state.shown
@@ -383,7 +383,7 @@ def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _named(value: Any, given: units.Units) -> Any:
-    """Return the values of a check, with the names of units in place of placeholders."""
+    """Return the values of a check after replacing placeholders by the names of units."""
     if isinstance(value, units.Measured):
         return value.to("", vars(given))
     if isinstance(value, str):
@@ -401,7 +401,7 @@ def _named(value: Any, given: units.Units) -> Any:
 
 
 def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]]:
-    """Group findings as (finding, findings that may follow from it)."""
+    """Group findings by cause: pairs of a finding and a list of the findings that it may explain."""
     above = heads([(one.code, one.severity) for one in found])
     return [
         (one, [other for k, other in enumerate(found) if k != place and above[k] == place])
@@ -411,7 +411,7 @@ def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]
 
 
 def _finding(one: Observed, section: str, cause: str, texts: Texts = TEXTS) -> Finding:
-    """Return the sentences of a finding; a check of another package provides its own sentences."""
+    """Return a finding with its sentences; a check of another package provides its own sentences."""
     if one.code not in TEXTS.entries:
         given = {name: str(one.values.get(name, "")) for name in ("title", "text", "remedy")}
         return Finding(one.code, one.severity, **given, values=one.values, section=section, cause=cause)
@@ -424,20 +424,20 @@ def _finding(one: Observed, section: str, cause: str, texts: Texts = TEXTS) -> F
 
 @dataclass(frozen=True)
 class AuditView(View):
-    """View of an audit's folder."""
+    """Read access to the folder of an audit."""
 
     given: AuditState | None = None  # what it has found, where that is known; it is read otherwise
 
     @cached_property
     def state(self) -> AuditState:
-        """State of the audit, with the results of its checks."""
+        """State of the audit, including the results of its checks."""
         from mdnum.audit.record import kept
 
         return kept(self.folder) if self.given is None else self.given
 
 
 def _judge(view: AuditView) -> Verdict:
-    """Return the findings, errors first, and the conclusions on both questions in one sentence."""
+    """Return findings, errors first, and a headline: is the calculator safe to run and to differentiate?"""
     state = view.state
     given, titles, more = units.get(state.units), {}, conclusion.concluded(state.shown)
     texts, observed = Texts(__file__, given), []
@@ -459,7 +459,7 @@ def _judge(view: AuditView) -> Verdict:
 
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
-    """State both conclusions, the checks that these lack, and the most severe finding."""
+    """Return the headline of an audit: both conclusions, missing checks, and the most severe finding."""
     shown, early = state.shown, conclusion.to_come(state.shown, state.checks)
     said, begun = conclusion.answers(shown, state.checks), {one.name for one in shown}
     name = TEXTS("on", name=state.name, formula=state.atoms.get_chemical_formula())
@@ -542,7 +542,7 @@ def _ways(part: Mapping[str, Any]) -> str:
 
 
 def _marked(rows: Sequence[Mapping[str, Any]], title: str) -> Any:
-    """Format a table with the rows of failed tests at the top."""
+    """Format a table of tests, with the rows of failed tests at the top."""
     order = sorted(rows, key=lambda row: not any(value is False for value in row.values()))
     bad = frozenset(n for n, row in enumerate(order) if any(value is False for value in row.values()))
     return replace(records(order, title, shown=8), bad=bad)

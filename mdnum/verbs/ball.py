@@ -1,4 +1,4 @@
-"""`mdnum ball` as a function: bouncing balls, their variants and gradients, with verdict and report."""
+"""`mdnum ball` as a function: simulation of bouncing balls, with variants, gradients, verdict and report."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def bounce(
     against: Sequence[str | Mapping[str, Any]] = (),
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Simulate a bouncing ball and its variants, record every contact and solver stop, and write a report.
+    """Simulate a bouncing ball and its variants, record contacts and solver stops, and write a report.
 
     Example:
         >>> mdnum.bounce("ball/drop", against=["precision.state=float32"])
@@ -70,10 +70,10 @@ def bounce(
 
 
 def command(system: str | None = None, *, demo: str | None = None, **given: Any) -> Outcome | Reply:
-    """Execute `mdnum ball`: run a ball or a demonstration; without a name, list what is available.
+    """Execute `mdnum ball`: simulate a ball or run a demonstration; list both kinds if no name is given.
 
     Raises:
-        InputError: a demonstration is combined with options of a ball.
+        InputError: a demonstration was requested together with options of a ball.
     """
     from mdnum import systems
     from mdnum.verbs import demos
@@ -115,7 +115,7 @@ def _loaded(
 
 
 def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun, float | None]:
-    """Return the run, and the steps per second after compilation (None for a short run)."""
+    """Run a ball; return the run and its steps per second after compilation (None for a short run)."""
     marks: list[tuple[float, int]] = []
 
     def rate() -> float | None:
@@ -143,7 +143,7 @@ def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun,
 def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return loss, derivatives, closed-form result and variants; and the separations of the variants."""
+    """Return loss, derivatives, closed form and variants for the summary, and a table of separations."""
     from mdnum.ball.rollout import first_difference
     from mdnum.verbs import ball_record
 
@@ -172,7 +172,7 @@ def _differentiated(
 
 
 def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dict[str, Any]]:
-    """Return each requested derivative as a plain mapping.
+    """Return the derivatives by each requested method, one mapping of plain values per method.
 
     Args:
         asked: the [gradient] table.
@@ -199,7 +199,7 @@ def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dic
 
 
 def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
-    """Return the loss: if possible, the value computed with a derivative of the program itself."""
+    """Return the loss, as computed by a method that differentiates the unchanged program, if there is one."""
     same = ("unrolled", "frozen", "event-aware")
     known = [made["value"] for made in gradient if made["method"] in same and not made["refused"]]
     return known[0] if known else problem.value()
@@ -209,7 +209,7 @@ def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
 
 
 def judge(view: BallView) -> Verdict:
-    """Return findings and evidence for a correct run, from the folder alone."""
+    """Return findings on a ball's run, and evidence that the run is correct, from its folder alone."""
     summary = view.summary
     rules = (
         _finite, _ledger, _finite_gradient, _independent, _ambiguous, _cap, _disagree, _forks, _iterations,
@@ -250,7 +250,7 @@ def _evidence(view: BallView, codes: set[str]) -> Iterator[str]:
 
 
 def differs(first: float | None, second: float | None) -> bool:
-    """True if two derivatives differ by more than one percent of the larger, or if only one is missing."""
+    """True if two derivatives differ by more than one percent of the larger, or if one of the two is None."""
     if first is None or second is None:
         return first is not second
     return abs(first - second) > _DISAGREE * max(abs(first), abs(second))
@@ -410,7 +410,7 @@ def _iterations(view: BallView) -> Iterator[Finding]:
 
 
 def _remarks(view: BallView) -> Iterator[Finding]:
-    """Yield remarks on valid settings in the system file that were probably not intended."""
+    """Yield findings on settings of the system file that are valid but probably not intended."""
     from pydantic import ValidationError
 
     from mdnum.systems.ball import BallSpec, remarks

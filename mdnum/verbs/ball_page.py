@@ -1,4 +1,4 @@
-"""Report page of a ball's run: heights, solver, margins, derivatives, and every decision."""
+"""Report page of a ball's run: heights, solver, margins, derivatives, contacts and stop decisions."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _REASONS = ("", "none", "tolerance", "cap", "fixed", "not finite", "rest")
 
 
 class BallView(View):
-    """View of the folder of a ball's run."""
+    """Read access to the folder of a ball's run."""
 
     @property
     def applied(self) -> list[Mapping[str, Any]]:
-        """Derivatives by method; methods that are not applicable are left out."""
+        """Derivatives by each method that is applicable."""
         return [made for made in self.summary["gradient"] if not made["refused"]]
 
     @property
     def exact(self) -> Mapping[str, Any]:
-        """Quantities known in closed form; empty if no quantity is."""
+        """Quantities of the run that are known in closed form; empty if there are none."""
         return self.summary["exact"] or {}
 
     @property
@@ -47,21 +47,21 @@ class BallView(View):
 
     @property
     def located(self) -> bool:
-        """True if impacts are located within a step; counts are then of impacts, not of iterations."""
+        """True if impacts are located within a step; the solver's counts are then impacts, not iterations."""
         return self.summary["integrator"] == "event-located"
 
     def first_step(self, reason: str) -> int:
-        """Return the first step whose solve ended for the given reason."""
+        """Return the first step at which the solver stopped for the given reason."""
         series = self.table("steps")
         return int(series["step"][np.argmax(series["reason"].astype(str) == reason)])
 
     def time(self, step: np.ndarray) -> np.ndarray:
-        """Return the times of steps, s."""
+        """Return the times of given steps, s."""
         return np.interp(step, self.table("steps")["step"], self.table("steps")["time"])
 
     @cached_property
     def ratio(self) -> np.ndarray:
-        """|margin| of each contact flip in units of its rounding bound."""
+        """Absolute margin of each contact flip, divided by the rounding bound of the margin."""
         return margins_in_bounds(self.table("contacts"))
 
 
@@ -70,7 +70,7 @@ def decision(variant: Mapping[str, Any]) -> str:
 
 
 def page(view: BallView, verdict: Verdict) -> Page:
-    """Return the page: heights, solver, margins, derivatives, closed form, variants, and every decision."""
+    """Return the report page of a ball's run, with a section for each subject that has data."""
     summary = view.summary
     about = TEXTS(
         "about", balls=summary["balls"], steps=summary["steps"], contact=summary["contact_kind"],
@@ -99,7 +99,7 @@ def page(view: BallView, verdict: Verdict) -> Page:
 
 
 def _groups(x: np.ndarray, y: np.ndarray, *groups: tuple[np.ndarray, str, Role]) -> tuple[Series, ...]:
-    """Return the points of each group as a set, if any point of the group is finite."""
+    """Split points (x, y) into groups, and return one data series for each group with any finite y."""
     return tuple(
         Series(label, x[mine], y[mine], "points", role)
         for mine, label, role in groups
@@ -146,7 +146,7 @@ def _nearest(view: BallView) -> Iterator[Plot]:
 
 
 def _ranges(view: BallView) -> Iterator[Any]:
-    """Yield the range of magnitudes of each quantity, and the steps at which a narrower format would fail."""
+    """Yield a table of each quantity's range of magnitudes, and the first steps outside narrower formats."""
     table = range_table(lambda name: TEXTS(f"range_{name}"), view.table("steps"))
     if table.rows:
         yield table
@@ -291,7 +291,7 @@ def _variants(view: BallView) -> Iterator[Any]:
 
 
 def _contacts(view: BallView) -> Iterator[Any]:
-    """Yield the contact flips nearest to the threshold, ordered by step."""
+    """Yield a table of the contact flips with the smallest margins, ordered by step."""
     rows, ratio = view.table("contacts"), view.ratio
     if not len(ratio):
         yield TEXTS("no_contacts")
@@ -303,7 +303,7 @@ def _contacts(view: BallView) -> Iterator[Any]:
 
 
 def _stop_decisions(view: BallView) -> Iterator[Any]:
-    """Yield the stop decisions nearest to their tolerance, ordered by step."""
+    """Yield a table of the solver's stop decisions with the smallest margins, ordered by step."""
     rows = view.table("solver")
     if not len(rows["step"]):
         return

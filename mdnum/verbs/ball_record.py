@@ -1,4 +1,4 @@
-"""Content of the folder of a ball's run: tables of all decisions, a summary, and the closed-form result."""
+"""Content of the folder of a ball's run: tables of decisions, a summary, and errors from the closed form."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _WORST = (Reason.NONE, Reason.FIXED, Reason.TOLERANCE, Reason.REST, Reason.CAP, 
 
 
 def tables(run: BallRun) -> dict[str, dict[str, np.ndarray]]:
-    """Return the rows of every table."""
+    """Return all tables of a ball's run, by name."""
     made = {"steps": steps(run), "contacts": contacts(run), "solver": decisions(run)}
     return made | ({"heights": heights(run)} if run.kept else {})
 
 
 def steps(run: BallRun) -> dict[str, np.ndarray]:
-    """One row per state 0..steps: contacts, flips, how the solver ended, margins, mean height and energy."""
+    """Return a table with one row per step: contacts, flips, stop reasons, margins, mean height, energy."""
     entered, left = run.contacts.counts(run.steps)
     inside = run.contact.sum(axis=1)
     first = inside[0] - entered[1] + left[1]
@@ -52,7 +52,7 @@ def steps(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def ranges(run: BallRun) -> dict[str, np.ndarray]:
-    """Largest and smallest magnitude, at each step, of the state, of the penetration and of its penalty."""
+    """Largest and smallest magnitude of heights, velocities, depths and penalty forces at each step."""
     if not run.kept:
         return {}
     y, v = run.y.astype(np.float64), run.v.astype(np.float64)
@@ -64,7 +64,7 @@ def ranges(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def contacts(run: BallRun) -> dict[str, np.ndarray]:
-    """Return one row per contact flip."""
+    """Return a table with one row per contact flip (begin or end of a contact)."""
     flips = run.contacts
     lift = 0.0 if run.world.lift is None else float(run.world.lift)
     return {
@@ -75,10 +75,10 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
-    """Return one row per stop decision, for the steps that had something to solve.
+    """Return a table with one row per stop decision of the solver, for all steps that required a solve.
 
-    All decisions are included if one rule stops all balls and histories were kept; otherwise, only the last
-    two decisions of each solve.
+    All decisions are included if all balls stop together and the histories of residuals were kept; otherwise,
+    only the last two decisions of each solve are included.
     """
     rule = rule_of(run)
     if rule is None:
@@ -130,7 +130,7 @@ def _histories(run: BallRun, rule: Any, busy: np.ndarray) -> dict[str, np.ndarra
 
 
 def heights(run: BallRun) -> dict[str, np.ndarray]:
-    """Return height and velocity of the first balls at every step."""
+    """Return a table of height and velocity, at every step, of the first `FOLLOWED` balls."""
     count = min(run.balls, FOLLOWED)
     shape = (run.steps + 1, count)
     return {
@@ -142,7 +142,7 @@ def heights(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
-    """Return one row per step: the separation between the heights of a variant and those of the run."""
+    """Return a table with one row per step: the separation in height between a variant and the run."""
     size = len(found.separation)
     return {"variant": np.full(size, name), "step": np.arange(size), "separation": found.separation}
 
@@ -151,7 +151,7 @@ def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
 
 
 def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
-    """Return the numbers that summarize the run."""
+    """Return the content of summary.json of a ball's run: sizes, counts, margins and status."""
     spec = simulation.system.spec
     entered = int(run.contacts.entered.sum())
     busy = solved(run)
@@ -182,10 +182,10 @@ def compared(
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Return where a variant diverges from the run, and how the loss and its gradient differ.
+    """Return the step and the decision at which a variant diverges, and the changes of its gradient.
 
     Args:
-        found: where the variant diverges from the run.
+        found: the difference between the two runs.
         other: the run of the variant.
         gradient, theirs: derivatives of the run and of the variant; those by the first method come first.
     """
@@ -204,13 +204,13 @@ def compared(
 
 
 def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Return errors relative to the closed form, or None if there is none.
+    """Return the run's deviations from the closed form, or None if no closed form exists.
 
     A closed form exists for a ball above the floor under a constant downward acceleration, with an impact or
     a projection (the ball with restitution) or a sharp penalty (the ball on a spring).
 
     Args:
-        gradient: derivatives, of which those of the final height are compared.
+        gradient: derivatives by each method; they are compared if the loss is a height.
     """
     spec, contact = system.spec, system.spec.contact
     pull = spec.flight.gravity
@@ -266,7 +266,7 @@ def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]
 
 
 def rule_of(run: BallRun) -> Any:
-    """Return the stopping rule of this run's solver, or None if nothing is solved."""
+    """Return the stopping rule of this run's solver, or None if the run has no solver."""
     contact = run.world.contact
     if isinstance(contact, Projection):
         return contact.stop
@@ -274,7 +274,7 @@ def rule_of(run: BallRun) -> Any:
 
 
 def solved(run: BallRun) -> np.ndarray:
-    """True for each step (and ball, if each has its own solve) with something to solve or locate."""
+    """True for each step (and each ball, if balls are solved separately) at which the solver was needed."""
     if rule_of(run) is None:
         return run.reason != Reason.NONE.value
     if isinstance(run.world.contact, Penalty):
@@ -284,12 +284,12 @@ def solved(run: BallRun) -> np.ndarray:
 
 
 def ambiguous_flips(run: BallRun) -> np.ndarray:
-    """Select contact flips whose step depends on rounding, which the step of an exact height does not."""
+    """True for contact flips whose step may depend on rounding (flips with a bound of zero are exact)."""
     return run.contacts.ambiguous & (run.contacts.bound > 0)
 
 
 def ambiguous_stops(run: BallRun) -> np.ndarray:
-    """Count the stop decisions of each step that depend on the order of summation of the residual."""
+    """Count, for each step, the stop decisions that may depend on the summation order of the residual."""
     rule = rule_of(run)
     if rule is None or isinstance(rule, FixedCount):
         return np.zeros(run.steps, np.int64)
@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step; for separate residuals, of the ball nearest to tolerance."""
+    """Residual and stop margin of each step; with one residual per ball, those of the smallest margin."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

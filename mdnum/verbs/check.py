@@ -1,4 +1,4 @@
-"""`mdnum check`: comparison of a system with ASE and with other neighbor searches, printed immediately."""
+"""`mdnum check`: comparison of a system's energies, pairs or dynamics with other codes; makes no folder."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _FAST = 0.1
 
 @dataclass(frozen=True)
 class Checked:
-    """Result of a comparison with other codes."""
+    """Result of a comparison of a system with other codes."""
 
     report: Any  # what was compared, with `ok` and rows for people
     verdict: Verdict  # its findings
@@ -44,7 +44,7 @@ class Checked:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Summary of the comparison for JSON."""
+        """Summary of the comparison, for the command's JSON output."""
         worst = {"worst": self.report.worst} if hasattr(self.report, "worst") else {}
         head = {"status": "complete" if self.report.ok else "failed", "seconds": self.seconds}
         found = {**head, "ok": self.report.ok, **vars(self.report), **worst}
@@ -52,7 +52,7 @@ class Checked:
 
 
 def check(question: str, system: Simulation | System | str | Path, *, allow_code: bool = False) -> Checked:
-    """Compare the energies, pairs or dynamics of a system with those of other codes.
+    """Compare the energies, the pairs or the dynamics of a system with results of other codes.
 
     Example:
         >>> mdnum.check("energy", "argon/liquid-864").report.ok
@@ -89,7 +89,7 @@ def check(question: str, system: Simulation | System | str | Path, *, allow_code
 def _replied(
     question: str, system: str, overrides: Mapping[str, str] | None = None, allow_code: bool = False
 ) -> Reply:
-    """Execute `mdnum check energy SYSTEM`, or the check of pairs or dynamics."""
+    """Execute `mdnum check energy SYSTEM`, `mdnum check pairs SYSTEM` or `mdnum check dynamics SYSTEM`."""
     from mdnum.systems import load
 
     loaded: Any = load(system, overrides, world="md")
@@ -103,7 +103,7 @@ energy, pairs, dynamics = (partial(_replied, question) for question in ("energy"
 
 
 def structure_findings(system: System) -> Iterator[Finding]:
-    """Yield findings on a structure's temperature, velocities and size that its author may not expect."""
+    """Yield findings on properties of a structure that its author may not expect, such as its temperature."""
     atoms = system.atoms
     frame = Frame(0, 0.0, atoms.positions, Box(np.asarray(atoms.cell), np.asarray(atoms.pbc)))
     if (far := far_out(frame)) is not None:
@@ -129,10 +129,10 @@ def structure_findings(system: System) -> Iterator[Finding]:
 
 
 def temperature_findings(start: float, requested: float, atoms: int, unit: str) -> Iterator[Finding]:
-    """Yield a warning if the temperature of the velocities differs greatly from the requested one.
+    """Yield a warning if the temperature of the velocities differs greatly from the requested temperature.
 
-    No warning is given for a crystal, which loses half of its kinetic energy at first, or for a difference
-    within the statistical scatter of few atoms.
+    A factor of up to three gives no warning: a crystal at rest loses half of its kinetic energy at first. For
+    few atoms, a difference within the statistical scatter gives no warning.
     """
     ratio = start / requested if requested > 0 else 1.0
     if 1 / _OTHER <= ratio <= _OTHER or abs(ratio - 1) <= 5 * math.sqrt(2 / (3 * atoms)):
@@ -143,7 +143,7 @@ def temperature_findings(start: float, requested: float, atoms: int, unit: str) 
 
 
 def would_show(report: Any, units: Units) -> Iterator[str]:
-    """Yield the difference between two evaluations, and the smallest difference that would be reported."""
+    """Yield sentences on the difference from other codes, with the smallest difference that is an error."""
     from mdnum.references.energy_check import FORCE, ROUNDINGS
 
     if frames := getattr(report, "frames", ()):
@@ -158,7 +158,7 @@ def would_show(report: Any, units: Units) -> Iterator[str]:
 
 
 def energy_findings(report: EnergyReport) -> Iterator[Finding]:
-    """Yield findings of a comparison of energies, forces and stresses with a reference."""
+    """Yield findings from a comparison of energies, forces and stresses with a reference."""
     from mdnum.references.ase_models import ENERGY, ITSELF
     from mdnum.references.energy_check import LAMMPS
 
@@ -184,7 +184,7 @@ def energy_findings(report: EnergyReport) -> Iterator[Finding]:
 
 
 def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
-    """Yield findings of the comparison of a trajectory with one that ASE computes."""
+    """Yield findings from a comparison of a trajectory with a trajectory computed by ASE."""
     if not report.ok:
         yield TEXTS.finding(
             "DYNAMICS_DIFFER", *["sudden"] * (report.sudden is not None), steps=len(report.position) - 1,
@@ -195,7 +195,7 @@ def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
 
 
 def pair_findings(report: PairsReport) -> Iterator[Finding]:
-    """Yield findings of a comparison of pair sets from several neighbor searches."""
+    """Yield findings from a comparison of the pair sets that several neighbor searches return."""
     for one in report.results:
         if one.verdict in ("differs", "failed"):
             code = "PAIRS_DIFFER" if one.verdict == "differs" else "SEARCH_FAILED"

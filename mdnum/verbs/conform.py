@@ -46,7 +46,7 @@ _RETURNS = "(i, j), (i, j, shift), (i, j, shift, distance) or a mapping with i a
 
 @dataclass(frozen=True)
 class Options:
-    """Options with which an examination was started."""
+    """Options of an examination (a test of a neighbor list), fixed when the examination starts."""
 
     cases: Annotated[int, Ge(0), Le(MOST_CASES)]
     seed: int = 0
@@ -76,7 +76,7 @@ class Options:
 
 @dataclass
 class Examination(CaseAnswers):
-    """Content of answers.json, from which an examination is resumed."""
+    """State of an examination, stored in answers.json so that an interrupted examination can be resumed."""
 
     word: str = field(kw_only=True)  # what names the list; empty where it has no name
     tested: tuple[str, str | None] = field(kw_only=True)  # name and version of the list
@@ -101,9 +101,9 @@ def conform(
     report: bool = True,
     progress: Wanted = None,
 ) -> Outcome:
-    """Test a neighbor list with the conformance suite.
+    """Test a neighbor list with the conformance suite: does the list contain the right pairs?
 
-    Results are saved in the folder as they arrive: an interrupted examination can be continued with `resume`.
+    Each result is saved at once, so that an interrupted examination can be continued with `resume`.
 
     Example:
         >>> mdnum.conform("vesin", time=60)
@@ -192,7 +192,7 @@ def conform(
             return summary_of(found, _write_scripts(folder, found), options.seed)
 
         def saved(urgent: bool) -> None:
-            """Save a result; write scripts and summary at intervals."""
+            """Save the latest result; write scripts and summary at intervals."""
             nonlocal due
             kept.save(urgent)
             if (now := monotonic()) >= due:
@@ -225,7 +225,7 @@ def conform(
 
 
 def command(pairs: str | None = None, *, resume: Path | None = None, **given: Any) -> Outcome | Reply:
-    """Execute `mdnum conform`; without a neighbor list, show the known ones."""
+    """Execute `mdnum conform`; if no neighbor list is given, print the names of known neighbor lists."""
     from mdnum.references.conformance.peers import known
 
     if pairs is not None or resume is not None:
@@ -241,12 +241,12 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
 
 
 def _script(code: str) -> str:
-    """Return the end of the file name of a failure's script."""
+    """Return the suffix of the name of a script that reproduces a failure with the given code."""
     return f"{code.lower().replace('_', '-')}.py"
 
 
 def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
-    """Write a script for each failure, remove mdnum's obsolete scripts, and return the names."""
+    """Write a script that reproduces each failure, remove obsolete scripts, and return the file names."""
     from mdnum.references.conformance.reproduction import script
 
     scripts = []
@@ -267,7 +267,7 @@ def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
 
 
 def summary_of(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
-    """Return the content of summary.json except the verdict; `scripts` are names, one for each failure."""
+    """Return summary.json of an examination without the verdict; `scripts`: one file name per failure."""
     tested = found.tested
     own = ("superset", "found_out", "keeps_order", "shifts", "aliased", "questions", "left", "breadth",
            "running", "padding", "asked", "wrong", "conforms", "seconds")  # fmt: skip
@@ -320,7 +320,7 @@ def summary_of(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
 
 
 def _cases(summary: Mapping[str, Any], code: str) -> int:
-    """Return the number of cases whose worst failure has the given code."""
+    """Return the number of test cases whose most severe failure has the given code."""
     return sum(row["codes"].get(code, 0) for row in summary["areas"])
 
 
@@ -329,7 +329,7 @@ def _total(summary: Mapping[str, Any], name: str) -> int:
 
 
 def judge(view: View) -> Verdict:
-    """Return headline, evidence and findings of an examination, from its folder alone."""
+    """Return the headline, evidence and findings of a neighbor list's examination, from its folder alone."""
     summary = view.summary
     asked, wrong, left = summary["asked"], summary["wrong"], summary["left"]
     silent = {code.lower(): _cases(summary, code) for code in SILENT}
@@ -382,7 +382,7 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield a finding for each code of the failures, below the finding that may be its cause."""
+    """Yield one finding per failure code; each finding names another finding that may be its cause."""
     by_code: dict[str, list[Mapping[str, Any]]] = {}
     for row in summary["failures"]:
         by_code.setdefault(row["code"], []).append(row)
@@ -414,7 +414,7 @@ def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
-    """Yield findings on properties of the list that are not errors."""
+    """Yield findings on properties of the neighbor list that are not errors, such as its precision."""
     ties = summary["ties"]
     if ties["counted"] and ties["not_counted"]:
         yield TEXTS.finding("TIES", **ties)
@@ -448,7 +448,7 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Return the remaining content of the page."""
+    """Return the report page of an examination: results by subject, failures, and the list's conventions."""
     summary = view.summary
     wrong, kinds = summary["wrong"] - summary["silent"], len(summary["failures"])
     totals = {name: _total(summary, name) for name in ("passed", "skipped")}
@@ -481,7 +481,7 @@ def page(view: View, verdict: Verdict) -> Page:
 
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
-    """Yield tables with one row per area: for single searches, and for lists that are updated in a run."""
+    """Yield tables with one row per subject: for lists built once, and for lists updated in a run."""
     columns: dict[str, Any] = {
         "area": "area", "tested": "asked", "right": "passed",
         "wrong": lambda row: row["failed"] - row["silent"] or None,
@@ -524,7 +524,7 @@ def _figure(summary: Mapping[str, Any]) -> Figure:
 
 
 def _conventions(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return rows that describe the conventions of the neighbor list."""
+    """Return table rows that describe the conventions of the neighbor list."""
     more = "pairs of its skin" if summary["kept"] else "pairs beyond the cutoff"
     ties = {name: pairs_of or None for name, pairs_of in summary["ties"].items()}
     inside = "counts as inside (r ≤ r_cut)" if ties["counted"] else "does not count (r < r_cut)"

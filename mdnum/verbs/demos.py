@@ -1,7 +1,7 @@
-"""`mdnum ball --demo` as a function: classic effects, shown within seconds, with numbers as proof.
+"""`mdnum ball --demo` as a function: short demonstrations of numerical effects, each with tested claims.
 
-A demonstration is a script in the folder `demos` next to the systems, `NN_its_name.py`: the first line of the
-script states the subject, and the script's `run()` returns a `Demo`. To add a demonstration, add a file.
+A demonstration is a script `NN_its_name.py` in the folder `demos` next to the shipped systems. The first line
+of the script states the subject, and its function `run()` returns a `Demo`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LISTED = 16
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of a demonstration that was tested while the demonstration ran."""
+    """A statement of a demonstration, with the result of the test of this statement."""
 
     what: str  # the statement, in words
     seen: Any  # the number or word that was found
@@ -43,7 +43,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Demo:
-    """The outcome of one demonstration."""
+    """Result of one demonstration: its texts, numbers, checked claims, tables and plots."""
 
     title: str  # a short heading
     question: str  # what it asks, one sentence
@@ -65,7 +65,7 @@ class Demo:
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
-    """Return a table of a demonstration; the title is the first argument."""
+    """Return a table with a title, for a demonstration."""
     return Table(tuple(columns), rows, title)
 
 

@@ -1,4 +1,4 @@
-"""`mdnum doctor`: tests of whether numbers that are computed on this machine can be trusted."""
+"""`mdnum doctor`: tests of whether this machine computes correct numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mdnum.verbs import Reply
 
 
 def diagnose() -> Reply:
-    """Return the result of each test, and remedies for failures."""
+    """Run all tests of this machine; return the result of each test, with a remedy for each failed test."""
     found = doctor.diagnose()
     rows = [(row.status, row.name, row.seen) for row in found.rows]
     remedies = [f"{row.name}: {row.remedy}" for row in found.rows if row.remedy]

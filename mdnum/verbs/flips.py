@@ -1,4 +1,4 @@
-"""`mdnum flips`: ledger (table) of the flips in any program's trajectory; for two, see flips_compare."""
+"""`mdnum flips`: a table of all flips (pairs entering or leaving a cutoff) in any program's trajectory."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def flips(
     drop_repeats: bool = False,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find the pairs that cross a threshold between the frames of a trajectory, and derive statistics.
+    """Find all pairs that cross a cutoff between frames of a trajectory, and compute contact statistics.
 
     Example:
         >>> mdnum.flips("run.dcd", topology="start.pdb", cutoffs=[8.5])
@@ -158,7 +158,7 @@ def flips(
 
 @dataclass
 class FrameExamination:
-    """Examination of frames, with results in a folder; the frames come from a file or from a `Recorder`."""
+    """A trajectory that is being examined frame by frame, with the output folder for the results."""
 
     answer: Answer  # its folder takes what follows from the tables, when all frames were examined
     rows: HeldRows  # to be handed over to the folder by then
@@ -172,7 +172,7 @@ def examining(
     opened: Trajectory, asked: tuple[Rule, ...], between: tuple[str, str] | None, window: int,
     live: bool = False, hydrogens: bool | None = None, **keep: Unpack[Keep],
 ) -> Iterator[FrameExamination]:  # fmt: skip
-    """Context manager for a new folder, whose tables are filled inside the block; arguments as for `flips`.
+    """Context manager: make an output folder and examine frames inside the block; arguments as for `flips`.
 
     Args:
         live: whether frames come from a running program. Frame numbers are then time steps, with no decisions
@@ -255,10 +255,10 @@ def rules(
     nearest: int | Sequence[int] = (),
     most: int | None = None,
 ) -> tuple[Rule, ...]:
-    """Return the requested membership rules, in this order; arguments as for `flips`.
+    """Return the rules that decide which pairs are neighbors: cutoffs, cutoffs by species, nearest neighbors.
 
     Raises:
-        InputError: a value is not understood, a rule is repeated, or `most` is given without a cutoff.
+        InputError: a value is not a valid rule, a rule is repeated, or `most` is given without a cutoff.
     """
     from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, SpeciesCutoffs
 
@@ -280,12 +280,12 @@ def rules(
 
 
 def _listed(given: Any) -> tuple[Any, ...]:
-    """Return a tuple of rule values from a single value or several."""
+    """Return a tuple of the given values; a single value becomes a tuple of one."""
     return (given,) if isinstance(given, str | Real | Mapping) else tuple(given)
 
 
 def _species_cutoffs(words: _Pairs) -> Mapping[Any, float]:
-    """Parse lengths by pair of species from "O-H=2.5,O-O=3.5", or from {"O-H": 2.5} as in system files."""
+    """Parse cutoffs by pair of species, given as "O-H=2.5,O-O=3.5" or as {"O-H": 2.5}."""
     if isinstance(words, Mapping):
         if all(isinstance(pair, tuple) and len(pair) == 2 for pair in words):
             return words
@@ -309,7 +309,7 @@ def _species_cutoffs(words: _Pairs) -> Mapping[Any, float]:
 
 
 def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
-    """Return the cutoff of the mdnum run that made the file, as recorded in the run's folder."""
+    """Return the cutoff of the mdnum run that wrote the trajectory, from the folder of this run."""
     radius = None
     # no run of mdnum's
     with suppress(OSError, MdnumError, AttributeError):
@@ -323,7 +323,7 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
 
 
 def _refuse_topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
-    """Raise an error for the order "TOPOLOGY TRAJECTORY", which other programs use."""
+    """Raise an error if a topology is given before the trajectory, which is the order in other programs."""
     from mdnum.trajectories.readers import IN_MEMORY, open_trajectory
 
     for one in (first, second):
@@ -348,7 +348,7 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
 def _with_other_box(
     trajectory: Trajectory, frame: Any, found: Pass, of: Groups | ByResidue
 ) -> dict[str, Any] | None:
-    """Count each rule's pairs in a frame if another plausible box is used; None if there is no other box."""
+    """Count the pairs of a frame in another box that is also plausible; None if there is no such box."""
     from mdnum.trajectories.tracker import Tracker
 
     if (other := trajectory.other_box(frame.index)) is None:
@@ -365,7 +365,7 @@ def _with_other_box(
 
 
 def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
-    """True if reading stopped at an incomplete frame that, as far as is known, is the last of the file."""
+    """True if reading stopped at an incomplete frame at the end of the file (as far as its end is known)."""
     from mdnum.reading import UnreadableFrame
 
     if not isinstance(error, UnreadableFrame):
@@ -376,7 +376,7 @@ def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
 
 
 def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str, Any]:
-    """Summarize the times of the frames: interval, uniformity, and whether simulations produce such times."""
+    """Summarize the times of the frames: interval, uniformity, missing frames, and implausible values."""
     timed = trajectory.time != "frame"
     times = frames["time"][frames["rule"] == 0]
     steps = np.diff(times)
@@ -401,7 +401,7 @@ def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str
 
 
 def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
-    """Find missing frames if most intervals are equal and the rest are integer multiples; else None."""
+    """Find missing frames from the times; None unless all intervals are multiples of the usual interval."""
     steps = np.diff(times)
     usual = float(np.median(steps)) if len(steps) else 0.0
     ratio = steps / usual if usual > 0 else np.ones_like(steps)
@@ -419,10 +419,10 @@ def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
-    """Yield (part, parts, history of some of the pairs) until every pair of a rule is included.
+    """Yield the flips of a rule as histories of pairs, in parts: (number of the part, parts, history).
 
-    The ledger is ordered by frame and may be larger than memory; a part contains all flips of its pairs. The
-    ledger is read once for each group of parts that fit into memory together.
+    The table of flips is ordered by frame and may be larger than memory. Each part contains all flips of some
+    of the pairs. The table is read once for each group of parts that fit into memory together.
     """
     from mdnum.trajectories.history import History
 
@@ -430,7 +430,7 @@ def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, 
     parts = max(1, -(-sum(stream.flushed for stream in streams.values()) // _PART_ROWS))
 
     def columns(name: str, wanted: range, kinds: list[str]) -> Iterator[dict[str, np.ndarray]]:
-        """Yield the columns of one part after another."""
+        """Yield the columns of a table for each part in turn."""
         found: list[list[dict[str, np.ndarray]]] = [[] for _ in wanted]
         names, stream = ["rule", *kinds], streams[name]
         for batch in chain([stream.read(names, rows=0)], stream.batches(names)):
@@ -464,7 +464,7 @@ def _rule_told(
     motion: FrameMotion | None,
     log: Progress,
 ) -> dict[str, Any]:
-    """Return the statistics of one rule's ledger, computed pair by pair; write its tables to the folder."""
+    """Return statistics of all flips of one rule, computed pair by pair, and write tables to the folder."""
     from mdnum.trajectories.residues import Occupancy, contacts_over_time
     from mdnum.trajectories.statistics import Labels, Statistics
 
@@ -543,7 +543,7 @@ def _rule_told(
 def _counted(
     total: Statistics, motion: FrameMotion | None, flux: Mapping[str, Any] | None, reach: float | None
 ) -> dict[str, Any]:
-    """Return statistics as plain values, durations in frames; with `reach`, lost flips are estimated."""
+    """Return contact statistics as plain values, in frames; if `reach` is given, also estimate lost flips."""
     from mdnum.trajectories.lost import lost_flips
     from mdnum.trajectories.statistics import Lifetime
 
@@ -570,9 +570,9 @@ def _counted(
 
 
 def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
-    """Name atoms as "GLY 12 CA" (or by atom name if there are no residues), and residues as "GLY 12".
+    """Return names of atoms such as "GLY 12 CA" (or "CA" if there are no residues), of residues "GLY 12".
 
-    If there are several segments, the name begins with the segment: "A GLY 12".
+    If there are several segments, each name begins with the name of the segment: "A GLY 12".
     """
     several = len(set(table.segments.tolist())) > 1
     columns = (table.segments, table.residue_names, table.residue_ids, table.names)
@@ -584,7 +584,7 @@ def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:
-    """Order two classes of atoms like the two selections, if only one order is consistent with these."""
+    """Swap the two classes of atoms in a row if only the swapped order matches the two selections."""
     if groups[0] is None or groups[1] is None:
         return row
     first, second = ({classes.names[at] for at in np.unique(classes.of[group])} for group in groups)
@@ -595,7 +595,7 @@ def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str
 
 
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
-    """Estimate the rate of crossings, as if observed continuously, from velocities; and the rate of flips."""
+    """Estimate the rate of cutoff crossings from velocities, and compare with the rate of observed flips."""
     duration = steps["last_time"] - steps["first_time"]
     if not one.flux or not steps["timed"] or not duration > 0 or found.odd is not None:
         return None

@@ -38,7 +38,7 @@ def compare(
     between: tuple[str, str] | None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find where two trajectories diverge; see `mdnum.verbs.flips.flips`.
+    """Find the frame at which two trajectories of the same atoms diverge; see `mdnum.verbs.flips.flips`.
 
     Raises:
         InputError: the trajectories do not contain the same atoms.
@@ -102,7 +102,7 @@ def compare(
 
 
 def _alike(a: Trajectory, b: Trajectory) -> bool:
-    """True if the atoms of two files may be the same: species agree as far as the files contain them."""
+    """True if two files may contain the same atoms: species agree as far as the files contain species."""
     first, second = ([str(one) for one in file.species] for file in (a, b))
     if not (a.table.named and b.table.named) or first == second:
         return True
@@ -116,28 +116,28 @@ def _alike(a: Trajectory, b: Trajectory) -> bool:
 
 
 class ComparisonView(FlipsView):
-    """View of the folder of a comparison, with the values that sentences about the comparison need."""
+    """Read access to the folder of a comparison of two trajectories, with values for its sentences."""
 
     @property
     def certain(self) -> bool:
-        """True if any difference exceeds the resolution of the two files."""
+        """True if any difference between the trajectories exceeds the resolution of the files."""
         certain = any(one["certain"] is not None for one in self.summary["rules"])
         return certain or any(self.summary[name] is not None for name in ("beyond", "other_box"))
 
     @property
     def differ(self) -> bool:
-        """True if any neighbor sets differ, and any difference exceeds the resolution."""
+        """True if neighbor sets differ, and a difference between the trajectories exceeds the resolution."""
         return self.certain and any(one["first"] is not None for one in self.summary["rules"])
 
     @property
     def largest(self) -> tuple[str, str]:
-        """(largest separation at any frame, the separation that resolution explains at this frame)."""
+        """Largest separation of an atom in any frame, and the part of it that rounding explains."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
 
     def frame(self, at: int | None) -> str:
-        """Name a frame by its place in the comparison and, if different, by its numbers in the files."""
+        """Format a frame number: its index in the comparison and, if different, its numbers in both files."""
         if at is None:
             return "no frame"
         a, b = (int(self.table("apart")[f"number_{one}"][at]) for one in "ab")
@@ -149,7 +149,7 @@ class ComparisonView(FlipsView):
 
     @property
     def shift(self) -> dict[str, Any]:
-        """Common shift of all atoms: size and vector where it begins, smallest and largest size."""
+        """Common displacement of all atoms: size and vector at its first frame, smallest and largest size."""
         table, at = self.table("apart"), self.summary["shift"]
         vectors = np.stack([table[f"shift_{one}"] for one in "xyz"], axis=1)
         sizes = np.sqrt((vectors**2).sum(axis=1))
@@ -162,13 +162,13 @@ class ComparisonView(FlipsView):
         }  # fmt: skip
 
     def by_boxes(self, first: Mapping[str, Any]) -> bool:
-        """True if the boxes, but not the positions, already differ when the neighbor sets begin to differ."""
+        """True if boxes, but not positions, differ at the first frame at which the neighbor sets differ."""
         boxes, beyond = self.summary["other_box"], self.summary["beyond"]
         same = beyond is None or beyond > first["frame"]
         return boxes is not None and boxes["frame"] <= first["frame"] and same
 
     def values(self, one: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values of one rule for sentences."""
+        """Return the results for one neighbor rule, formatted for sentences."""
         first = one["first"] or {}
         return {
             "rule": self.rule(one), "frames": self.summary["frames"], "pairs": first.get("pairs", 0),
@@ -183,12 +183,12 @@ class ComparisonView(FlipsView):
 
 
 def judge(view: ComparisonView) -> Verdict:
-    """Return headline, evidence and findings of a comparison."""
+    """Return the headline, evidence and findings of a comparison of two trajectories."""
     return conclude(_findings(view), _evidence(view), headline=_headline(view))
 
 
 def _headline(view: ComparisonView) -> str:
-    """Return the verdict on the first rule and, if there are more rules, a sentence on each of them."""
+    """Return the verdict on the first neighbor rule, followed by a sentence on each further rule."""
     first, *others = view.summary["rules"]
     text = TEXTS(f"head_{_head(view, first)}", **view.values(first))
     if view.summary["shift"] is not None:
@@ -220,7 +220,7 @@ def _in_short(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _evidence(view: ComparisonView) -> Iterator[str]:
-    """Yield evidence from the frames: positions, neighbor sets of the first rule, and notes on others."""
+    """Yield sentences on differences of positions and neighbor sets, and on what differed first."""
     summary, (one, *others) = view.summary, view.summary["rules"]
     seed, beyond, first, values = summary["seed"], summary["beyond"], one["first"], view.values(one)
     if seed is not None:
@@ -248,14 +248,14 @@ def _evidence(view: ComparisonView) -> Iterator[str]:
 
 
 def _certain(one: Mapping[str, Any]) -> str:
-    """Classify from when on the neighbor sets differ by more than rounding in the files explains."""
+    """Classify when neighbor sets differ by more than rounding: at the first difference, later, or never."""
     if one["first"]["pairs"] > one["first"]["ambiguous"]:
         return "some"
     return "never" if one["certain"] is None else "later"
 
 
 def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
-    """Classify whether positions differed before the neighbor sets did."""
+    """Classify what differed first: positions, boxes or neighbor sets."""
     at, beyond, certain = one["first"]["frame"], view.summary["beyond"], one["certain"]
     if beyond is not None and beyond < at:
         return "positions"
@@ -269,7 +269,7 @@ def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _leap(view: ComparisonView, first: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a sentence if the separation grows faster once the sets differ than it did before."""
+    """Yield a sentence on whether the separation grows faster after the neighbor sets differ than before."""
     table, at = view.table("apart"), int(first["frame"])
     furthest = table["furthest"]
     # a difference that has just begun grows fast, whatever began it
@@ -396,7 +396,7 @@ def _first_pairs(view: ComparisonView) -> Iterator[Table]:
 def _plot(
     view: ComparisonView, name: str, lines: Mapping[str, tuple[np.ndarray, Any]], unit: str = ""
 ) -> Plot:
-    """Return a figure with lines along the frames, each with a role; reference lines are dashed."""
+    """Return a figure of quantities along the frames, each with a role; reference lines are dashed."""
     table, summary = view.table("apart"), view.summary
     timed = summary["timed"] and bool(np.all(np.diff(table["time"]) > 0))
     x = table["time"] if timed else table["frame"]

@@ -1,4 +1,4 @@
-"""Statistics and findings on the neighbor lists and energies that a simulation loop records."""
+"""Statistics and findings on neighbor lists and energies that a user's simulation loop recorded."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _POINTS = 2_000
 
 
 def loop_told(folder: RunFolder) -> dict[str, Any]:
-    """Return statistics of a program's own neighbor lists and energy; None for data not recorded."""
+    """Return statistics of a loop's neighbor lists and energy; None for quantities that were not recorded."""
     loop = folder.read("loop")
     return {"lists": _lists_told(loop, folder), "energy": _energy_told(loop, folder)}
 
@@ -53,7 +53,7 @@ def _lists_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, 
 
 
 def _energy_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, Any] | None:
-    """Return statistics of the energy, and the share of its changes that coincides with flips."""
+    """Return statistics of the recorded energy, and the fraction of its variance that flips explain."""
     energy = loop["energy"]
     if len(energy) < 4 or not np.isfinite(energy).all():
         return None
@@ -81,7 +81,7 @@ def _energy_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str,
 def findings(
     view: FlipsView, lists: Mapping[str, Any] | None, energy: Mapping[str, Any] | None
 ) -> Iterator[Finding]:
-    """Yield findings on lost pairs, list overflow and the energy."""
+    """Yield findings on pairs missing from neighbor lists, on list overflow, and on energy jumps."""
     if lists and (worst := lists["worst"]) is not None:
         values = {"pair": f"{worst['i']}–{worst['j']}", "missed": worst["frames"]}
         again, deepest = ["again"] * (lists["times"] > lists["lost"]), view.length(worst["deepest"])
@@ -98,7 +98,7 @@ def findings(
 
 
 def sections(view: FlipsView) -> Iterator[Section]:
-    """Yield sections on neighbor lists and energy, if the loop recorded them."""
+    """Yield sections on the neighbor lists and on the energy, if the loop recorded these data."""
     rows, energy = view.table("loop"), view.summary.get("energy")
     some = slice(None, None, -(-len(rows["number"]) // _POINTS) or 1)
     drawn = {"lists": {"pairs lost": rows["lost"].astype(float)}, "energy": {"energy": rows["energy"]}}

@@ -1,4 +1,4 @@
-"""Findings, sections and figures on the flips of a trajectory, and their limits, from the folder alone."""
+"""Findings, sections and figures on the flips of a trajectory, made from the output folder alone."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Limit = tuple[str, tuple[str, ...], dict[str, Any]]
 
 
 def judge(view: FlipsView) -> Verdict:
-    """Return headline, evidence and findings of a trajectory."""
+    """Return the headline, evidence and findings on the flips of a trajectory."""
     if view.summary["status"] == "unfinished":
         return flips_loop.unfinished(view)
     told = (view.summary.get(name) for name in ("lists", "energy"))
@@ -105,7 +105,7 @@ def _ended(view: FlipsView) -> Iterator[Finding]:
 
 
 def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
-    """Return the frames whose number of pairs is not the previous number + entered - left."""
+    """Return the frames at which the number of pairs is not the previous number + entered - left."""
     table = view.table("frames")
     rows = table["rule"] == place
     net = (table["entered"][rows] - table["left"][rows])[1:]
@@ -113,7 +113,7 @@ def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
 
 
 def _of_rules(view: FlipsView) -> Iterator[Finding]:
-    """Yield one finding for each code: sentences on several rules are joined, the reason is given once."""
+    """Yield one finding per code, with the sentences on all rules and a single explanation."""
     by_code: dict[str, list[Finding]] = {}
     for place, one in enumerate(view.summary["rules"]):
         for code, variants, values in _limits(view, place, one):
@@ -129,7 +129,7 @@ def _of_rules(view: FlipsView) -> Iterator[Finding]:
 
 
 def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
-    """Yield (code, variants, values) for the limits of one rule's flips."""
+    """Yield the limitations of one rule's flips as (code of a finding, variants of its text, values)."""
     if len(wrong := _disagreeing(view, place)):
         yield "EVENT_ALGEBRA", (), {"first": int(wrong[0]) + 1, "frames": len(wrong)}
     flips, frames = one["flips"], view.summary["frames"]
@@ -165,7 +165,7 @@ def _undecided(one: Rule) -> Iterator[Limit]:
 
 
 def _far_apart(one: Rule) -> bool:
-    """True if half of the contacts that begin have ended by the next frame."""
+    """True if frames are too far apart: half of the new contacts have ended by the next frame."""
     return one["flips"] >= FEW and one["lifetime"]["median"] == 1
 
 
@@ -249,7 +249,7 @@ def _others(view: FlipsView) -> Iterator[Finding]:
 
 
 def _time_goes_back(view: FlipsView) -> Finding:
-    """Return the finding on frames at which time decreases, and on frames with times of earlier frames."""
+    """Return a finding on frames at which time decreases or repeats."""
     rows = view.table("frames")
     numbers, times = (rows[name][rows["rule"] == 0] for name in ("number", "time"))
     told = view.again(view.summary["repeats"].get("again", ()))
@@ -263,12 +263,12 @@ def _time_goes_back(view: FlipsView) -> Finding:
 
 
 def _title(title: str, view: FlipsView, one: Rule) -> str:
-    """Return the title of a section about a rule; the rule is named if there are several."""
+    """Return the title of a section about a rule; the title contains the rule if there are several rules."""
     return f"{title}, {view.rule(one)}" if len(view.summary["rules"]) > 1 else title
 
 
 def page(view: FlipsView, verdict: Verdict) -> Page:
-    """Return the page of a trajectory."""
+    """Return the report page on the flips of a trajectory."""
     summary = view.summary
     size = many(summary["atoms"], "atom")
     if summary["status"] == "unfinished":
@@ -307,7 +307,7 @@ def _input(view: FlipsView, size: str) -> list[tuple[str, str]]:
 
 
 def _across(view: FlipsView, across: Mapping[str, Any]) -> Section:
-    """Return a section on jumps across the cell's faces, and on diffusion with and without these jumps."""
+    """Return a section on jumps of atoms across cell faces, and on diffusion before and after unwrapping."""
     diffusion, time = across["diffusion"] or {}, view.summary["time"]
     values = {"raw": None, "undone": None, "error": None, **across, **diffusion}
     values["too_far"] = TEXTS("too_far") if across["too_far"] else None
@@ -430,7 +430,7 @@ def _busiest(view: FlipsView) -> Browse | None:
 
 
 def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]:
-    """Yield (title of its section, figure) for each figure of a rule that would not be empty."""
+    """Yield the figures of one rule, each with the title of its section; empty figures are omitted."""
 
     def rows(table: str) -> dict[str, np.ndarray]:
         whole = view.table(table)
@@ -514,7 +514,7 @@ def _lasting(view: FlipsView, place: int) -> Table | None:
 def _maps(
     view: FlipsView, pairs: Mapping[str, np.ndarray], moments: Mapping[str, np.ndarray], x: np.ndarray
 ) -> Iterator[tuple[str, tuple[str, ...], tuple[str, ...], Region]]:
-    """Yield (name, labels along x and y, map) of the contact matrix and of contacts over time."""
+    """Yield two maps with names and axis labels: the contact matrix, and contacts per residue over time."""
     index, first = np.unique(moments["index"], return_index=True)
     if not len(index):
         return

@@ -1,4 +1,4 @@
-"""Functions for the analysis of one trajectory and the comparison of two: summary, and format of numbers."""
+"""Functions shared by `mdnum flips` of one trajectory and of two: summary entries and number formats."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TEXTS = Texts(Path(__file__).with_name("flips.py"))
 
 
 def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
-    """Return the indices of the atoms of both selections."""
+    """Return the atom indices of both selections (None for all atoms)."""
     from mdnum.trajectories.selection import select
 
     first, second = (None, None) if between is None else (select(trajectory, one) for one in between)
@@ -40,20 +40,20 @@ def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
 
 
 def stem(trajectory: Trajectory) -> str:
-    """Return the stem of a folder's name; for a run's trajectory, the name of the run's folder."""
+    """Return the stem of the output folder's name: that of the trajectory file, or the name of its run."""
     name = trajectory.path.name.split(".")[0]
     return trajectory.path.resolve().parent.name if name == "trajectory" else name
 
 
 def name_of(trajectory: Trajectory) -> str:
-    """Return the name of a file for a page; for a run's trajectory, the name of the run's folder."""
+    """Return the name of a trajectory for a page: its file name, or the folder of the mdnum run."""
     own = trajectory.path.name == "trajectory.traj"
     name = trajectory.path.resolve().parent.name if own else trajectory.path.name
     return f"{name}@{trajectory.slice_words}" if trajectory.slice_words else name
 
 
 def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None) -> dict[str, Any]:
-    """Return the entries of summary.json that describe a file."""
+    """Return the entries of summary.json that describe a trajectory file."""
     return {
         "world": "flips", "question": question, "system": name_of(trajectory), "file": str(trajectory.path),
         **{name: getattr(trajectory, name) for name in ("format", "reader", "atoms", "length", "time")},
@@ -63,7 +63,7 @@ def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None
 
 
 def in_python(text: str) -> str:
-    """Replace options of the command in a sentence by their Python equivalents: cutoffs=R, array[:9]."""
+    """Replace command-line options in a sentence by their Python equivalents: cutoffs=R, array[:9]."""
 
     def named(option: re.Match[str]) -> str:
         name = {"cutoff": "cutoffs"}.get(option[1], option[1].replace("-", "_"))
@@ -76,7 +76,7 @@ def in_python(text: str) -> str:
 
 @contextmanager
 def as_python(in_memory: bool) -> Iterator[None]:
-    """In errors on arrays, replace command-line options by names of arguments."""
+    """Replace command-line options in error messages by Python arguments, if the frames were arrays."""
     try:
         yield
     except InputError as error:
@@ -86,7 +86,7 @@ def as_python(in_memory: bool) -> Iterator[None]:
 
 
 def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = False) -> dict[str, Any]:
-    """Return the entries of summary.json that describe how reading ended."""
+    """Return the entries of summary.json on whether all frames were read, and on the error if not."""
     told = None if stopped is None else str(stopped)
     return {
         "stopped": in_python(told) if told and in_memory else told,
@@ -96,7 +96,7 @@ def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = Fals
 
 
 class HeldRows:
-    """Buffer of rows of a folder's tables, which are written for many frames together."""
+    """Buffer of table rows, which are written to the output folder for many frames together."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         units = {"length": trajectory.length, "decision": trajectory.length, "time": trajectory.time}
@@ -107,14 +107,14 @@ class HeldRows:
         self._count = self.flips = 0
 
     def add(self, table: str, columns: dict[str, np.ndarray]) -> None:
-        """Add rows as columns of equal length."""
+        """Add rows to a table, given as columns of equal length."""
         self.held.setdefault(table, []).append(columns)
         rows = len(next(iter(columns.values())))
         self._count += rows + _PART
         self.flips += rows * (table == "flips")
 
     def drain(self, folder: RunFolder, passes: Iterator[Any], found: Any, of: int, log: Progress) -> bool:
-        """Read frames until the end, or until control-C is pressed; return True in the latter case.
+        """Read frames until the end or until control-C is pressed; return whether control-C was pressed.
 
         Args:
             passes: iterator with one item per frame, which adds rows.
@@ -138,7 +138,7 @@ class HeldRows:
         return self._count > _ROWS_HELD
 
     def hand_over(self, folder: RunFolder) -> None:
-        """Append the rows to their tables."""
+        """Append all buffered rows to the tables of the folder."""
         folder.told = self._told
         for table, parts in self.held.items():
             folder.append(table, together(parts))
@@ -146,11 +146,11 @@ class HeldRows:
 
 
 class FlipsView(View):
-    """View of a folder of flips, with formatted numbers: frames as times, lengths with units."""
+    """Read access to a folder of flips, with formatted numbers: frames as times, lengths with units."""
 
     @property
     def timed(self) -> bool:
-        """True if frames have times."""
+        """True if the frames have usable times."""
         return bool(self.summary["timed"] and self.summary["interval"])
 
     @property
@@ -174,7 +174,7 @@ class FlipsView(View):
         return " and ".join(f"“{one}”" for one in self.summary["between"] or ()) or None
 
     def time(self, text: str) -> str:
-        """Append the unit of time to a number; only steps have a plural."""
+        """Append the unit of time to a number; only the unit "step" has a plural."""
         unit = self.summary["time"]
         return f"{text} {unit}{'s' if unit == 'step' and text not in ('1', '1.00', '1.0') else ''}"
 
@@ -187,10 +187,10 @@ class FlipsView(View):
         return f"{plain(frames, digits)} frame{'' if frames == 1 else 's'}"
 
     def life(self, one: Mapping[str, Any], name: str = "median", of: str = "lifetime") -> str:
-        """Format a contact lifetime: its value, a bound if there is one, or the reason why there is no value.
+        """Format a contact lifetime: its value, a bound, or the reason why no lifetime is known.
 
-        If half of the contacts have ended by the next frame, all lifetimes are upper bounds, because pairs
-        crossed the threshold several times between frames.
+        If the median lifetime is one frame, all lifetimes are upper bounds, because pairs crossed the cutoff
+        several times between frames.
         """
         life = one[of]
         if not one["pairs_most"]:
@@ -216,12 +216,12 @@ class FlipsView(View):
         return f"{number(value)} {self.unit}".rstrip()
 
     def rule(self, one: Mapping[str, Any]) -> str:
-        """Format a rule with its unit: r < 8.5 Å."""
+        """Format a rule with its unit, such as "r < 8.5 Å"."""
         name = one["rule"]
         return f"{name} {self.unit}" if self.unit and "<" in name and "most" not in name else name
 
     def box(self, box: Mapping[str, Any]) -> str:
-        """Format a box: lengths, angles unless they are right angles, and periodic axes."""
+        """Format a box: its lengths, its angles unless all are 90°, and its periodic axes."""
         matrix, axes = np.array(box["matrix"]), repeating(box)
         if not axes:
             return "no box that repeats"
@@ -235,7 +235,7 @@ class FlipsView(View):
         return f"{text}, repeating along {listed(axes)}"
 
     def repeated(self, repeats: Mapping[str, Any] | None, file: str = "") -> Iterator[Finding]:
-        """Yield the finding on frames that repeat earlier ones, if any; `file` names one of two files."""
+        """Yield a finding if frames repeat earlier frames; `file` names the file in a comparison of two."""
         again = repeats.get("again", ()) if repeats else ()
         if again and repeats and repeats["dropped"]:
             total = sum(one["frames"] for one in again)
@@ -256,20 +256,20 @@ class FlipsView(View):
         yield TEXTS.finding("REPEATED_FRAMES", *variants, ranges=listed(told), **values)
 
     def again(self, again: Sequence[Mapping[str, Any]]) -> list[str]:
-        """Return phrases on the frames that have the times of earlier frames."""
+        """Return a phrase for each stretch of frames whose times repeat the times of earlier frames."""
         kinds = ["one" if one["first"] == one["last"] else "many" for one in again[:_RANGES]]
         times = [{"time": plain(one["time"], 9), "to": self.time(plain(one["to"], 9))} for one in again]
         return [TEXTS(f"again_{kind}", **{**again[k], **times[k]}) for k, kind in enumerate(kinds)]
 
     def axis(self, rows: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray]:
-        """Return (label, values) of an axis along the trajectory."""
+        """Return the label and the values of an axis along the trajectory: times or frame numbers."""
         if self.timed:
             return f"time ({self.summary['time']})", rows["time"]
         return "frame", rows["frame"]
 
 
 def average(mean: float) -> str:
-    """Format a mean of integers with enough digits that rounding keeps it within their range."""
+    """Format a mean of integers: four digits, or the nearest integer for 1000 and more."""
     return count(round(mean)) if mean >= 1000 else number(mean, 4)
 
 
@@ -279,7 +279,7 @@ def repeating(box: Mapping[str, Any]) -> list[str]:
 
 
 def resolution(kept: Mapping[str, Any], length: str) -> str:
-    """Return a phrase on the resolution of a file's positions."""
+    """Return a phrase on the resolution (rounding) of the positions in a trajectory file."""
     code = kept["kind"]
     if not kept["told"]:
         code = "usual" if kept["step"] else "unknown"

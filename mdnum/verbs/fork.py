@@ -1,7 +1,7 @@
-"""`mdnum fork`: where two runs that differ in one choice diverge, and whether a flip is the cause.
+"""`mdnum fork`: the step at which two runs that differ in one choice diverge, and the cause.
 
-For molecular dynamics and for a ball, `fork` varies one choice and `fork_screen` every choice; `fork_folders`
-compares or replays two finished runs. `fork_benign` compares ensembles.
+For molecular dynamics and for a ball, `fork` varies one numerical choice and `fork_screen` each choice in
+turn; `fork_folders` compares or replays two finished runs. `fork_benign` compares ensembles of runs.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def fork(
     pin: str | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system and its twin that differs in one choice, and find where and why they diverge.
+    """Run a system twice, with a difference in one choice, and find the step and the cause of divergence.
 
     Example:
         >>> mdnum.fork("argon/crystal-108", "precision.force=float32", steps=500)
@@ -121,7 +121,7 @@ def fork(
 
 
 def _asked_by_default(system: Any) -> Mapping[str, Any]:
-    """Return the options in the [fork] table of a system file: vary, steps and split."""
+    """Return the default options from the [fork] table of a system file: vary, steps and split."""
     from mdnum.systems.load import world_of
 
     if world_of(system) == "md":
@@ -133,9 +133,9 @@ def _asked_by_default(system: Any) -> Mapping[str, Any]:
 def fork_screen(
     system: Simulation | System | BallSystem | str | Path, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Run each choice without imposed decisions, and rank the choices by the step at which the runs fork.
+    """Run a system once per choice, and rank the choices by the step at which decisions first differ.
 
-    For the choices that prove to matter, `fork` also runs counterfactuals (one run's decisions in the other).
+    For a choice that matters, use `fork`: it also runs B with the decisions of A (a counterfactual).
 
     Example:
         >>> mdnum.fork_screen("argon/crystal-108", steps=200)
@@ -173,7 +173,7 @@ def fork_screen(
 def fork_folders(
     a: str | Path, b: str | Path, *, replay: bool = False, objects: Sequence[Simulation] = (), **asked: Any
 ) -> Outcome:
-    """Compare two finished runs of molecular dynamics or of a ball: how they differ, and where they diverge.
+    """Compare two finished runs (molecular dynamics or a ball): their settings, and where they diverge.
 
     Example:
         >>> mdnum.fork_folders("runs/liquid-864", "runs/liquid-864-2")
@@ -238,7 +238,7 @@ def fork_folders(
 def fork_benign(
     system: Simulation | System | str | Path, vary: str, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Test whether a choice changes any measurable quantity: an ensemble-consistency test.
+    """Test whether a choice changes any measured quantity, by an ensemble-consistency test.
 
     Example:
         >>> mdnum.fork_benign("argon/liquid-864", "order")
@@ -265,7 +265,7 @@ def fork_benign(
 
 
 def listed() -> Reply:
-    """Execute `mdnum fork choices`: list the choices that can be varied."""
+    """Execute `mdnum fork choices`: list the numerical choices that can be varied."""
     from mdnum.forks.choices import shipped
 
     document, tables = {}, []
@@ -291,7 +291,7 @@ def _page(view: View, what: str, about: str, keys: Mapping[str, Any], sections: 
 
 
 def page_screen(view: View, verdict: Verdict) -> Page:
-    """Return the page that compares all choices."""
+    """Return the report page that ranks all choices."""
     s, rows, left = view.summary, view.summary["ranking"], view.summary["not_applicable"]
     same = [row["first_bit"] is None for row in rows]
     held = [whole for whole, row in zip(same, rows, strict=True) if row["must_hold"]]
@@ -318,7 +318,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """Draw one line per choice, with marks at the first different bit, at the fork and at the split."""
+    """Draw one line per choice; marks show the steps of the first different bit, fork and split."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (
@@ -342,7 +342,7 @@ def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
 
 
 def page_compare(view: View, verdict: Verdict) -> Page:
-    """Return the page of two finished runs."""
+    """Return the report page of a comparison of two finished runs."""
     s = view.summary
     same = [TEXTS("folders_0_causes")] * (s["world"] != "flips")
     different = [differences(s["differences"])] if s["differences"] else same
@@ -360,7 +360,7 @@ of_pair,
 
 
 def page_benign(view: View, verdict: Verdict) -> Page:
-    """Return the page of an ensemble-consistency test."""
+    """Return the report page of an ensemble-consistency test."""
     s = view.summary
     failing = Table(("feature", "standard deviations"), list(s["failing"].items()))
     names = tuple(f"component {k + 1}" for k in range(s["components"]))

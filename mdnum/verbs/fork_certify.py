@@ -1,4 +1,4 @@
-"""`mdnum fork certify` and `processes`: runs versus exact arithmetic, and variants of one program."""
+"""`mdnum fork certify`: runs versus exact arithmetic; `mdnum fork processes`: variants of one program."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def fork_certify(
     policies: Mapping[str, Any] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find, for each precision, the step at which a run departs from the decisions of exact arithmetic.
+    """Find, for each precision, the first step whose decisions differ from those of exact arithmetic.
 
     Example:
         >>> mdnum.fork_certify("argon/crystal-108", steps=100)
@@ -89,7 +89,7 @@ def fork_certify(
 
 
 def _ranking(answer: Answer) -> list[dict[str, Any]]:
-    """Return the precisions for the summary; write their table and separations from the exact run."""
+    """Return the ranking of precisions for the summary; write it and the separations as tables."""
     ranking, rows, table = answer.result.ranking, [], []
     for row in ranking:
         decision, growth, separation = row.decision, row.growth, row.separation
@@ -111,7 +111,7 @@ def _ranking(answer: Answer) -> list[dict[str, Any]]:
 
 
 def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[str, Any]:
-    """Return the columns of separations of several lines, stacked, with each line's name in a column."""
+    """Stack several named lines into one table, with the columns name, step and separation."""
     return {
         name: np.concatenate([np.full(len(line), key) for key, line in lines.items()]),
         "step": np.concatenate([first + np.arange(len(line)) for line in lines.values()]),
@@ -120,7 +120,7 @@ def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[s
 
 
 def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
-    """Compare each policy's decisions with their rounding bounds; evaluate ambiguous ones exactly too."""
+    """Count the decisions within their rounding bounds for each precision, and evaluate these exactly."""
     from mdnum.forks.certified import certified_horizon
     from mdnum.numerics import PrecisionPolicy
 
@@ -135,7 +135,7 @@ def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
 
 
 def judge_certify(view: View) -> Verdict:
-    """Return the verdict on which precisions keep the exact history, and when the others depart from it."""
+    """Return the verdict: which precisions reproduce all decisions of exact arithmetic, and for how long?"""
     s = view.summary
     rows = [row for row in s["policies"] if row["reason_unavailable"] is None]
     left = [row for row in rows if row["horizon"] is not None]
@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """Yield the gain from double precision in a single role, or the loss from lower precision in a role."""
+    """Yield a sentence for each run with another precision in one role: steps gained or lost."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip
@@ -187,7 +187,7 @@ def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
 
 
 def page_certify(view: View, verdict: Verdict) -> Page:
-    """Return the page of a ranking of precisions."""
+    """Return the report page of a ranking of precisions."""
     s, ball, unit = view.summary, "balls" in view.summary, view.units.length
     rows, ambiguous, steps = s["policies"], s.get("ambiguous") or {}, s["steps"]
     roles = [role for role in ("state", "force", "arithmetic", "decision", "accumulate") if role in rows[0]]
@@ -229,7 +229,7 @@ def page_certify(view: View, verdict: Verdict) -> Page:
 
 
 def _drawn(table: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> tuple[Series, ...]:
-    """Return one line for each selected name of a table of `_lines`."""
+    """Return a data series for each selected line of a table that `_lines` made."""
     names = next(iter(table.values()))
     steps = np.unique(table["step"])
     lines = {label: np.full(len(steps), np.nan) for label in labels.values()}
@@ -240,7 +240,7 @@ def _drawn(table: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> tuple[
 
 
 def _bars(s: Mapping[str, Any], figure: Canvas) -> None:
-    """Draw one bar per precision, whose length is the number of steps with the exact history."""
+    """Draw one bar per precision; its length is the number of steps with exact decisions."""
     axes, rows, last = figure.subplots(), s["policies"], s["steps"]
     place = np.arange(len(rows))[::-1]
     ends = [last if row["horizon"] is None else row["horizon"] for row in rows]
@@ -266,7 +266,7 @@ def fork_processes(
     which: Sequence[Variant] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system jitted, eagerly, in a batch, in a gradient and under XLA flags, and find which runs agree.
+    """Run a system as several programs (jitted, eager, batched, in a gradient, XLA flags); find which agree.
 
     Example:
         >>> mdnum.fork_processes("argon/crystal-108", steps=100)
@@ -281,7 +281,7 @@ def fork_processes(
         an outcome whose result is a `mdnum.forks.processes.Variants`.
 
     Raises:
-        InputError: the system cannot be run, or its potential is a many-body one.
+        InputError: the system cannot be run, or its potential is a many-body potential.
         FolderError: the folder cannot be used.
         MdnumError: none of the variants ran.
     """
@@ -327,7 +327,7 @@ def _cause(code: str, names: Sequence[str] = (), program: str = "", **values: An
 
 
 def judge_processes(view: View) -> Verdict:
-    """Return the verdict: how many different trajectories do the programs of one system compute?"""
+    """Return the verdict: how many different trajectories do the program variants of one system compute?"""
     s = view.summary
     seeds = [row["first_bit"] for row in s["variants"] if row["first_bit"] is not None]
     ran, clusters = len(s["variants"]) - len(s["failed_variants"]), len(s["clusters"])
@@ -343,7 +343,7 @@ def judge_processes(view: View) -> Verdict:
 
 
 def page_processes(view: View, verdict: Verdict) -> Page:
-    """Return the page of a comparison of programs."""
+    """Return the report page of a comparison of program variants."""
     s, length = view.summary, view.units.length
     ran = [row for row in s["variants"] if not row["failed"]]
     seeds = [row["first_bit"] for row in ran if row["first_bit"] is not None]

@@ -1,4 +1,4 @@
-"""`mdnum fork map` and `forecast`: where decisions change along a parameter, and which flip first."""
+"""`mdnum fork map`: parameter values at which decisions change; `fork forecast`: which change first."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ def command(system: str, along: str, **given: Any) -> Outcome:
 
 
 def interval(text: str) -> tuple[str, float, float]:
-    """Split KEY=LOW:HIGH into the key and two numbers.
+    """Split a text KEY=LOW:HIGH into the key and the two ends of the interval.
 
     Raises:
-        InputError: the text is not of this form.
+        InputError: the text is not of the form KEY=LOW:HIGH.
     """
     with suppress(ValueError):
         for key, low, high in _INTERVAL.findall(text):
@@ -153,7 +153,7 @@ def fork_map(
 
 
 def _row(edge: Boundary) -> dict[str, Any]:
-    """Return a boundary as plain values."""
+    """Return a boundary (a parameter value at which a decision changes) as plain values."""
     below, above = edge.below, edge.above
     first, second = [*edge.subject, -1, -1][:2]
     side = "above" if above.decided else "below"
@@ -177,7 +177,7 @@ def _row(edge: Boundary) -> dict[str, Any]:
 
 
 def judge_map(view: View) -> Verdict:
-    """Return the verdict on what changes along a parameter, by how much, and with what certainty."""
+    """Return the verdict on a map: number of boundaries along the parameter, jumps of the loss, certainty."""
     s = view.summary
     edges, left, failed = s["boundaries"], s["unresolved"], s["failed_runs"]
     all_failed = bool(failed) and failed == s["evaluations"]
@@ -223,7 +223,7 @@ def _map_evidence(s: Mapping[str, Any], values: Mapping[str, Any]) -> Iterator[s
 
 
 def page_map(view: View, verdict: Verdict) -> Page:
-    """Return the page of a map."""
+    """Return the report page of a map along a parameter."""
     s, unit, length = view.summary, view.summary["key_unit"], view.units.length
     edges, left = s["boundaries"], s["unresolved"]
     keys = TEXTS.keys("keys_map", **{**s, "n": len(edges), "left": len(left) or None, "length": length})
@@ -262,7 +262,7 @@ def page_map(view: View, verdict: Verdict) -> Page:
 
 
 def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
-    """Yield figures of the loss by piece, of the loss minus its trend if jumps are small, and of jumps."""
+    """Yield figures of the loss along the parameter, of the loss minus its trend, and of its jumps."""
     s, points = view.summary, view.table("points")
     at, loss = points["at"], points["loss"]
     finite = np.isfinite(loss)
@@ -325,7 +325,7 @@ def _with_unit(text: str, unit: str) -> str:
 def fork_forecast(
     system: Simulation | System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Predict which decisions a random displacement of the start would flip first, from one tangent run.
+    """Predict the first decisions that a random displacement of the start changes, from one tangent run.
 
     Example:
         >>> mdnum.fork_forecast("argon/liquid-864", 1e-9)
@@ -373,7 +373,7 @@ def fork_forecast(
 
 
 def judge_forecast(view: View) -> Verdict:
-    """Return the verdict on the first flips expected from a displacement, and the forecast's validity."""
+    """Return the verdict on a forecast: the first decisions expected to change, and the range of validity."""
     s, unit = view.summary, view.units.length
     first, nearest, until, ends = s["first"], s["nearest"], s["until"], s["ends"]
     values = {**s, "unit": unit, "after": until + 1}
@@ -392,7 +392,7 @@ def judge_forecast(view: View) -> Verdict:
 
 
 def page_forecast(view: View, verdict: Verdict) -> Page:
-    """Return the page of a forecast."""
+    """Return the report page of a forecast."""
     s, length, until = view.summary, view.units.length, view.summary["until"]
     first, near = (next(iter(s[name]), None) for name in ("first", "nearest"))
     values = {"first": first, "near": near, "needed": near and abs(near["amplitude"]), "length": length}

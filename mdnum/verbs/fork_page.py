@@ -1,4 +1,4 @@
-"""Report page of a pair of runs, of molecular dynamics or of a ball, from the folder alone."""
+"""Report page of two runs that differ in one choice, made from the output folder alone."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ARROW = 0.5
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Return the page of a pair of runs."""
+    """Return the report page of a pair of runs."""
     s = view.summary
     return view.page(f"{view.name}: {s['choice']}", str(s["difference"]), TEXTS.keys(**_numbers(view)), [
         Section("Separation", list(_separation(view))),
@@ -60,7 +60,7 @@ def page(view: View, verdict: Verdict) -> Page:
 
 
 def _numbers(view: View) -> dict[str, Any]:
-    """Return the key numbers at the top of the page."""
+    """Return the numbers that are shown at the top of the page."""
     s, fits = view.summary, view.summary["r_squared"]
     worth = number(s["e_foldings"])
     if s["e_foldings"] is None and s["effect"] == "cause":
@@ -84,7 +84,7 @@ def _has(table: Mapping[str, np.ndarray], name: str) -> bool:
 
 
 def _separation(view: View) -> Iterator[Plot | str]:
-    """Yield figures of the separation of A from B, with free and with imposed decisions."""
+    """Yield figures of the separation of runs A and B, with own decisions and with imposed decisions."""
     s, table = view.summary, view.table("separation")
     if not _has(table, "free"):
         return
@@ -125,7 +125,7 @@ def _separation(view: View) -> Iterator[Plot | str]:
 
 
 def _decision(view: View) -> Iterator[Any]:
-    """Yield rows on the decision at the fork."""
+    """Yield a table with details of the first decision that differs between the two runs."""
     s, unit = view.summary, view.units.length
     d = s["decision"]
     if d is None:
@@ -159,7 +159,7 @@ def _decision(view: View) -> Iterator[Any]:
 
 
 def _around(view: View) -> Iterator[Any]:
-    """Yield a figure of the atoms around the deciding pair, or of the heights of the deciding ball."""
+    """Yield a figure of the atoms around the pair at the fork, or of the heights of the ball at the fork."""
     d = view.summary["decision"]
     if d is None:
         return
@@ -183,7 +183,7 @@ def _around(view: View) -> Iterator[Any]:
 
 
 def _atoms(view: View, figure: Canvas) -> None:
-    """Draw A and B next to each other, with the pair in the plane and the cutoff around the first atom."""
+    """Draw the atoms of A and of B in two panels; the pair lies in the plane, a circle shows the cutoff."""
     d, table = view.summary["decision"], view.table("neighborhood")
     x, moved = (
         np.stack([table[k] for k in names], axis=1) for names in (("x", "y", "z"), ("dx", "dy", "dz"))
@@ -222,7 +222,7 @@ def _atoms(view: View, figure: Canvas) -> None:
 
 
 def _two_by_two(view: View) -> Iterator[Any]:
-    """Yield the two-by-two table of arithmetic and decisions: splits of each run, effect of each factor."""
+    """Yield the two-by-two table (arithmetic and decisions): split of each run, effect of each factor."""
     s, unit = view.summary, view.units.length
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for cell in s["table"]:
@@ -297,7 +297,7 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
 
 
 def _certain(view: View) -> Iterator[Any]:
-    """Yield how far the decisions are certain, of each run alone and relative to the other run."""
+    """Yield tables and a figure on the steps up to which rounding could not have changed a decision."""
     s, rows = view.summary, []
     for name, step in (s.get("certified_horizon") or {}).items():
         ambiguous, first = s["ambiguous"][name], s["ambiguous_first"][name]
@@ -356,7 +356,7 @@ def _growth(view: View) -> Iterator[Any]:
 
 
 def _after(view: View) -> Iterator[Plot]:
-    """Yield figures of differences at each step: decisions, overridden decisions, energies."""
+    """Yield figures of the numbers of differing and overridden decisions, and of energy differences."""
     s, table = view.summary, view.table("separation")
     step, dates, length = table["step"], _dates(s, "fork", "split"), view.units.length
     named = [("cross", "decisions that differ"), ("overridden", "decisions overridden")]
@@ -375,7 +375,7 @@ def _after(view: View) -> Iterator[Plot]:
 
 
 def _flips(view: View) -> Iterator[Any]:
-    """Yield a searchable table of the first decisions that differ."""
+    """Yield a searchable table of decisions that differ between the runs, earliest first."""
     s, total = view.summary, view.summary["cross_flips"]
     if not total:
         yield TEXTS("no_flips")
@@ -392,7 +392,7 @@ def _flips(view: View) -> Iterator[Any]:
 
 
 def size(view: View) -> list[tuple[str, str]]:
-    """Return rows on the system's name and size."""
+    """Return table rows on the description and the size of the system."""
     s = view.summary
     rows = [("System", str(s["about"]))] if s.get("about") else []
     parts = many(s["balls"], "ball") if "balls" in s else many(s["atoms"], "atom")
@@ -422,7 +422,7 @@ def _what(view: View) -> Iterator[Any]:
 
 
 def differences(rows: Sequence[Sequence[Any]], title: str = "") -> Table:
-    """Return a table of the differences between two runs: key, value in A, value in B."""
+    """Return a table of the settings that differ between two runs: key, value in A, value in B."""
     return Table(("key", "in A", "in B"), [(key, _value(a), _value(b)) for key, a, b in rows], title)
 
 

@@ -1,4 +1,4 @@
-"""Run two simulations that differ in one choice, and write the summary and tables of their folder."""
+"""Run two simulations that differ in one choice, and write the results to an output folder."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MD_ALONE = ("energy_back", "nearest_a", "nearest_b", "ambiguous_a", "ambiguous_
 
 @dataclass(frozen=True)
 class PairQuestion:
-    """Options for a pair of runs; the arguments of `fork`."""
+    """Options for a pair of runs, with the names and meanings of arguments of `fork`."""
 
     steps: int | None = None
     split: float | None = None
@@ -56,7 +56,7 @@ class PairQuestion:
 
 
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
-    """Return the last step: the given one, or else the system's own, but at most `most`.
+    """Return the given last step or, if none is given, the system's own, limited to `most`.
 
     Raises:
         InputError: steps is below 1.
@@ -72,7 +72,7 @@ def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
 def of_md(
     system: Any, overrides: Mapping[str, Any] | None, question: str, pairwise: bool = False
 ) -> Simulation:
-    """Return a simulation of molecular dynamics, or raise an error for a system that is not supported.
+    """Return the simulation of a molecular-dynamics system; raise an error for unsupported systems.
 
     Args:
         question: name in the text keys "ball_<question>", the alternative for a ball, and
@@ -80,7 +80,7 @@ def of_md(
         pairwise: whether only pair potentials are supported.
 
     Raises:
-        InputError: the system is a ball, has an unsupported many-body potential, or is no system.
+        InputError: the argument is a ball or no system, or its many-body potential is not supported.
     """
     from mdnum.systems import BallSystem, opened
 
@@ -94,7 +94,7 @@ def of_md(
 
 
 def basics(system: Simulation | System | BallSystem, steps: int | None) -> dict[str, Any]:
-    """Return the entries on the system that every summary has; steps default to the system's own."""
+    """Return the entries of summary.json on a system: name, size, last step, time step."""
     from mdnum.systems import BallSystem, System
 
     head: dict[str, Any] = {"system": system.name}
@@ -117,7 +117,7 @@ def basics(system: Simulation | System | BallSystem, steps: int | None) -> dict[
 
 
 def check(asked: PairQuestion) -> None:
-    """Raise an error for impossible options before a folder is made."""
+    """Raise an error if options are invalid, before the output folder is made."""
     from mdnum.forks.pair import repeats_asked
 
     expect_at_least(1, steps=1 if asked.steps is None else asked.steps)
@@ -137,7 +137,7 @@ def followed(
     further: Callable[[Fork], dict[str, Any]] = lambda made: {},
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a pair and write a fork folder.
+    """Run a pair of simulations and write an output folder of kind "fork".
 
     Args:
         labels: entries of the summary on the varied choice.
@@ -159,7 +159,7 @@ def followed(
 
 
 def _numbers(made: Fork) -> dict[str, Any]:
-    """Return the summary's numbers for any pair: dates, verdict, growth, the two-by-two table."""
+    """Return summary entries for any pair: steps of divergence, verdict, growth, two-by-two table."""
     step, verdict, growth = made.twin.a.timestep, made.verdict, made.growth["B"]
     dates = {"first_bit": made.dates.first_bit, "fork": made.dates.fork, "split": made.dates.split}
     free, imposed, overridden = (
@@ -204,7 +204,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
 
 
 def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
-    """Return the strain between the boxes: at the end, the largest, and with the separation at each date."""
+    """Return the strain between the boxes of A and B: at the end, at its largest, at fork and split."""
     if "strain" not in made.series:
         return {}
     strain, free = made.series["strain"], made.series["B"]
@@ -217,7 +217,7 @@ def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
-    """Return a fit as a line: separation = exp(intercept + rate * step) between first and last."""
+    """Return the fit separation = exp(intercept + rate * step), with its first and last step."""
     if not np.isfinite(fit.rate):
         return dict.fromkeys(("rate", "r_squared", "first", "last", "intercept"))
     step = np.arange(fit.first, fit.last + 1)
@@ -226,7 +226,7 @@ def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
 
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Predict the split step of runs that have not split, from their own growth or the Lyapunov exponent."""
+    """Predict the step of a split that has not occurred, from observed growth or the Lyapunov exponent."""
     from mdnum.numerics.verdicts import expected
 
     exponent = summary.get("lyapunov")
@@ -251,7 +251,7 @@ def _separation(made: Fork) -> dict[str, Any]:
 
 
 def _decision(made: Fork) -> dict[str, Any] | None:
-    """Return the decision at the fork as plain values."""
+    """Return the first decision that differs between the runs, as plain values."""
     decision = made.decision
     if decision is None:
         return None
@@ -285,7 +285,7 @@ def _decision(made: Fork) -> dict[str, Any] | None:
 
 
 def _of_md(made: Fork, asked: PairQuestion, answer: Answer) -> dict[str, Any]:
-    """Return entries, and add tables, for a pair of molecular-dynamics runs."""
+    """Return summary entries, and add tables, for a pair of molecular-dynamics runs."""
     from mdnum.forks.certified import certified
     from mdnum.forks.replays import neighborhood
 
@@ -335,7 +335,7 @@ def _of_md(made: Fork, asked: PairQuestion, answer: Answer) -> dict[str, Any]:
 
 
 def _of_ball(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
-    """Return entries, and add tables, for a pair of ball runs: differing decisions, the ball at the fork."""
+    """Return summary entries, and add tables of decisions and heights, for a pair of ball runs."""
     names = ("step", "channel", "ball", "a", "b", "margin_a", "margin_b", "bound_a", "bound_b", "run")
     flips = [{name: getattr(flip, name) for name in names} for flip in made.flips]
     tables["cross_flips"] = [
@@ -357,7 +357,7 @@ def _of_ball(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
 
 
 def _exponent(made: Fork) -> dict[str, Any]:
-    """Return the largest Lyapunov exponent of run A and the observed growth, or why there is none."""
+    """Return the largest Lyapunov exponent of run A, or the reason why it is not available."""
     from mdnum.forks.linearized import lyapunov
 
     def why(name: str, **values: Any) -> dict[str, Any]:
@@ -391,7 +391,7 @@ def _exponent(made: Fork) -> dict[str, Any]:
 
 
 def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
-    """Return the result of running B with some of A's decisions imposed, or why this is impossible."""
+    """Run B with one or more decisions of A imposed; return the result, or why this is impossible."""
     from mdnum.forks.replays import parse_pin, pinned
 
     try:
@@ -408,7 +408,7 @@ def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
 
 
 def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
-    """Return the smallest set of decisions that must be overridden, or a reason why there is none."""
+    """Return the smallest set of decisions to override to prevent a split, or why none was found."""
     from mdnum.forks.replays import disagreements, minimal_cause
 
     try:

@@ -1,4 +1,4 @@
-"""Findings on two runs, and the verdict in one sentence, from the folder alone."""
+"""Findings on two runs that diverge, and the verdict in one sentence, from the output folder alone."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RANKING = "Ranking"
 
 
 def subject(s: Mapping[str, Any]) -> str:
-    """Name what differs at the fork: the flip of a pair, the contact of a ball, the stop of a solver."""
+    """Return a phrase for the decision that differs: a pair's flip, a ball's contact or a solver's stop."""
     d = s.get("decision")
     if d is None:
         return ""
@@ -36,13 +36,13 @@ def subject(s: Mapping[str, Any]) -> str:
 
 
 def of_pair(flip: Mapping[str, Any]) -> str:
-    """Name the pair (and the term, if there are several) or the ball of a stored flip."""
+    """Return the label of a stored flip's pair (with its energy term, if there are several) or ball."""
     i, *j = flip["subject"]
     return pair_name({"i": i, "j": j[0], "terms": flip["terms"]}) if j else str(i)
 
 
 def judge(view: View) -> Verdict:
-    """Return the verdict on a pair of runs."""
+    """Return the verdict on a pair of runs: findings, evidence and headline."""
     found = [*_findings(view), *view.kept(TEXTS.entries)]
     name, values = _headline(view)
     best = "info" if view.summary.get("fork") is not None else "good"
@@ -50,7 +50,7 @@ def judge(view: View) -> Verdict:
 
 
 def _headline(view: View) -> tuple[str, dict[str, Any]]:
-    """Return the name of the headline sentence and its values."""
+    """Return the key of the headline's text, and the values for this text."""
     s = view.summary
     failed, word, fork, split = (s.get(name) for name in ("failed", "effect", "fork", "split"))
     values = {name: s.get(name) for name in ("steps", "first_bit", "fork", "split", "predicted_split")}
@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """State how many runs (the pair and its repeats) split later without flips, at each displacement."""
+    """Return a phrase on how many pairs (the first and its repeats) split later if decisions are imposed."""
     said = ""
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -108,13 +108,13 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def decided(decision: Mapping[str, Any]) -> str:
-    """Return the name of the sentence on a decision that differs."""
+    """Return the key of the sentence on a decision that differs."""
     name = "at_start" if decision["run"] == "start" else decision["channel"]
     return f"decided_{name}{'_term' * bool(decision.get('terms'))}"
 
 
 def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
-    """Return which run decided yes and which no, and the decision of each."""
+    """Return the decisions of A and B at the fork, and which of the two runs decided yes and which no."""
     yes = "A" if decision["decided"]["A"] > decision["decided"]["B"] else "B"
     return {"yes": yes, "no": "B" if yes == "A" else "A", "a": decision["decided"]["A"],
             "b": decision["decided"]["B"]}  # fmt: skip
@@ -158,13 +158,13 @@ def _findings(view: View) -> Iterator[Finding]:
 
 
 def must_hold(row: Mapping[str, Any]) -> Finding:
-    """Return the finding that a choice changed a bit although, by design, it cannot."""
+    """Return the finding for a choice that changed bits although it should not change any."""
     values: dict[str, Any] = {name: row.get(name) for name in ("choice", "difference", "first_bit", "fork")}
     return TEXTS.finding("MUST_HOLD_FORKED", *["fork"] * (row.get("fork") is not None), **values)
 
 
 def judge_screen(view: View) -> Verdict:
-    """Return the verdict on all choices: which forks first, and whether the choices that must hold did."""
+    """Return the verdict on all choices: the first to fork, and choices that should change no bit but did."""
     rows, found = view.summary["ranking"], []
     broken = [row for row in rows if row["must_hold"] and row["first_bit"] is not None]
     forked = [row for row in rows if row["fork"] is not None]
@@ -181,7 +181,7 @@ def judge_screen(view: View) -> Verdict:
 
 
 def judge_compare(view: View) -> Verdict:
-    """Return the verdict: where the runs of two folders diverge, and what may be the cause."""
+    """Return the verdict on the runs of two folders: the step of divergence, and its possible causes."""
     summary = view.summary
     causes = summary["causes"]
     values = {name: summary[name] for name in ("steps", "first_bit", "fork")}
@@ -210,7 +210,7 @@ def judge_compare(view: View) -> Verdict:
 
 
 def judge_benign(view: View) -> Verdict:
-    """Return the verdict: do the runs of B belong to the ensemble of A?"""
+    """Return the verdict: are the runs of B consistent with the ensemble of runs of A?"""
     summary = view.summary
     values = {"difference": summary["difference"], "step": summary["window"]}
     if summary["passed"]:

@@ -1,13 +1,13 @@
-"""The common frame of all verbs: a folder is created, filled, judged and shown.
+"""Functions common to all verbs (commands): make an output folder, fill it, judge and show its content.
 
-A verb is a file that reads from top to bottom: its function (options → a filled folder), `judge` (view →
-findings and a headline) and `page` (view → sections), with its sentences in a text file of the same name. It
-is declared once:
+The module of a verb contains its function (options → output folder), `judge` (view of the folder → findings
+and a headline) and `page` (view → sections). Its sentences are in a text file with the name of the module.
+The module declares the verb once:
 
     KINDS = {"flips": Verb(judge, page)}
 
-by the kind of its folders, which its text file declares under [kinds.flips] (see `mdnum.verbs`). All results
-are written to the folder first: judge and page read only the folder, so a page can be rewritten from disk.
+where "flips" is the kind of its folders, declared in the text file under [kinds.flips] (see `mdnum.verbs`).
+The functions judge and page read results only from the folder, so a page can be written again later.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ STEPWISE = 50
 
 @dataclass(frozen=True)
 class View:
-    """Read access to a folder for the findings and sections of its verb."""
+    """Read access to an output folder, from which findings and sections of a page are made."""
 
     folder: RunFolder  # on disk
     summary: dict[str, Any]  # as written, without what was judged
@@ -74,7 +74,7 @@ class View:
 
     @cached_property
     def system(self) -> Mapping[str, Any]:
-        """Tables of the system that was run, empty if there is none."""
+        """Tables of the system file of the system that was run; empty if the folder has no system."""
         return self.folder.system
 
     @cached_property
@@ -84,11 +84,11 @@ class View:
 
     @property
     def took(self) -> tuple[str, str]:
-        """Table row with the duration of the verb."""
+        """Table row with the duration of the computation."""
         return "Took", f"{number(self.summary['seconds'], 2)} s"
 
     def table(self, name: str) -> Mapping[str, np.ndarray]:
-        """Return a table of the folder: arrays by column name."""
+        """Return a table of the output folder, as arrays by column name."""
         if name not in self._tables:
             self._tables[name] = self.folder.read(name)
         return self._tables[name]
@@ -99,7 +99,7 @@ class View:
         return [restore(each) for each in found if each.get("code") not in codes]
 
     def page(self, title: str, about: str, keys: Iterable[Key], sections: Iterable[Section]) -> Page:
-        """Return a page of this folder, with system and provenance; sections without content are omitted."""
+        """Return the report page of this folder, with system and provenance; empty sections are omitted."""
         kept = [section for section in sections if section.parts]
         file = self.folder.system_file
         what = ("", "") if file is None else (file.name, read_text(file))
@@ -108,7 +108,7 @@ class View:
 
 @dataclass(frozen=True)
 class Verb:
-    """Functions that judge and show a kind of folder."""
+    """Functions of a verb that judge and show its kind of output folder."""
 
     judge: Callable[[Any], Verdict]  # findings and headline, from the folder alone
     page: Callable[[Any, Verdict], Page]  # everything else that is shown
@@ -117,7 +117,7 @@ class Verb:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised if control-C is pressed when an answer already exists: `outcome`, stored in its folder."""
+    """Raised if control-C was pressed after results were stored; `outcome` contains these results."""
 
     def __init__(self, outcome: Outcome):
         super().__init__(outcome)
@@ -126,9 +126,9 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether control-C was pressed; a second press interrupts as usual.
+    """Yield a function that returns whether control-C was pressed; a second press raises KeyboardInterrupt.
 
-    Outside the main thread, to which Python does not deliver signals, the function always returns False.
+    Python delivers signals only to the main thread: in other threads the function always returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -148,14 +148,14 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
 
 
 def end_on_sigterm(stack: ExitStack) -> None:
-    """Treat SIGTERM as control-C until a stack is closed, in the main thread, so that results can be kept."""
+    """Treat SIGTERM like control-C until `stack` is closed (main thread only), so that results are stored."""
     if threading.current_thread() is threading.main_thread():
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)
         stack.callback(signal.signal, signal.SIGTERM, before)
 
 
 class Keep(TypedDict, total=False):
-    """Keyword arguments that all verbs on a system have in common."""
+    """Keyword arguments that all functions of `mdnum` that run a system have in common."""
 
     # the new folder; default runs/<verb>-<name>-<n>; "{content}" in it becomes a digest of what is asked, and
     # a folder of that name which is finished is read
@@ -170,14 +170,14 @@ class Keep(TypedDict, total=False):
 
 
 class UnknownKeyword(InputError, TypeError):
-    """Raised for a keyword that a verb does not have; also a TypeError, as Python would raise."""
+    """Raised if a public function gets an unknown keyword argument; a subclass of TypeError."""
 
 
 def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
-    """Wrap a public verb so that an unknown keyword is rejected before anything is read or written.
+    """Wrap a public function so that it rejects unknown keywords before it reads or writes any file.
 
-    Otherwise, keywords passed on as `**keep` would be checked only when the folder is made, after the
-    defaults of misspelled options have been used.
+    Without this check, misspelled keywords in `**keep` would raise an error only when the output folder is
+    made, after the function has used default values instead.
 
     Args:
         more: names of keywords that the verb passes on in addition to those of `Keep`.
@@ -215,10 +215,10 @@ def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
 
 
 def content(verb: str, asked: Mapping[str, Any]) -> str:
-    """Return sixteen hexadecimal digits that identify the arguments of a verb, the same in every process.
+    """Return a digest of the arguments of a verb, 16 hexadecimal digits that are the same in every process.
 
-    A system is identified by its program and structure, independent of its file name; a file by its bytes; a
-    run folder by its manifest; everything else by its value. The version of mdnum is included.
+    The digest covers the content of a system (not its file name), the bytes of a file, the manifest of a run
+    folder, the values of other arguments, and the version of mdnum.
 
     Raises:
         InputError: an argument has no plain value, such as a function.
@@ -252,7 +252,7 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
 
 @dataclass
 class Answer:
-    """Content of a verb's folder while it is being filled."""
+    """An output folder that is being filled, with the summary, tables and result to be stored."""
 
     folder: RunFolder  # that is filled
     log: Progress  # passes progress on and writes it to log.txt
@@ -274,7 +274,7 @@ def answering(
     progress: Progress | None = None,
     allow_code: bool = False,
 ) -> Iterator[Answer]:
-    """Context manager for a new folder; at its end, results and duration are stored, judged and shown.
+    """Context manager for a new output folder; at its end, the results are stored, judged and shown.
 
     Args:
         kind, name, system: as for `new_folder`.
@@ -282,7 +282,7 @@ def answering(
         out, report, progress: see `Keep`; explicit arguments, so that misspelled names raise an error.
 
     Raises:
-        InputError: overrides without a system. FolderError: the folder cannot be used.
+        InputError: overrides were given without a system. FolderError: the folder cannot be used.
     """
     if overrides and system is None:
         raise InputError("overrides apply to a system file, but none was given", remedy="Omit the overrides")
@@ -295,7 +295,7 @@ def answering(
 
 
 def layout(kind: str) -> Layout:
-    """Return the content of a kind of folder, as declared by the verb that makes it.
+    """Return the layout (tables and columns) of a kind of folder, from the text file of its verb.
 
     Raises:
         InputError: no installed verb declares the kind.
@@ -310,7 +310,7 @@ def layout(kind: str) -> Layout:
 def new_folder(
     kind: str, name: str, out: str | Path | None = None, *, system: Any = None
 ) -> Iterator[RunFolder]:
-    """Context manager for an empty folder with the system and its provenance; a failure closes the folder.
+    """Context manager for a new output folder that contains the system and its provenance.
 
     Args:
         kind: kind of the folder, which a verb declares.
@@ -343,7 +343,7 @@ def finish(
     view: View | None = None,
     write: bool = True,
 ) -> Outcome:
-    """Judge a folder, write findings and verdict to its summary.json and, on request, its page.
+    """Judge a folder: add findings and verdict to its summary.json, and write its report page if requested.
 
     Args:
         result: result of the verb's computation, for a caller in Python.
@@ -386,7 +386,7 @@ def finish(
 
 
 def read(folder: str | Path) -> Outcome:
-    """Return the outcome of a folder of any verb; the folder is judged again, and not changed.
+    """Return the outcome of an output folder of any kind; its results are judged again, without writing.
 
     Example:
         >>> mdnum.read("runs/argon-crystal-108-1").table("flips")
@@ -398,13 +398,13 @@ def read(folder: str | Path) -> Outcome:
 
 
 def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **counts: Any) -> None:
-    """Report a phase, if there is a progress function."""
+    """Report the phase and the current step to the progress function, if there is one."""
     if progress is not None:
         progress(step, steps, {"phase": phase, **counts})
 
 
 def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, Any]) -> None:
-    """Finish filling a folder: write its tables, then its summary.
+    """Write all tables and then the summary of an output folder.
 
     Args:
         summary: a mapping of plain values, dataclasses and arrays included.
@@ -421,20 +421,20 @@ def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, An
 
 
 def words(texts: Sequence[str] | str) -> tuple[str, ...]:
-    """Split words that were given one by one, or separated by commas."""
+    """Return words without repeats from one text or several texts; each text may be a list with commas."""
     texts = (texts,) if isinstance(texts, str) else texts
     return tuple(dict.fromkeys(word.strip() for text in texts for word in text.split(",") if word.strip()))
 
 
 def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
-    """Raise an error for options that would have no effect.
+    """Raise an error if options were given that would have no effect.
 
     Args:
         given: for each option, whether it was given.
         whose: use of these options: "of one comparison, and all choices were asked for".
 
     Raises:
-        InputError: an option was given.
+        InputError: at least one of the options was given.
     """
     names = [name for name, present in given.items() if present]
     if names:
@@ -443,7 +443,7 @@ def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
 
 
 def logged(folder: RunFolder, progress: Progress | None, lines: int = 10) -> Progress:
-    """Wrap a progress function so that log.txt gets a line at each new phase and at intervals.
+    """Wrap a progress function so that each new phase, and progress at intervals, is logged in log.txt.
 
     Args:
         lines: approximate number of lines for a phase that counts its steps.

@@ -1,4 +1,4 @@
-"""`mdnum grad`: derivatives of a loss through a simulation (a rollout), by several methods."""
+"""`mdnum grad`: derivatives of a loss with respect to parameters of a simulation, by several methods."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def grad(
     half_step: bool = True,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Differentiate a rollout's loss with respect to parameters by several methods, and compare the results.
+    """Differentiate a loss of a simulation with respect to parameters, and compare several methods.
 
     Example:
         >>> mdnum.grad("argon/crystal-108", "mean-potential", ["sigma", "cutoff.radius"], steps=200)
@@ -126,7 +126,7 @@ def grad(
 def _problem(
     simulation: Simulation, of: str | None, names: Sequence[str], steps: int | None
 ) -> tuple[Problem, tuple[str, ...]]:
-    """Return the problem and the full names of the parameters; raise an error if they are not supported."""
+    """Return the problem and the full names of its parameters; raise an error for invalid names."""
     from mdnum.gradients import Problem, parameters
     from mdnum.gradients.losses import LOSSES, NOT_REAL, parse
 
@@ -148,7 +148,7 @@ def _problem(
 def plan(
     problem: Problem, names: Sequence[str], asked: Sequence[str] | None, replicas: int = 0
 ) -> tuple[list[Method], list[dict[str, str]]]:
-    """Return the methods to run, and those omitted by default: what, why, and the option that adds them.
+    """Return the gradient methods to run, and the omitted methods with reasons and options to add them.
 
     Args:
         asked: names of methods; None for the fast ones.
@@ -156,7 +156,7 @@ def plan(
             is None.
 
     Raises:
-        InputError: no such method.
+        InputError: there is no method of this name.
     """
     from mdnum.gradients import METHODS, method
 
@@ -181,7 +181,7 @@ def plan(
 
 
 def _too_long(method: Method, problem: Problem, names: int) -> str:
-    """Return why a fast method is not run by default; "" if it is run."""
+    """Return the reason why a method is too slow to be run by default; "" if it is fast enough."""
     runs = getattr(method, "runs", 0) * names + 1
     if runs * problem.simulation.atoms * problem.steps <= AFFORDABLE or runs == 1:
         return ""
@@ -189,7 +189,7 @@ def _too_long(method: Method, problem: Problem, names: int) -> str:
 
 
 def _over(method: Any, replicas: int, horizons: bool = True) -> Method:
-    """Set the number of starts of a method that averages over starts; return other methods unchanged."""
+    """Return a method with another number of starts; a method without averages over starts is unchanged."""
     if not replicas or not hasattr(method, "replicas"):
         return method
     changed = replace(method, replicas=replace(method.replicas, count=replicas))
@@ -235,7 +235,7 @@ def _diagnosed(
 
 
 def _brief(part: Any) -> Any:
-    """Return a part of a diagnosis without rows, and without pairs that were far from a flip."""
+    """Return one part of a diagnosis as plain values, without its tables."""
     return part and plain({name: value for name, value in vars(part).items() if name not in _ROWS})
 
 
@@ -292,7 +292,7 @@ def _not_run(
     asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
     further: Sequence[str], half_step: bool,
 ) -> list[dict[str, str]]:  # fmt: skip
-    """Return what was omitted, why, and the option that adds it."""
+    """Return a list of what was not computed, each with the reason and the option that adds it."""
     from mdnum.gradients.diagnose.trust import no_half_step
 
     own, rows = problem.simulation.steps, []
@@ -308,7 +308,7 @@ def _not_run(
 
 
 def _keep_arrays(answer: Answer) -> None:
-    """Write large derivatives to the folder."""
+    """Write derivatives with many entries to a file in the output folder."""
     agreement = answer.result.agreement
     large: dict[str, Any] = {
         f"{one.method}/{name}": np.asarray(value)
@@ -325,7 +325,7 @@ def _keep_arrays(answer: Answer) -> None:
 
 
 def _method(found: Gradient) -> dict[str, Any]:
-    """Return the result of one method as plain values."""
+    """Return the result of one gradient method as plain values."""
     details = plain(found.details)
     error = details.pop("error", details.get("standard_error", {}))
     # by what is used, zero is a number like any other
@@ -342,7 +342,7 @@ def _method(found: Gradient) -> dict[str, Any]:
 
 
 def brief(value: Any) -> Any:
-    """Return a number, a short list of numbers, or the norm and largest entry of a large array."""
+    """Shorten an array: return a number, a short list, or the norm and the largest entry of a large array."""
     array = np.asarray(value, np.float64)
     if array.ndim == 0:
         return float(array)
@@ -370,7 +370,7 @@ def _ball_methods(asked: Sequence[str] | None) -> list[str]:
 def _ball_system(
     system: Any, of: str | None, names: Sequence[str], steps: int | None, overrides: Mapping[str, Any] | None
 ) -> BallSystem:
-    """Return the ball system with the requested loss and parameters in its tables."""
+    """Return a ball system whose tables contain the requested loss, parameters and number of steps."""
     from mdnum.systems import BallSystem, ball, load
 
     kinds = get_args(ball.LossTable.model_fields["kind"].annotation)
@@ -433,7 +433,7 @@ def _differentiated(system: BallSystem, methods: list[str], answer: Answer) -> N
 
 
 def relative(value: float, right: float) -> float:
-    """Difference relative to the correct value; infinite if only the correct value is 0."""
+    """Return |value - right| / |right|, or infinity if `right` is 0 and `value` is not."""
     if value == right:
         return 0.0
     return abs(value - right) / abs(right) if right else float("inf")

@@ -1,4 +1,4 @@
-"""Report page of `mdnum grad`: derivatives by method with their valid digits, sections and figures."""
+"""Report page of `mdnum grad`: derivatives by each method, rounded to their valid digits, and figures."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _GROWN = {"forward bounded, gradient not": "growing", "forward not bounded": "un
 
 
 def by(summary: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
-    """Return the result of a method; the closed form counts as a method."""
+    """Return the stored result of a method; the closed form, if it is the reference, counts as a method."""
     if summary.get("exact") and method == summary["reference"]:
         exact = {"gradient": summary["exact"], "details": {}, "error": {}}
         return {"method": method, "description": TEXTS("exact"), **exact}
@@ -39,7 +39,7 @@ def by(summary: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
 
 
 def magnitude(value: Any, missing: float | None = None) -> float:
-    """Return a derivative as one number: its value, or the norm of several values."""
+    """Return a derivative as one number: a scalar's value, or the norm of an array."""
     if isinstance(value, Mapping):
         value = value["norm"]
     if isinstance(value, list):
@@ -48,12 +48,12 @@ def magnitude(value: Any, missing: float | None = None) -> float:
 
 
 def digits_of(summary: Mapping[str, Any], name: str) -> int | None:
-    """Number of digits of a derivative that are unchanged at half the time step; None if not examined."""
+    """Return the number of valid digits: those unchanged at half the time step; None if not examined."""
     return ((summary.get("trust") or {}).get("digits") or {}).get(name)
 
 
 def digits_note(summary: Mapping[str, Any], name: str) -> str:
-    """Return a note on a derivative's digits; "" if the digits are valid or trust was not examined."""
+    """Return a note if a derivative has no valid digits, or if their number is unknown; otherwise ""."""
     known = digits_of(summary, name)
     if summary.get("trust") and known is None:
         return TEXTS("digits_unknown")
@@ -61,9 +61,9 @@ def digits_note(summary: Mapping[str, Any], name: str) -> str:
 
 
 def resolved(summary: Mapping[str, Any], name: str, value: float | None, most: int) -> str:
-    """Format one entry of a derivative with its valid digits, but at most `most`.
+    """Format one entry of a derivative with its valid digits, at most `most` digits.
 
-    The number is written as a power of ten if zeros could be mistaken for digits.
+    Scientific notation is used if trailing zeros could be mistaken for valid digits.
     """
     known = digits_of(summary, name)
     if known is None:
@@ -72,7 +72,7 @@ def resolved(summary: Mapping[str, Any], name: str, value: float | None, most: i
 
 
 def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str, most: int = 6) -> str:
-    """Format a derivative with its valid digits."""
+    """Format a derivative, rounded to its valid digits, with its error if one is known."""
     if found is None or name not in found["gradient"]:
         return "–"
     value = found["gradient"][name]
@@ -86,7 +86,7 @@ def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str
 
 
 def slope_unit(summary: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
-    """Return the unit of a derivative."""
+    """Return the unit of a derivative: that of the loss divided by that of the parameter."""
     above, below = summary["loss"]["unit"], parameter["unit"]
     if above == below:
         return ""
@@ -98,7 +98,7 @@ def slope_unit(summary: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
 
 
 def closeness(row: Mapping[str, Any]) -> str:
-    """Format a relative difference as a phrase."""
+    """Format the relative difference between two derivatives as a phrase."""
     relative = row["relative"]
     if relative is None:
         return "not finite" if row["size"] else "nonzero, but the other is 0"
@@ -111,7 +111,7 @@ def closeness(row: Mapping[str, Any]) -> str:
 
 
 def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
-    """Return the sentence on one limit of trust."""
+    """Return the sentence on one limit of the steps for which the gradient can be trusted."""
     code = f"{limit['what']}_{limit['code']}".replace(" ", "_")
     values = {"horizon": limit["horizon"], **limit["values"]}
     first = values.get("first")
@@ -120,7 +120,7 @@ def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
 
 
 def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, Any]]:
-    """Group the judgments on trust by the parameters that share them; the key is empty if all share one."""
+    """Group parameters with the same judgment on trust; the key is empty if all have the same judgment."""
     trust = summary.get("trust")
     if not trust:
         return {}
@@ -135,7 +135,7 @@ def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, 
 
 
 def trust_sentence(summary: Mapping[str, Any], names: tuple[str, ...], one: Mapping[str, Any]) -> str:
-    """Return the sentence on a verdict on trust."""
+    """Return the sentence on whether derivatives by the named parameters can be trusted."""
     free = [limit["what"] for limit in one["limits"] if limit["horizon"] is not None and not limit["reached"]]
     values = {"steps": summary["steps"], "horizon": one["horizon"], "limit": one["limited_by"]}
     text = TEXTS(f"trust_{one['verdict']}", free=", ".join(free) or "nothing", **values)
@@ -143,7 +143,7 @@ def trust_sentence(summary: Mapping[str, Any], names: tuple[str, ...], one: Mapp
 
 
 def trust_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the verdicts on trust, and their limits."""
+    """Yield sentences on whether derivatives can be trusted, up to which step, and what limits them."""
     for names, one in judgments(summary).items():
         yield trust_sentence(summary, names, one)
         yield from (limit_sentence(summary, limit) for limit in one["limits"] if limit["reached"])
@@ -166,7 +166,7 @@ def growth_sentences(view: View) -> list[str]:
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Return the page of a gradient."""
+    """Return the report page of a gradient."""
     summary, loss = view.summary, view.summary["loss"]
     size = many(summary["atoms"], "atom") if "atoms" in summary else many(summary["balls"], "ball")
     about = TEXTS(
@@ -200,7 +200,7 @@ def _keys(view: View) -> Iterator[Key]:
 
 
 def _methods(view: View) -> Iterator[Any]:
-    """Yield derivatives by method, the reference first, with their differences from the reference."""
+    """Yield tables of the derivatives by each method, with differences from the reference method."""
     summary, reference = view.summary, view.summary["reference"]
     rows = sorted(summary["methods"], key=lambda one: one["method"] != reference)
     exact = by(summary, reference)
@@ -269,7 +269,7 @@ def _horizons(view: View) -> Iterator[Any]:
 
 
 def _limits(view: View) -> Iterator[tuple[float, str]]:
-    """Yield the horizons at which trust in the gradient ends."""
+    """Yield the steps at which trust in derivatives ends, each with the limit that was reached."""
     for names, one in judgments(view.summary).items():
         if one["limited_by"]:
             yield one["horizon"], ", ".join([f"limit: {one['limited_by']}", *names])
@@ -346,7 +346,7 @@ def _flips(view: View) -> Iterator[Any]:
 
 
 def _browse(table: Mapping[str, np.ndarray]) -> Browse:
-    """Return a table of the flips with the largest contributions."""
+    """Return a searchable table of the flips with the largest contributions to the gradient."""
     with np.errstate(divide="ignore", invalid="ignore"):
         rows = {**table, "ratio": np.abs(table["margin"]) / table["bound"]}
     rows["rank"] = np.arange(1, len(rows["ratio"]) + 1)

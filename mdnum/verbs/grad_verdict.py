@@ -1,4 +1,4 @@
-"""Verdict of `mdnum grad`: errors, warnings and notes on a gradient."""
+"""Verdict of `mdnum grad`: findings (errors, warnings and notes) on a gradient."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _CLOSE = 0.01
 
 
 def judge(view: View) -> Verdict:
-    """Return findings, evidence and headline of a gradient."""
+    """Return the verdict on a gradient: findings, evidence and headline."""
     trust = view.summary.get("trust") or {}
     found = [*_of_methods(view), *_of_trust(view), *_of_flips(view), *_of_the_motion(view)]
     found += function_findings(view.summary.get("function"), view.units)
@@ -73,7 +73,7 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def _of_methods(view: View) -> Iterator[Finding]:
-    """Yield findings on the results of methods, on missing results, and on likely misinterpretations."""
+    """Yield findings on results of gradient methods: not finite, zero, unexplained, misleading or missing."""
     summary, methods, section = view.summary, view.summary["methods"], "By method"
     where = summary.get("detective") or {}
     variants = []
@@ -145,7 +145,7 @@ def _of_trust(view: View) -> Iterator[Finding]:
 
 
 def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a remedy for each limit that was not examined, as variants of the finding."""
+    """Yield the variants of the finding on unexamined limits; each variant adds a remedy to its text."""
     unseen = {one["what"] for one in trust["limits"] if one["horizon"] is None}
     aware = by(view.summary, "event-aware") is not None
     if any(one["what"] == "half the time step" for one in view.summary["left_out"]):
@@ -163,12 +163,12 @@ def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _averaged(view: View) -> bool:
-    """True if the gradient was averaged over starts."""
+    """True if the gradient was averaged over several starts (initial states)."""
     return any(name.startswith("error.") for name in view.table("trust"))
 
 
 def _of_flips(view: View) -> Iterator[Finding]:
-    """Yield findings on derivatives dominated by one or two flips, and on flips that the guard excluded."""
+    """Yield findings on derivatives dominated by one or two flips, and on excluded grazing flips."""
     section, totals = "Flips on the way", (view.summary.get("flips") or {}).get("total") or {}
     table = view.table("flip_contributions") if totals else {}
     for name, total in totals.items():
@@ -199,7 +199,7 @@ def _of_flips(view: View) -> Iterator[Finding]:
 
 
 def _of_the_motion(view: View) -> Iterator[Finding]:
-    """Yield findings on methods whose result differs from the derivative of the exact motion, if known."""
+    """Yield a finding on methods that disagree with the derivative of the exact motion, if known."""
     rows = view.summary["comparisons"] if view.summary.get("exact") else ()
     off = [row for row in rows if row["relative"] is None or row["relative"] > _CLOSE]
     methods: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""Return value of every verb: plain data, and tables, figures and a page read from its folder on demand."""
+"""Return value of every command: a summary, a verdict, and access to tables and figures of its folder."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Outcome:
-    """Return value of every verb: plain data, and methods that read the rest from its folder.
+    """Return value of every command: a summary and a verdict, with methods that read tables and figures.
 
     An outcome can be pickled, and returned by the workers of a pool. Tables, figures and the page are read
-    from the folder when they are used, so the folder must still be where it was written.
+    from the output folder when they are used, so the folder must not be moved.
 
     Example:
         >>> outcome = mdnum.run("argon/crystal-108", steps=200)
@@ -57,21 +57,21 @@ class Outcome:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Findings on the result that a person should know, errors first."""
+        """Findings on the result (errors, warnings and notes), errors first."""
         return self.verdict.findings
 
     @property
     def page(self) -> Page:
-        """Content of report.html and of the terminal output; FolderError if the folder is gone or damaged."""
+        """Content of report.html and of the terminal output; FolderError if the folder is missing."""
         if self._page is None:
             object.__setattr__(self, "_page", self._read(self._place).page)
         return cast(Page, self._page)
 
     def table(self, name: str) -> pa.Table:
-        """Return a table of the folder; `.to_pandas()` converts it to a data frame (docs/folders.md: nulls).
+        """Return a table of the output folder; `.to_pandas()` converts the table to a data frame.
 
         Raises:
-            FolderError: there is no such table (the message lists the existing ones), or it is damaged.
+            FolderError: no table has this name (the message lists all tables), or the table is damaged.
         """
         from mdnum.store import RunFolder
 
@@ -86,13 +86,13 @@ class Outcome:
             return folder.table(name)
 
     def plot(self, name: str) -> Axes:
-        """Draw a figure of the page, named as its file in figures/, as a new figure of pyplot.
+        """Draw a figure of the page as a new pyplot figure; `name` is that of its file in figures/.
 
         Returns:
             the axes, or the first of several; `.figure.axes` are all of them.
 
         Raises:
-            InputError: there is no such figure; the message lists the existing ones.
+            InputError: no figure has this name (the message lists all figures).
         """
         from matplotlib import pyplot
 

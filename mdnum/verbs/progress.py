@@ -1,4 +1,4 @@
-"""Progress of a verb: a bar in a terminal and in a notebook, occasional lines elsewhere."""
+"""Progress display of a command: a bar in a terminal or a notebook, occasional lines elsewhere."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _OUTERMOST = threading.Lock()
 
 @contextmanager
 def reported(progress: Wanted) -> Iterator[Progress | None]:
-    """Yield the function to which a verb reports its progress, or None.
+    """Context manager: yield the function that receives reports of progress, or None.
 
-    A function is used as given. None gives a bar, except in a verb called by another verb and in the workers
-    of a pool; True gives a bar in any case, False none.
+    If `wanted` is a function, it is used. None gives a bar, except in a command called by another command and
+    in the workers of a pool; True always gives a bar, False gives no bar.
     """
     from multiprocessing import parent_process
 
@@ -46,10 +46,10 @@ def reported(progress: Wanted) -> Iterator[Progress | None]:
 
 
 class ProgressBar:
-    """Progress bar of a rollout, called as progress(step, steps, info); shows steps/s, flips, rebuilds, ETA.
+    """Progress bar, called as progress(step, steps, info); shows steps/s, flips, list rebuilds, time left.
 
-    If something other than steps is counted, info["unit"] names it. The bar is drawn by a thread, because a
-    run begins with seconds of compilation, during which there are no calls.
+    If the unit of progress is not a step, info["unit"] names it. The bar is drawn by a separate thread,
+    because a run begins with seconds of compilation without calls.
 
     Args:
         stream: where to draw a bar, or to print lines if the stream is no terminal; default stderr, or the
@@ -83,12 +83,12 @@ class ProgressBar:
             self._bar.stop()
 
     def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
-        """Receive a rollout's report: the current step, the number of steps, and counts so far."""
+        """Receive a progress report: the current step, the number of steps, and further counts."""
         self._last = (step, steps, dict(info))
         self.folder = info.get("folder", self.folder)
 
     def _watch(self) -> None:
-        """Draw the bar, or print a line, at intervals."""
+        """Draw the bar, or print a line, at intervals, until the progress bar is closed."""
         while not self._over.wait(self._pause):
             step, steps, info = self._last
             phase = str(info.get("phase", "run"))
@@ -108,7 +108,7 @@ class ProgressBar:
 
 
 def _drawn(stream: TextIO) -> Any:
-    """Return a bar that is shown until it is stopped."""
+    """Start and return a progress bar, which is shown until it is stopped."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
@@ -123,7 +123,7 @@ def _drawn(stream: TextIO) -> Any:
 
 
 class _Cell:
-    """A progress bar below a notebook's cell, shown until it is stopped."""
+    """A progress bar below a notebook cell, shown until its method `stop` is called."""
 
     def __init__(self, stream: TextIO):
         from IPython.display import display  # pyright: ignore[reportMissingImports]
@@ -141,7 +141,7 @@ class _Cell:
 
 
 def describe(step: int, steps: int, info: dict[str, Any]) -> str:
-    """Return the numbers next to the bar, in one line."""
+    """Format the text next to the progress bar: counts, steps per second and remaining time."""
     unit = info.get("unit", "steps")
     parts = [f"{step:,} of {steps:,} {unit}"]
     parts += [f"{info[name]:,} {name}" for name in ("flips", "rebuilds") if name in info]

@@ -1,4 +1,4 @@
-"""`mdnum.Recorder`: frames of any simulation loop, recorded in a folder like that of `mdnum flips`."""
+"""`mdnum.Recorder`: records the flips of any simulation loop in a folder like that of `mdnum flips`."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ _NONE = {name: np.zeros(0, np.int64) for name in ("rule", "i", "j", "rank", "ent
 
 
 class Recorder:
-    """Recorder of flips, and of pairs that the neighbor list in use lacks, for any simulation loop.
+    """Recorder of flips, and of pairs that are missing from the neighbor list, for any simulation loop.
 
-    The loop need not be changed; the data given to `see` lead to the same folder, findings and page as
-    `mdnum.flips` for a file with the same frames. Decisions are computed from the positions in float64; an
-    error bound marks decisions that float32 positions leave uncertain.
+    The results are those of `mdnum.flips` for a file with the same frames. Decisions (pair inside or outside
+    the cutoff) are computed from the positions in float64. Decisions that are uncertain because the positions
+    are in float32 are marked.
 
     Example:
         >>> with mdnum.Recorder(8.5, box=box, fractional=True, out="runs/mine") as rec:
@@ -110,7 +110,7 @@ class Recorder:
         self, step: int, positions: Any, cell: Any = None, *, box: Any = None, pbc: Any = None,
         neighbors: Any = None, velocities: Any = None, energy: Any = None,
     ) -> None:  # fmt: skip
-        """Record a frame; arrays may be from numpy, jax or torch, and are copied.
+        """Record one frame; arrays may be numpy, jax or torch arrays, and are copied.
 
         Args:
             step: step of the loop.
@@ -143,7 +143,7 @@ class Recorder:
     def see_many(
         self, positions: Any, cell: Any = None, *, first: int = 0, every: int = 1, **given: Any
     ) -> None:
-        """Record frames that a scan returned, (frames, atoms, 3), or a list of frames or of ASE `Atoms`.
+        """Record several frames: an array (frames, atoms, 3), a list of arrays, or a list of ASE `Atoms`.
 
         Args:
             first, every: step of the first frame, and number of steps between frames.
@@ -157,7 +157,7 @@ class Recorder:
                 self.see(first + every * k, frame, **here)
 
     def see_atoms(self, atoms: Any, step: int | None = None) -> None:
-        """Record ASE `Atoms`, or those of an ASE dynamics object, whose step number is then used."""
+        """Record ASE `Atoms`, or the atoms and the step number of an ASE dynamics object."""
         step = int(getattr(atoms, "nsteps", self._given if step is None else step))
         atoms = getattr(atoms, "atoms", atoms)
         if self._source.named is None:
@@ -167,7 +167,7 @@ class Recorder:
         self.see(step, atoms.positions, atoms.cell.array, pbc=atoms.pbc, velocities=speeds, energy=energy)
 
     def __call__(self, *args: Any, **given: Any) -> None:
-        """Call `see` or `see_atoms`: ASE dynamics call attached functions without arguments."""
+        """Call `see`; without arguments, as in a call by an ASE dynamics object, call `see_atoms`."""
         if len(args) > 1 or given:
             self.see(*args, **given)
         elif args or self._atoms is not None:
@@ -178,7 +178,7 @@ class Recorder:
             )
 
     def hook(self, step: Any, positions: Any, **given: Any) -> None:
-        """Call `see` inside jax.jit, fori_loop and scan: the host is called at every step, in order."""
+        """Record a frame inside jax.jit, fori_loop or scan, by a callback to the host at every step."""
         from jax.experimental import io_callback
 
         def seen(step: Any, positions: Any, given: Mapping[str, Any]) -> None:
@@ -189,7 +189,7 @@ class Recorder:
 
     @property
     def outcome(self) -> Outcome:
-        """Close the recorder and return the outcome, as `mdnum.flips` does."""
+        """Close the recorder and return the outcome, of the same kind as from `mdnum.flips`."""
         return self.close()
 
     def __enter__(self) -> Recorder:
@@ -201,13 +201,13 @@ class Recorder:
             self.close(error)
 
     def close(self, error: BaseException | None = None) -> Outcome:
-        """End the recording, and judge the recorded frames.
+        """End the recording, compute the statistics, and return the outcome.
 
         Args:
             error: the exception that ended the loop early.
 
         Raises:
-            InputError: no frame was given, or the first cannot be used.
+            InputError: no frame was recorded, or the first frame cannot be used.
         """
         if self._outcome is not None:
             return self._outcome
@@ -233,13 +233,13 @@ class Recorder:
         return self._outcome
 
     def compare(self, other: Recorder) -> FolderFork:
-        """Find where the decisions of two loops with the same rule diverge; close both recorders."""
+        """Find the first frame at which neighbor sets of two recorded loops differ; close both recorders."""
         from mdnum.forks.folders import compare_folders
 
         return compare_folders(self.outcome.path, other.outcome.path)
 
     def _advance(self) -> None:
-        """Examine the frames that are waiting."""
+        """Examine all recorded frames that were not yet examined, and write rows to the folder."""
         try:
             if self._one is None:
                 self._one = self._stack.enter_context(examining(self._source, self._rules, **self._how))
@@ -273,7 +273,7 @@ class Recorder:
             self._cost = self._written - now
 
     def _after(self, one: FrameExamination, new: Sequence[dict[str, Any]]) -> None:
-        """Record the program's own data on an examined frame, in addition to its flips."""
+        """Record a frame's energy, and pairs inside the cutoff that are missing from its neighbor list."""
         energy, listed, overflow = self._told.popleft()
         flips, frame = next((rows for rows in new if rows["rule"][0] == 0), _NONE), self._source.now
         for rows in new:

@@ -1,4 +1,4 @@
-"""`mdnum report`: rewriting of a folder's page."""
+"""`mdnum report`: write the report page of an existing output folder again."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mdnum.verbs.frame import finish
 
 
 def report(folder: Path) -> Reply:
-    """Judge a folder and write the page of the folder, as the verb that made the folder does."""
+    """Judge the results in an output folder again, and write its report page."""
     outcome = finish(folder)
     written = outcome.folder / "report.html"
     kept = {name: outcome.summary[name] for name in HEAD} | {"of": outcome.kind}

@@ -1,4 +1,4 @@
-"""`mdnum run`: simulation of a system, stored in a folder, with a comparison to ASE and a verdict."""
+"""`mdnum run`: simulate a system, store the results in a folder, compare with ASE and give a verdict."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def run(
     progress: Wanted = None,
     allow_code: bool = False,
 ) -> Outcome:
-    """Simulate a system, record every flip, compare the first and last frame with ASE, and write a report.
+    """Simulate a system, record all flips, compare the first and last frame with ASE, and write a report.
 
     Example:
         >>> mdnum.run("argon/liquid-864", steps=500).folder
@@ -148,10 +148,10 @@ def run(
 
 
 def _compile_beside() -> None:
-    """Start another process that compiles the loop's functions, if the compilation cache is empty.
+    """Start a second process that compiles the simulation's functions, if the compilation cache is empty.
 
-    The cache is empty for the first command after an installation; most of its time is compilation, and a
-    single process compiles on only one processor.
+    The first command after an installation finds an empty cache and spends most of its time on compilation,
+    and a single process uses only one processor for compilation.
     """
     kept = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     with contextlib.suppress(OSError):
@@ -162,7 +162,7 @@ def _compile_beside() -> None:
 
 
 class _Beside(NamedTuple):
-    """Results that are computed in parallel with the loop."""
+    """Results that are computed in parallel with the simulation loop."""
 
     compared: EnergyReport | None = None  # the first and the last frame with ASE
     period: float | None = None  # the fastest in them
@@ -175,7 +175,7 @@ def _beside_the_loop(
     check: bool,
     report: bool,
 ) -> _Beside:
-    """Compute, in parallel with the loop, the comparison with ASE and other work outside the loop."""
+    """Compare the first and last frame with ASE, in parallel with the simulation loop."""
     if report:
         import mdnum.report.drawing  # noqa: F401 it takes as long
     if not check:
@@ -211,7 +211,7 @@ def _beside_the_loop(
 
 
 def _keep(run: RunView, compared: EnergyReport | None, period: float | None, function: Any) -> None:
-    """Add the results computed in parallel with the loop to the summary."""
+    """Add the results that were computed in parallel with the simulation loop to summary.json."""
     from mdnum.verbs.check import energy_findings
 
     assert compared is not None
@@ -224,7 +224,7 @@ def _keep(run: RunView, compared: EnergyReport | None, period: float | None, fun
 
 
 def _beside_float64(run: RunView, result: RunResult) -> None:
-    """Add to the summary the energy conservation of a run in fixed-point numbers, and that of float64."""
+    """For a fixed-point run, add energy fluctuations of this run and of a float64 run to the summary."""
     from mdnum.rollout.engine import FAILURES, Engine
 
     simulation, summary = result.simulation, run.summary
@@ -247,7 +247,7 @@ def _beside_float64(run: RunView, result: RunResult) -> None:
 
 
 def judge(run: RunView) -> Verdict:
-    """Return the findings in reading order: the most serious causes first."""
+    """Return the verdict on a run, with findings ordered by cause, the most serious cause first."""
     found = [
         *_status(run), *_time_step(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
         *_decisions(run), *_drift(run), *_cutoff(run),
@@ -439,7 +439,7 @@ def _loop(run: RunView) -> Iterator[Finding]:
 
 
 def function_findings(function: Mapping[str, Any] | None, units: Units) -> Iterator[Finding]:
-    """Yield findings on a user's pair function that is not finite, or has jumps in any derivative."""
+    """Yield findings on a user's pair function that is not finite, or whose value or derivatives jump."""
     function = function or {}
     if function.get("single"):
         yield TEXTS.finding("SINGLE_INSIDE", "pair")
@@ -460,7 +460,7 @@ def function_findings(function: Mapping[str, Any] | None, units: Units) -> Itera
 
 
 def _potential(run: RunView) -> Iterator[Finding]:
-    """Yield the findings from trial calls of an energy function."""
+    """Yield findings from test calls of a user's energy function."""
     units: dict[str, Any] = {"energy_unit": run.units.energy, "length_unit": run.units.length}
     for code, values in ((run.system.get("potential") or {}).get("notes") or {}).items():
         # of a range that has an end

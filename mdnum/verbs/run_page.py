@@ -1,4 +1,4 @@
-"""View of a run folder, and the sections and figures of its page."""
+"""Report page of `mdnum run`: read access to the run folder, sections and figures."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _COLUMNS = ("step", "i", "j", "entered", "distance", "margin", "radial_speed", "
 
 
 class RunView(View):
-    """View of the folder of a run, finished or not."""
+    """Read access to the folder of a run, whether the run is finished or not."""
 
     @cached_property
     def series(self) -> Mapping[str, np.ndarray]:
-        """Table with one row for each step.
+        """Table with one row of energies, temperature and counts for each step.
 
         Raises:
-            FolderError: the folder has no steps.
+            FolderError: the folder contains no step of the run.
         """
         series = self.table("series")
         if not len(series["step"]):
@@ -51,12 +51,12 @@ class RunView(View):
 
     @property
     def epochs(self) -> Mapping[str, np.ndarray]:
-        """Table with one row for each neighbor list."""
+        """Table with one row for each neighbor list that was built during the run."""
         return self.table("epochs")
 
     @cached_property
     def flips(self) -> analysis.Scan:
-        """Statistics of the table of flips, which may be larger than memory."""
+        """Statistics of all flips; the table of flips is read in batches, as it may be larger than memory."""
         flips = analysis.Scan(len(self.series["step"]), TABLE_ROWS)
         known = self.folder.table("flips", rows=1).column_names
         columns = [*_COLUMNS, *(name for name in ("terms",) if name in known)]
@@ -73,7 +73,7 @@ class RunView(View):
 
     @property
     def cutoff(self) -> Mapping[str, Any]:
-        """Kind, radius, comparison and jumps of the cutoff; empty if there is none."""
+        """Kind, radius, comparison and jumps of the cutoff; empty if the run has no cutoff."""
         return self.summary.get("cutoff") or {}
 
     @property
@@ -84,7 +84,7 @@ class RunView(View):
 
     @property
     def own_end(self) -> list[str]:
-        """Variant of a finding's remedy for a cutoff that no key of the system file can change."""
+        """Variant of a remedy: "own" if the potential, not the system file, sets the cutoff."""
         return [] if self.cutoff_key else ["own"]
 
     @cached_property
@@ -99,34 +99,34 @@ class RunView(View):
 
     @property
     def ase(self) -> Mapping[str, Any]:
-        """Comparison with ASE; empty if there is none."""
+        """Results of the comparison with ASE; empty if no comparison was made."""
         return self.summary.get("ase") or {}
 
     @property
     def conservative(self) -> bool:
-        """True if the total energy should be conserved."""
+        """True if the total energy should be conserved (dynamics of kind "nve")."""
         return (self.system.get("dynamics") or {}).get("kind", "nve") == "nve"
 
     @cached_property
     def expected_ambiguous(self) -> float:
-        """Expected number of flips within their rounding bound."""
+        """Expected number of flips whose margin is within its rounding bound."""
         return analysis.expected_ambiguous(self.flips.ratios)
 
     @cached_property
     def budget(self) -> dict[str, np.ndarray]:
-        """Energy over time: its change, the cumulative jumps of the flips, and the difference of the two."""
+        """Change of the conserved energy, cumulative energy jumps of flips, and their difference."""
         conserved = self.series["conserved"]
         change, jumps = conserved - conserved[0], np.cumsum(self.series["energy_jump"])
         return {"change": change, "jumps": jumps, "residual": change - jumps}
 
     @cached_property
     def time_step(self) -> dict[str, float | None]:
-        """Indicators of the time step's adequacy, from energies and the fastest vibration; None if unknown.
+        """Indicators of whether the time step is small enough; an indicator that is unknown is None.
 
-        `per_period`: number of steps per period of the fastest vibration in the first and the last
-        configuration; `fluctuation`: fluctuation of the conserved energy (without the flips' jumps) over that
-        of the kinetic energy; `drift` of the conserved energy over the run and its standard error
-        `drift_error`, in k_B T per atom.
+        `per_period`: number of steps per period of the fastest vibration in the first and the last frame;
+        `fluctuation`: fluctuation of the conserved energy (without the jumps of flips) divided by that of the
+        kinetic energy; `drift`, `drift_error`: drift of this energy over the run and its error, k_B T per
+        atom.
         """
         period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
         atoms = self.summary.get("atoms") or 0
@@ -146,22 +146,22 @@ class RunView(View):
 
     @property
     def residual(self) -> Measured:
-        """Residual of the energy budget, as stated by the run or else max |E(t) - E(0) - sum of jumps|."""
+        """Residual of the energy budget: the run's value, or else max |E(t) - E(0) - sum of jumps|."""
         stated = self.summary.get("energy_budget_residual")
         left = float(np.max(np.abs(self.budget["residual"]))) if stated is None else abs(float(stated))
         return Measured(left, self.units.energy, self.summary.get("energy_budget_tolerance"))
 
     def total(self, key: str, column: str | None = None) -> int:
-        """Return a count from the summary, or from the epochs if a killed run has no summary."""
+        """Return a count from the summary, or from the table of neighbor lists if a run was killed."""
         return int(self.summary.get(key) or self.epochs[column or key].sum())
 
     def step(self, row: int | np.integer) -> int:
-        """Return the step of a row of the series."""
+        """Return the step number of a row of the table of steps."""
         return int(self.series["step"][row])
 
 
 def page(run: RunView, verdict: Verdict) -> Page:
-    """Return the page of a run."""
+    """Return the report page of a run."""
     atoms, cutoff, units = run.summary.get("atoms"), run.cutoff, run.units
     about = [many(atoms, "atom")] if atoms else []
     about.append(many(run.steps, "step"))
@@ -189,7 +189,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
 
 
 def draw_first(run: RunView) -> None:
-    """Draw the figures that do not show single flips, while the flips are still being computed."""
+    """Draw the figures without single flips early, in parallel with other work."""
     from mdnum.report import drawing
 
     for part in (*_energy(run), next(_flips_per_step(run)), *_lists(run)):
@@ -198,7 +198,7 @@ def draw_first(run: RunView) -> None:
 
 
 def _numbers(run: RunView) -> dict[str, Any]:
-    """Return the key numbers at the top of the page."""
+    """Return the numbers that are shown at the top of the page."""
     summary, atoms, epochs = run.summary, run.summary.get("atoms"), run.epochs
     made = {name: int(run.series[name].sum(dtype=np.int64)) for name in ("entered", "left", "ambiguous")}
     known = ("energy_drift", "energy_budget_closes", "steps_per_second")
@@ -213,7 +213,7 @@ def _numbers(run: RunView) -> dict[str, Any]:
 
 
 def _what(run: RunView) -> list[tuple[str, str]]:
-    """Return rows on the system that was run; rows without an entry in the system file are left out."""
+    """Return table rows on the system that was run; settings that the system file lacks are omitted."""
     units, system, time = run.units, run.system, run.series["time"]
     lengths: dict[str, str] = dict.fromkeys(("radius", "onset", "skin"), units.length)
 
@@ -244,7 +244,7 @@ def _what(run: RunView) -> list[tuple[str, str]]:
 
 
 def _freedom(run: RunView) -> dict[str, Any]:
-    """Return the number of degrees of freedom in the temperature, and its explanation."""
+    """Return the number of degrees of freedom used for the temperature, with an explanation."""
     freedom, atoms = run.summary.get("degrees_of_freedom"), run.summary.get("atoms") or 0
     if freedom is None:
         return dict.fromkeys(("freedom", "counted"))
@@ -310,7 +310,7 @@ def _energy(run: RunView) -> Iterator[Any]:
 
 
 def _pressure(run: RunView, parts: Mapping[str, Any]) -> Iterator[Any]:
-    """Yield the components of the pressure, and the pressure that the cutoff neglects."""
+    """Yield the contributions to the pressure, including those of jumps at the cutoff and of the tail."""
     units = run.units
     rows = TEXTS.rows("pressure", **vars(units), **parts)
     terms = [
@@ -443,7 +443,7 @@ def _lists(run: RunView) -> Iterator[Any]:
 
 
 def _nearest(run: RunView) -> Iterator[Any]:
-    """Yield the flips nearest to the threshold, ordered by step."""
+    """Yield a table of the flips with the smallest margins to the cutoff, ordered by step."""
     flips, units = run.flips.nearest, run.units
     if not len(flips["step"]):
         yield TEXTS("no_flips")
@@ -454,7 +454,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
 
 
 def _ranges(run: RunView) -> Iterator[Any]:
-    """Yield the range of magnitudes of each quantity, and the steps at which a narrower format would fail."""
+    """Yield a table of each quantity's range of magnitudes, and the first steps outside narrower formats."""
     examined, series, units = run.table("ranges"), run.series, vars(run.units)
     sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
     sums["step"] = series["step"]

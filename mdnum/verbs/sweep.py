@@ -1,4 +1,4 @@
-"""`mdnum sweep`: which choices change which results, and the cheapest setting that is accurate enough."""
+"""`mdnum sweep`: sensitivity of results to numerical choices, and the cheapest setting that suffices."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def sweep(
 ) -> Outcome:
     """Find which choices change which results, and the cheapest setting that is accurate enough.
 
-    Points are stored under names derived from their input. If a sweep is repeated with more values, seeds or
-    measures, only the new points are computed; a stopped sweep continues when it is called again.
+    Each point (a run with one setting and one seed) is stored on disk. If a sweep was stopped, or is repeated
+    with more values, seeds or measures, only the missing points are computed.
 
     Example:
         >>> mdnum.sweep("argon/liquid-864", {"dynamics.timestep": [0.001, 0.002, 0.004]}, seeds=8)
@@ -115,7 +115,7 @@ def sweep(
 
 
 def command(system: str, *, over: Sequence[str] = (), dry_run: bool = False, **given: Any) -> Any:
-    """Execute `mdnum sweep`, whose options are texts."""
+    """Execute `mdnum sweep`: convert the texts of command-line options, then call `sweep`."""
     for name in ("tolerance", "converged"):
         if texts := given.pop(name, None):
             given[name] = _assignments(name, frame.words(texts))
@@ -138,7 +138,7 @@ def _assignments(name: str, texts: Sequence[str]) -> Any:
 
 
 def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
-    """Return what a sweep would compute: number of points, stored points, time and disk space."""
+    """Return the plan of a sweep without a run: points, missing points, estimated time and disk space."""
     from mdnum.verbs import Reply
 
     where = given.pop("points_in", None) or Path(given.get("out") or "runs/x").parent / "sweep-points"
@@ -169,7 +169,7 @@ def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
 def _compute(
     place: Workspace, plan: Plan, log: Any, on: Any, workers: int | None, keep: bool, code: bool
 ) -> dict[str, Any]:
-    """Compute the missing points, and wait for points that another sweep is computing."""
+    """Compute the missing points, wait for points that another sweep is computing, and return counts."""
     wanted = {one.address: one for one in plan.points if not one.wrong}
     missing = [a for a in wanted if not enough(place.result(a), plan.wanted)]
     missed = place.nearest(wanted[missing[0]].state) if missing else None
@@ -247,7 +247,7 @@ def _compute(
 def _after_a_loss(
     place: Workspace, one: Task, wanted: Mapping[str, Planned], error: BaseException, counts: dict[str, Any]
 ) -> list[list[Planned]]:
-    """Handle a task whose process died each time: the point that it was computing is omitted."""
+    """Handle a task whose process died several times: mark its current point as failed; return the others."""
     from mdnum.sweeps.points import write_result
 
     again = []

@@ -1,7 +1,7 @@
-"""Measures of a sweep that need further runs: forks of two runs, and gradients with their horizon.
+"""Measures of a sweep that require further runs: divergence of two runs, and gradients.
 
-This module adds them to `mdnum.sweeps.measures.MEASURES`, because `sweeps` may not import forks and
-gradients.
+This module adds these measures to `mdnum.sweeps.measures.MEASURES`, because the package `sweeps` must not
+import forks and gradients.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def _twin(simulation: Any, steps: int, argument: str) -> Any:
 
 
 def _pair(run: Sample, argument: str) -> Any:
-    """Run a system and its twin until they split; by default they differ by an ulp of one coordinate."""
+    """Run a system twice; by default the starts differ by one ulp of one coordinate; find the divergence."""
     from mdnum.forks import fork
 
     if ("fork", argument) not in run.made:
@@ -43,17 +43,17 @@ def _date(run: Sample, argument: str, name: str) -> Value:
 
 
 def fork(run: Sample, argument: str) -> Value:
-    """Time at which two runs first make different decisions; the scatter of the seeds gives its error."""
+    """Time at which two runs first make different decisions; its error is the scatter between seeds."""
     return _date(run, argument, "fork")
 
 
 def split(run: Sample, argument: str) -> Value:
-    """Time until two runs are a hundredth of the cutoff apart; the scatter of the seeds gives its error."""
+    """Time until two runs are separated by 0.01 of the cutoff; its error is the scatter between seeds."""
     return _date(run, argument, "split")
 
 
 def separation(run: Sample, argument: str) -> Value:
-    """Rate of the exponential growth of the separation of two runs, 1/time, from a fit of its logarithm."""
+    """Rate at which the separation of two runs grows exponentially, 1/time, from a fit of its logarithm."""
     found = _pair(run, argument)
     grown = found.growth["B"]
     if not grown.plain:
@@ -62,7 +62,7 @@ def separation(run: Sample, argument: str) -> Value:
 
 
 def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
-    """Return the loss and the full name of the parameter in LOSS/PARAMETER."""
+    """Return the loss and the full name of the parameter in a text LOSS/PARAMETER."""
     from mdnum.gradients import parameters
     from mdnum.gradients.losses import parse
 
@@ -77,7 +77,7 @@ def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
 
 
 def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
-    """Return the diagnosis of a gradient, as in `grad`, and the full name of the parameter."""
+    """Return the gradient and its trust horizon, as in `mdnum grad`, and the parameter's full name."""
     from mdnum.gradients import Problem
     from mdnum.gradients.diagnose import diagnose
 
@@ -91,7 +91,7 @@ def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
 
 
 def gradient(run: Sample, argument: str) -> Value:
-    """Derivative of a loss by the reference method of `mdnum grad`, unit of the loss over the parameter's."""
+    """Derivative of a loss with respect to a parameter, by the reference method of `mdnum grad`."""
     found, name = _diagnosis(run, argument)
     if found.agreement is None:
         raise InputError(found.failed["agreement"])
@@ -100,7 +100,7 @@ def gradient(run: Sample, argument: str) -> Value:
 
 
 def horizon(run: Sample, argument: str) -> Value:
-    """Time up to which the derivative is trusted; the scatter of the seeds gives its error."""
+    """Time up to which the derivative of a loss can be trusted; its error is the scatter between seeds."""
     found, _ = _diagnosis(run, argument)
     if found.trust is None:
         raise InputError(found.failed["trust"])

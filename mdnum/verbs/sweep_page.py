@@ -1,4 +1,4 @@
-"""Verdict and report page of `mdnum sweep`: significant changes, detection limits, recommended values."""
+"""Verdict and report page of `mdnum sweep`: significant changes, detection limits, recommendations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _INSIDE = {True: "yes", False: "no", None: "not decided"}
 
 
 def _shown(view: View, name: str) -> str:
-    """Return the name of a measure, with the part of its path that distinguishes it from other measures."""
+    """Shorten the path in a measure's name as far as the name remains different from other names."""
     parts, others = Path(name).parts, [one["name"] for one in view.summary["measures"] if one["name"] != name]
     ends = ["/".join(parts[-k:]) for k in range(1, len(parts))] if ".py:" in name else []
     return next((end for end in ends if not any(one.endswith(f"/{end}") for one in others)), name)
@@ -37,7 +37,7 @@ def _unit(view: View, name: str) -> str:
 
 
 def _moved(view: View) -> dict[str, list[str]]:
-    """Return the measures that each choice changes, by choice."""
+    """Return, for each choice, the names of the physical measures that it changes significantly."""
     found: dict[str, list[str]] = {axis["key"]: [] for axis in view.summary["axes"]}
     physical = {one["name"] for one in view.summary["measures"] if one["physical"]}
     for row in view.summary["differences"]:
@@ -48,7 +48,7 @@ def _moved(view: View) -> dict[str, list[str]]:
 
 
 def judge(view: View) -> Verdict:
-    """Return the verdict: which choices change which results, and recommended values."""
+    """Return the verdict on a sweep: which choices change which results, and recommended values."""
     s = view.summary
     moved = _moved(view)
     said = [TEXTS("moves", key=key, measures=listed(names)) for key, names in moved.items() if names]
@@ -107,7 +107,7 @@ def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
 
 
 def _advised(view: View, advice: Mapping[str, Any]) -> str:
-    """Return a sentence on the recommended value of an axis."""
+    """Return a sentence on the recommended value of one choice."""
     key, end, best = advice["choice"], label(advice["end"]), label(advice["best"])
     if key in FREE:
         return "" if advice["best"] is None else TEXTS("use_fastest", key=key, best=best)
@@ -122,12 +122,12 @@ def _advised(view: View, advice: Mapping[str, Any]) -> str:
 
 
 def _further_seeds(view: View, factor: float) -> int:
-    """Return by how many seeds a sweep must grow for a given factor."""
+    """Return the number of seeds to add so that the number of seeds grows by the given factor."""
     return int(np.ceil(len(view.summary["seeds"]) * (factor - 1)))
 
 
 def _together(view: View) -> list[str]:
-    """Return a sentence on the test of all recommended values together."""
+    """Return a sentence on the runs with all recommended values combined."""
     joint = view.summary["joint"]
     if joint is None or joint["inside"] is False:
         return []
@@ -140,13 +140,13 @@ def _together(view: View) -> list[str]:
 
 
 def _keyed(view: View, setting: Sequence[str]) -> str:
-    """Format a setting as KEY = VALUE."""
+    """Format a setting as a list of KEY = VALUE."""
     keys = [axis["key"] for axis in view.summary["axes"]]
     return listed([f"{key} = {value}" for key, value in zip(keys, setting, strict=True)])
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Return the page: the recommendations first, then each choice."""
+    """Return the report page of a sweep."""
     s = view.summary
     keys = TEXTS.keys(
         points=s["points"], settings=s["settings"], computed=s["computed"], found=s["found"],
@@ -178,13 +178,13 @@ def _sections(view: View) -> Iterator[Section]:
 def _most(
     rows: Sequence[Any], columns: Mapping[str, str], stored: str, bad: Callable[[Any], Any] | None = None
 ) -> list[Any]:
-    """Return a table of the first rows, with the name of the file of all rows if there are more."""
+    """Return a table of the first rows; if there are more rows, add a note on the file with all rows."""
     more = [TEXTS("more_rows", shown=_ROWS, all=len(rows), stored=stored)] if len(rows) > _ROWS else []
     return [*more, table_of(rows[:_ROWS], columns, bad=bad)]
 
 
 def _several(words: Sequence[str], separator: str = ", ") -> str:
-    """Join words; if there are many, only the first and the last, with their number."""
+    """Join words; of many words, join only the first three and the last, and give the number of words."""
     if len(words) <= _VALUES:
         return separator.join(words)
     return TEXTS("many_values", first=separator.join(words[:3]), last=words[-1], n=len(words))
@@ -207,7 +207,7 @@ def _differences(view: View) -> list[Any]:
 
 
 def _with_error(row: Mapping[str, Any]) -> str:
-    """A value, rounded to the digits that its error leaves valid, and the error."""
+    """Format a value and its error; the value is rounded to the digits that the error leaves valid."""
     value, error = row["value"], row["error"]
     if not error:
         return number(value, 5)
@@ -245,7 +245,7 @@ def _settings(view: View) -> list[Any]:
 
 
 def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
-    """Yield figures of each measure along an axis, with errors; other choices have their base values."""
+    """Yield a figure of each measure versus one choice, with errors; other choices keep their base values."""
     s, values = view.summary, axis["values"]
     if not all(isinstance(one, int | float) for one in values):
         return

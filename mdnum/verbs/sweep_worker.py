@@ -1,4 +1,4 @@
-"""Computation of points by a worker of `mdnum sweep`, in a separate process."""
+"""Computation of the points of a sweep by a worker process of `mdnum sweep`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SERIES = "series.parquet"
 
 @dataclass(frozen=True)
 class Task:
-    """Points that are computed one after the other, with one program if their arrays have the same shapes."""
+    """Points of a sweep that one process computes in sequence, so that compiled programs can be reused."""
 
     workspace: str
     points: tuple[Mapping[str, Any], ...]  # each with address, state and settings
@@ -37,7 +37,7 @@ class Task:
 
 
 def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> bool:
-    """True if a stored result contains all requested measures."""
+    """True if a stored result contains all requested measures, or failed for a reason that will persist."""
     if result is None:
         return False
     if result["status"] == "failed":
@@ -47,16 +47,16 @@ def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> boo
 
 
 def _missing(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> list[str]:
-    """Return measures that a result lacks, or that were computed by other source code."""
+    """Return the measures that a stored result lacks, or that were computed by different source code."""
     stored = {} if result is None else result["measures"]
     return [name for name, at in measures.items() if stored.get(name, {}).get("digest") != at]
 
 
 def work(task: Task) -> list[dict[str, Any]]:
-    """Compute missing points; return the address and the outcome of each point.
+    """Compute the missing points of a task; return the address and the status of each point.
 
-    The outcome is "computed", "there" (already stored), "busy" (another process computes it), or "full" with
-    the reason (its folder cannot be written).
+    The status of a point is "computed", "there" (already stored), "busy" (being computed by another process),
+    or "full" (its folder cannot be written), with the reason.
     """
     place, told = Workspace(Path(task.workspace)), []
     for point in task.points:
@@ -117,7 +117,7 @@ def _compute(place: Workspace, task: Task, point: Mapping[str, Any]) -> None:
 
 
 def _simulation(task: Task, point: Mapping[str, Any]) -> Any:
-    """Make a simulation, or the system of a ball."""
+    """Build the simulation, or the ball system, of a point."""
     from mdnum.systems import opened
 
     with allow_code(task.allow_code):
@@ -148,7 +148,7 @@ def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
 
 
 def _bounced(system: Any, steps: int, task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
-    """Run a ball, without its variants and gradients."""
+    """Run a ball without its variants and gradients, and return the data for measures."""
     import pyarrow
     import pyarrow.parquet as parquet
 

@@ -1,4 +1,4 @@
-"""`mdnum systems`: list, show, check and copy systems, shipped with mdnum or one's own."""
+"""`mdnum systems`: list, show, check and copy system files."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def copy(system: str, target: Path | None = None) -> Reply:
 
 
 def _size_in(file: Path) -> dict[str, Any]:
-    """Return the number of atoms or balls of a shipped system file, and its description, without checks.
+    """Return the number of atoms or balls and the description in a shipped system file, without checks.
 
-    Checking and building all systems for a list would need jax and ASE, and take seconds.
+    To check and build all systems for a list, jax and ASE would have to be imported, which takes seconds.
     """
     table = tomllib.loads(file.read_text(encoding="utf-8"))
     about, start, structure = table["about"], table.get("start", {}), table.get("structure", {})
@@ -67,7 +67,7 @@ def _size_in(file: Path) -> dict[str, Any]:
 
 
 def _size(system: Any) -> dict[str, int]:
-    """Return the number of atoms or balls of a system."""
+    """Return the number of atoms, or of balls, of a loaded system."""
     atoms = getattr(system, "atoms", None)
     return {"balls": system.balls} if atoms is None else {"atoms": len(atoms)}
 
