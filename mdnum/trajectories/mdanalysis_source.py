@@ -1,9 +1,9 @@
 """Trajectories read by MDAnalysis, and detection of data after the last frame that MDAnalysis reads.
 
-A killed run, a truncated copy and a damaged frame header all look like the end of the file to MDAnalysis's
-readers of dcd, trr and some text formats, which silently skip the rest. A number that is cut off is read as
-another number. MDAnalysis rejects an Amber NetCDF file with fewer records than its header states, which a
-killed run leaves; such a file is read by this module (ambermd.org/netcdf/nctraj.xhtml).
+MDAnalysis's readers of dcd, trr and some text formats take a truncated or damaged frame for the end of the
+file, and silently skip the remaining data. If the last number of a text file is truncated, the remaining
+digits are read as a different number. A killed run leaves an Amber NetCDF file with fewer records than stated
+in the header; MDAnalysis rejects such a file, and this module reads it (ambermd.org/netcdf/nctraj.xhtml).
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ _PART = 1 << 22
 
 
 class LibraryFrames:
-    """Frames of an MDAnalysis reader; each frame is checked before MDAnalysis reads it.
+    """Frames of an MDAnalysis reader, each checked before MDAnalysis reads it.
 
     Attributes:
-        raw: the last frame read, before transformations; None without transformations.
-        replaced: True if transformations were applied in memory and have replaced the values read.
+        raw: the last frame read, before transformations; None if there are no transformations.
+        replaced: True if transformations in memory have replaced the values from the file.
     """
 
     def __init__(self, trajectory: Any):
@@ -71,11 +71,11 @@ class LibraryFrames:
         self._guard = opened(trajectory)
 
     def timestep(self, number: int, forward: bool = False) -> Any:
-        """Return MDAnalysis's timestep of a frame; set `forward` if the reader is at the previous one.
+        """Return MDAnalysis's timestep of a frame; set `forward` if the reader is at the previous frame.
 
         Raises:
-            UnreadableFrame: the frame cannot be read, reading it would end the process, or its last number is
-                cut off.
+            UnreadableFrame: the frame is unreadable, would crash the process, or ends with a truncated
+                number.
         """
         with self._reading(number):
             if self._guard is not None:
@@ -99,7 +99,7 @@ class LibraryFrames:
             return ts
 
     def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
-        """Return a timestep as a frame, copied; errors as in `timestep`."""
+        """Return a `Frame` with copies of the data in a timestep; raise the same errors as `timestep`."""
         with self._reading(number):
             time, x = float(number) if untimed else float(ts.time), np.array(ts.positions, np.float64)
             velocities = np.array(ts.velocities, np.float64) if ts.has_velocities else None
@@ -115,7 +115,7 @@ class LibraryFrames:
         return reading(file_of(self.trajectory) or "the trajectory", number)
 
     def _refuse_cut_text(self, number: int) -> None:
-        """Reject the last frame of a text file if its last number is cut off; no other frame can be cut."""
+        """Reject the last frame of a text file if its last number is truncated."""
         trajectory = self.trajectory
         if number != trajectory.n_frames - 1 or (found := _text(trajectory)) is None:
             return
@@ -134,7 +134,7 @@ class LibraryFrames:
 
 
 class MDAnalysisTrajectory(Trajectory):
-    """Trajectory read through an MDAnalysis Universe; coordinates pass through float32 in all formats."""
+    """Trajectory read through an MDAnalysis Universe, with all coordinates reduced to float32."""
 
     reader = "MDAnalysis"
     bits = 32
@@ -161,7 +161,7 @@ class MDAnalysisTrajectory(Trajectory):
             return self._boxes.other(self.universe.trajectory[number], number)
 
     def _universe_of(self, format: str | None) -> tuple[Any, list[str]]:
-        """Return a Universe of the trajectory, and the warnings from opening it and reading its time step."""
+        """Return a Universe of the trajectory, and the warnings from opening it and reading the time step."""
         import MDAnalysis
 
         path = self.path
@@ -213,9 +213,9 @@ class MDAnalysisTrajectory(Trajectory):
 
 
 def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
-    """Return a function that reads the atom labels of any frame; MDAnalysis reads those of the first only.
+    """Return a function that reads the atom labels of any frame, not only of the first as MDAnalysis does.
 
-    The function returns None for all formats except XYZ files and PDB models.
+    The function returns None unless the file is an XYZ file or a PDB file with several models.
     """
     from MDAnalysis.lib.util import anyopen
 
@@ -243,7 +243,7 @@ def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
 
 
 def _length_of(trajectory: Any) -> str:
-    """Return the name of the length unit; "" for formats that prescribe none (GSD)."""
+    """Return the name of the length unit of positions; "" if the file format does not define it (GSD)."""
     unit = trajectory.units.get("length")
     if unit is None or getattr(trajectory, "convert_units", True):
         return "Å" if unit else ""
@@ -252,7 +252,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factors(trajectory: Any) -> tuple[float, float]:
-    """Return two ratios of DCD time steps: file to MDAnalysis's value, and byte-swapped to file value."""
+    """Return the ratios of DCD time steps (in the file / in MDAnalysis, byte-swapped / in the file)."""
     read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
     if not read:
         return 1.0, math.nan
@@ -268,9 +268,9 @@ def _time_factors(trajectory: Any) -> tuple[float, float]:
 
 
 def left_over(trajectory: Any) -> str | None:
-    """Describe the data after the last frame of an MDAnalysis reader; return None if there are none.
+    """Describe data after the last frame that MDAnalysis finds in a file; return None without such data.
 
-    A reader of line-based text is moved to its last frame.
+    If the file is line-based text, the MDAnalysis reader is moved to its last frame.
     """
     path = file_of(trajectory)
     if path is None or not path.is_file():
@@ -307,7 +307,7 @@ def left_over(trajectory: Any) -> str | None:
 
 
 def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
-    """Return (bytes after the last frame of a DCD file, bytes of a frame)."""
+    """Return (number of bytes after the last frame of a DCD file, size of a frame in bytes)."""
     from MDAnalysis.lib.formats.libdcd import DCDFile
 
     with DCDFile(str(path)) as file:
@@ -320,7 +320,7 @@ def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
 
 
 def _behind_text(file: Any) -> str | None:
-    """Describe the lines after the last frame, without blank ones at the end; None if there are none."""
+    """Describe lines after the last frame of a text file, ignoring trailing blank lines; None if none."""
     if file is None or file.closed:
         return None
     lines = 0
@@ -333,7 +333,7 @@ def _behind_text(file: Any) -> str | None:
 
 
 def _last_bytes(path: Path) -> tuple[bytes, int]:
-    """Return (the last bytes of a file, its size) after decompression, which reads the file completely."""
+    """Return (last bytes of a file, its size); a compressed file is decompressed completely."""
     from MDAnalysis.lib.util import anyopen
 
     packed = path.suffix in (".gz", ".bz2")
@@ -347,7 +347,7 @@ def _last_bytes(path: Path) -> tuple[bytes, int]:
 
 
 def _text(trajectory: Any) -> tuple[Path, str] | None:
-    """Return (file, format) if MDAnalysis's reader reads the file as lines of text; otherwise None."""
+    """Return (path, format) if MDAnalysis's reader reads the file as lines of text; otherwise None."""
     path, word = file_of(trajectory), next((one for one in formats_of(trajectory) if one in _LINES), None)
     return None if word is None or path is None else (path, word)
 
@@ -356,7 +356,7 @@ def _text(trajectory: Any) -> tuple[Path, str] | None:
 
 
 class NetcdfFile(netcdf_file):
-    """A NetCDF file in classic format; complete records can be read whatever number its header states."""
+    """A NetCDF file in classic format, whose complete records can be read even if the header is wrong."""
 
     # where the first record begins, bytes
     _begin = sys.maxsize
@@ -374,7 +374,7 @@ class NetcdfFile(netcdf_file):
 
     @property
     def told(self) -> int:
-        """Number of records stated in the header; -1 if the writer never filled it in."""
+        """Number of records stated in the header; -1 if the program that wrote the file never set it."""
         return int(vars(self)["_recs"])
 
     @property
@@ -397,7 +397,7 @@ class NetcdfFile(netcdf_file):
 
 
 def netcdf_of(path: str | Path) -> NetcdfFile | None:
-    """Open a NetCDF file in classic format; return None for other files, or if the header is truncated."""
+    """Open a NetCDF file in classic format; return None for other formats or a truncated header."""
     try:
         file = NetcdfFile(str(path))
     except (OSError, TypeError, ValueError, KeyError, IndexError):
@@ -408,7 +408,7 @@ def netcdf_of(path: str | Path) -> NetcdfFile | None:
 
 
 class NetcdfTrajectory(Trajectory):
-    """Trajectory from an Amber NetCDF file that ends early, in Å and ps."""
+    """Trajectory from an Amber NetCDF file with missing records, in Å and ps."""
 
     format = "NCDF"
 
@@ -452,7 +452,7 @@ class NetcdfTrajectory(Trajectory):
 
 
 def _scaled(variable: Any, number: int) -> np.ndarray:
-    """Return the value of a variable in a record, multiplied by the variable's scale factor."""
+    """Return the value of a NetCDF variable in a record, multiplied by the scale factor of the variable."""
     values, scale = np.array(variable[number]), getattr(variable, "scale_factor", None)
     values = values.astype(values.dtype.newbyteorder("="))
     # rounded once, as MDAnalysis does

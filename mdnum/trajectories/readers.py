@@ -1,4 +1,4 @@
-"""Choice of a reader for a trajectory file, and frame selections such as run.xtc@100:."""
+"""Choice of a reader for a trajectory file, and parsing of frame selections such as run.xtc@100:."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def open_trajectory(
         path: the file, optionally followed by a frame selection @START:STOP:STEP.
         topology: a file that identifies the atoms, if the trajectory does not (xtc, trr, dcd, ...); any
             topology file that MDAnalysis accepts.
-        slice: frames to read, written as after the @.
+        slice: frames to read, in the notation used after the @.
         format: MDAnalysis's or ASE's name of the format, if the file name does not identify it.
 
     Raises:
@@ -101,7 +101,7 @@ def open_trajectory(
 
 
 def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
-    """Return the function that opens a file, given its path, its topology and the requested frames."""
+    """Return the function that opens a file from its path, its topology and the requested frames."""
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
     word = (format or suffix[1:]).lower()
     if word in READERS:
@@ -129,7 +129,7 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
 
 
 def _first_lines(file: Path) -> tuple[str, str]:
-    """Return the first two lines in lower case; empty strings for a file that is not text."""
+    """Return the first two lines of a text file in lower case; empty strings for other files."""
     from ase.io.formats import open_with_compression
 
     try:
@@ -143,7 +143,7 @@ def _first_lines(file: Path) -> tuple[str, str]:
 
 
 def split_path(text: str) -> tuple[Path, str]:
-    """Return (path, slice after the last @); a file whose own name contains an @ is recognized."""
+    """Return (path, slice after the last @), or the whole text as the path if a file of this name exists."""
     whole = Path(text).expanduser()
     name, at, words = text.rpartition("@")
     if not at or whole.exists():
@@ -154,10 +154,10 @@ def split_path(text: str) -> tuple[Path, str]:
 
 
 def parse_slice(words: str, where: str = "") -> slice:
-    """Return the slice that a text describes: "100:", "::10", "-50:", "5" (one frame), "" (all frames).
+    """Parse a slice of frames: "100:", "::10", "-50:", "5" (one frame) or "" (all frames).
 
     Raises:
-        InputError: the text is not a slice, or its stride is not positive (flips are found forward in time).
+        InputError: the text is not a slice, or its stride is not positive (frames are read forward in time).
     """
     match = _SLICE.fullmatch(words.strip())
     if match is None:

@@ -1,8 +1,8 @@
-"""Detection of frames that repeat the data or the times of earlier ones, after restarts or without motion.
+"""Detection of frames that repeat the data or the times of earlier frames, for example after a restart.
 
-A run that continues from a checkpoint writes some frames again, concatenated files have frames in common, and
-a stopped simulation or a rejected Monte Carlo move repeats the previous frame. Times do not always reveal
-this. A restart with different rounding repeats times but not bits; the first of the two frames is kept.
+A run continued from a checkpoint writes some frames again, concatenated files may share frames, and a stopped
+simulation or a rejected Monte Carlo move repeats the previous frame, not always with equal times. After a
+restart with different rounding, times repeat but data differ; the first frame of each time is kept.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _SAME = 1e-8
 
 
 def digest(frame: Frame) -> bytes:
-    """Return sixteen bytes that are equal for two frames with bitwise identical positions and boxes."""
+    """Return sixteen bytes that are equal for frames with bitwise identical positions and boxes."""
     x = np.ascontiguousarray(frame.positions)
     parts = (x[:: max(1, len(x) // _ATOMS)], np.array(crc32(x.data)), frame.box.matrix, frame.box.pbc)
     return blake2b(b"".join(part.tobytes() for part in parts), digest_size=16).digest()
@@ -33,16 +33,16 @@ def digest(frame: Frame) -> bytes:
 
 @dataclass
 class RepeatedFrames:
-    """Record of the frames that repeat earlier ones; its memory holds one digest per distinct frame.
+    """Record of frames that repeat earlier frames, based on one stored digest per distinct frame.
 
     Attributes:
-        drop: True to leave repeated frames out when frames are passed on.
-        most: number of frames remembered; older frames are forgotten.
+        drop: True to omit repeated frames from the frames that are yielded.
+        most: largest number of digests stored; the oldest digests are deleted.
         frames: number of repeated frames.
-        again: ranges of different frames whose times occurred before, with numbers as in `stretches`, the
-            first and the last time (time, to), and the number of frames (frames).
-        stretches: ranges of consecutive frames that repeat consecutive ones: numbers in the file (first,
-            last, of_first, of_last), and whether the range is one frame without motion (still).
+        again: ranges of frames that repeat times but not data, with numbers as in `stretches`, the first and
+            the last time (time, to), and the number of frames (frames).
+        stretches: ranges of consecutive frames that repeat consecutive frames: frame numbers (first, last,
+            of_first, of_last), and whether all frames of the range repeat a single frame (still).
     """
 
     drop: bool = False
@@ -60,7 +60,7 @@ class RepeatedFrames:
     _had = 0
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Yield frames, without repeated ones if `drop` is set."""
+        """Yield the frames; omit repeated frames if `drop` is true."""
         for frame in frames:
             every: list[dict[Any, Any]] = [self._known, self._wrapped, self._times]
             for held in every:
@@ -72,7 +72,7 @@ class RepeatedFrames:
                 yield frame
 
     def _digest(self, frame: Frame) -> bytes:
-        """Return the digest of a frame, or of an earlier frame with the same atoms in other cells."""
+        """Return the digest of a frame, or of an earlier frame that differs only by wrapping of atoms."""
         digested, box = digest(frame), frame.box
         if not box.pbc.all() or not np.linalg.det(box.matrix):
             return digested
@@ -86,7 +86,7 @@ class RepeatedFrames:
         return digested if before == mine else known
 
     def had(self, number: int, time: float) -> bool:
-        """Return True if the frame seen last has the time of an earlier frame although times had advanced."""
+        """Return True if the latest frame has the time of an earlier frame, although times had advanced."""
         of = self._times.setdefault(f"{time:.12g}", number)
         if of == number or len(self._times) < 2:
             return False
@@ -113,6 +113,6 @@ class RepeatedFrames:
         return back > 0
 
     def plain(self, most: int = 100) -> dict[str, Any]:
-        """Return the record as plain values, with at most `most` ranges."""
+        """Return the record as plain Python values, with at most `most` ranges of each kind."""
         sizes = {"frames": self.frames, "stretches": len(self.stretches), "to_the_end": self._back > 0}
         return sizes | {"dropped": self.drop, "ranges": self.stretches[:most], "again": self.again[:most]}

@@ -1,8 +1,8 @@
-"""Contacts between residues: two residues are in contact if their nearest atoms are within the cutoff.
+"""Contacts between residues: two residues are in contact if any pair of their atoms is within the cutoff.
 
-A pair of residues is inside while any of its atom pairs is inside, so decisions are made on atoms; the ledger
-holds the smallest distances. Hydrogens and virtual sites are left out by default: their positions depend on
-constraints and on the program that wrote the file, and customary cutoffs are meant for heavy atoms.
+Decisions are made for pairs of atoms, and the ledger contains the smallest distance between two residues.
+Hydrogens and virtual sites are excluded by default: their positions depend on constraints and on the program
+that wrote the file, and customary contact cutoffs are defined for heavy atoms.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _TOGETHER = 20_000
 
 @dataclass(frozen=True)
 class ByResidue:
-    """Residues of a file, used in place of atoms."""
+    """Residues of a file, which replace atoms in the analysis of pairs."""
 
     of: Int[np.ndarray, "atoms"]  # residue of each atom of the file
     table: AtomTable  # of the residues, an entry each
@@ -45,7 +45,7 @@ class ByResidue:
 
     @classmethod
     def make(cls, table: AtomTable, groups: Groups, hydrogens: bool, rules: Sequence[Rule]) -> ByResidue:
-        """Build the residues of a file; `hydrogens` keeps hydrogens and virtual sites.
+        """Build the residues of a file; `hydrogens` is True to include hydrogens and virtual sites.
 
         Raises:
             InputError: the file has no residues, no atom is left, or a rule is not defined for pairs of
@@ -75,18 +75,18 @@ class ByResidue:
 
     @property
     def names(self) -> ResidueNames:
-        """Names of the residues."""
+        """Names, numbers and segments of the residues."""
         table = self.table
         return ResidueNames(table.residues, table.residue_names, table.residue_ids, table.segments)
 
     @property
     def sides(self) -> Groups:
-        """Residues on either side of a pair."""
+        """Residue indices of the two groups between which contacts are counted."""
         first, second = (None if side is None else np.unique(self.of[side]) for side in self.groups)
         return first, second
 
     def tracker(self, rule: Rule, species: Sequence[str] | None, bound: float = 0.0) -> ResidueTracker:
-        """Return a tracker for the contacts that a rule defines."""
+        """Return a tracker of residue contacts, as defined by a membership rule for atoms."""
         return ResidueTracker(rule, self, species, bound)
 
 
@@ -102,14 +102,14 @@ def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarr
 
 
 class ResidueTracker:
-    """Tracker of contacts between residues, with the interface that `Tracker` has for pairs of atoms.
+    """Tracker of contacts between residues, with the same interface as `Tracker` for pairs of atoms.
 
-    Atoms of one residue make no contact. `near` counts pairs of atoms; each pair of residues within the bound
-    has one or more of them. The smallest margin is not computed (inf).
+    Pairs of atoms within one residue are ignored. `near` counts pairs of atoms, at least one for each pair of
+    residues within the error bound of the cutoff. The smallest margin is not computed (inf).
 
     Args:
         rule: membership rule for atoms.
-        residues: residues, and the atoms that count.
+        residues: residues, and the atoms that can form contacts.
         species: species of each atom of the file; required by some rules.
         bound: error of a distance, in length units, due to the resolution of the file.
 
@@ -138,7 +138,7 @@ class ResidueTracker:
 
     @property
     def near(self) -> int:
-        """Number of pairs of atoms at the last frame whose |margin| is at most the bound."""
+        """Number of atom pairs at the last frame whose |margin| is at most the error bound."""
         return self._atoms.near
 
     @property
@@ -182,7 +182,7 @@ class ResidueTracker:
         return Members(i, j, np.zeros_like(i), self._closest(self._last, i, j)[0])
 
     def _closest(self, frame: Frame, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lengths (distance, threshold) of the atom pair deepest inside or least outside."""
+        """Return lengths (distance, threshold) of the atom pair with the largest margin, per residue pair."""
         placed, found = self._placed(frame), np.full((2, len(i)), np.inf)
         for begin in range(0, len(i), _TOGETHER):
             part = slice(begin, begin + _TOGETHER)
@@ -212,7 +212,7 @@ class ResidueTracker:
 
 
 def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (atoms sorted by residue, offsets at which the atoms of each residue begin and the last end)."""
+    """Return (atoms sorted by residue, offset of the first atom of each residue and of the end)."""
     atoms = np.arange(len(of)) if atoms is None else atoms
     order = atoms[np.argsort(of[atoms], kind="stable")]
     return order, np.searchsorted(of[order], np.arange(count + 1))
@@ -220,7 +220,7 @@ def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[n
 
 @dataclass(frozen=True)
 class Occupancy(Columns):
-    """Share of the frames in which each pair was in contact, sorted by (i, j): a sparse contact matrix."""
+    """Fraction of the frames in which each pair was in contact, sorted by (i, j): a sparse contact matrix."""
 
     i: Int[np.ndarray, "pairs"]  # the pair
     j: Int[np.ndarray, "pairs"]
@@ -231,7 +231,7 @@ class Occupancy(Columns):
 
     @classmethod
     def of(cls, stays: Contacts, frames: int) -> Occupancy:
-        """Sum the contacts of each pair over the given number of frames."""
+        """Add up the contacts of each pair of residues over the given number of frames."""
         new = np.append(True, (np.diff(stays.i) != 0) | (np.diff(stays.j) != 0))[: len(stays)]
         heads, where = np.flatnonzero(new), np.cumsum(new) - 1
         weights = (stays.length, stays.began, stays.ended)
@@ -241,7 +241,7 @@ class Occupancy(Columns):
 
 @dataclass(frozen=True)
 class ResidueNames(Columns):
-    """Names of residues, one entry per residue."""
+    """Names, numbers and segments of residues, one entry per residue."""
 
     residue: Int[np.ndarray, "residues"]  # its number from 0, by which tables name it
     name: np.ndarray
@@ -252,7 +252,7 @@ class ResidueNames(Columns):
 def contacts_over_time(
     stays: Contacts, residues: int, frames: int
 ) -> tuple[Int[np.ndarray, "moments"], Float[np.ndarray, "residues moments"]]:
-    """Return (first frame of each of up to `MOMENTS` intervals, mean number of contacts of each residue)."""
+    """Return (first frame of each of up to `MOMENTS` intervals, mean number of contacts per residue)."""
     edges = np.unique(np.linspace(0, frames, min(frames, MOMENTS) + 1).astype(np.int64))
     found = np.zeros((residues, len(edges) - 1))
     for k, (low, high) in enumerate(pairwise(edges)):

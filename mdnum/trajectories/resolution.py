@@ -1,14 +1,15 @@
-"""Resolution of positions in a file, inferred from its numbers, and the decisions it leaves undecided.
+"""Resolution of the positions in a file, inferred from the numbers, and its effect on pair decisions.
 
-Writing three decimals moves every coordinate by up to half a unit of the third. Whether a pair is inside a
-cutoff is then undecidable if its distance is closer to the cutoff than the resulting error of a distance.
-`infer` searches for the decimal grid that holds all coordinates, so an undocumented precision is found too.
+Rounding to three decimals changes every coordinate by up to half a unit of the third decimal. The decision
+whether a pair is inside a cutoff is then uncertain if its distance deviates from the cutoff by less than the
+error of a distance. `infer` finds the decimal grid of the coordinates, so that the precision need not be
+documented.
 
-Rounding of coordinates moves a crossing to another frame, hides a short visit, or makes a pair near the
-cutoff cross it. One file does not show which flips are affected, but their number can be estimated
-(`grid_effect`): random pairs near the cutoff move as atoms of the file do between two frames, and are decided
-with and without rounding. For nearest neighbors, a flip is an exchange of two atoms at about the same
-distance from a third, so triples of atoms are drawn.
+Rounding of coordinates shifts a crossing to another frame, hides a short visit, or makes a pair near the
+cutoff cross it. The affected flips cannot be identified from one file, but their number is estimated by
+`grid_effect`. Random pairs near the cutoff are moved by displacements between two frames of the file, and
+decided with and without rounding. For nearest neighbors, a flip exchanges two atoms at about the same
+distance from a third atom, so triples of atoms are drawn.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ _WIDE = 4.0
 
 @dataclass(frozen=True)
 class Resolution:
-    """Resolution of the positions in a file."""
+    """Resolution of the positions in a file, a decimal grid or a floating-point format."""
 
     # "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32", "float64", or
     # "unknown" where every coordinate looked at is 0 (bounds are then those of float32)
@@ -68,16 +69,15 @@ class Resolution:
     told: bool = True  # whether the coordinates determine it; where all are 0, it is the format's usual one
 
     def bound(self, frame: Frame, atoms: AtomIndices = None) -> float:
-        """Return the largest error of a distance in this frame due to rounding when the file was written.
+        """Return the largest error of a distance in this frame due to rounding of the data in the file.
 
-        The bound, in length units, is the worst case: both atoms are moved by half a step along every axis in
-        opposite directions, and a pair across the boundary also by the rounding of the box. For float64, the
-        bound is the rounding of the distance. A margin to a cutoff has the same error bound; a margin among
-        the nearest neighbors (the difference of two distances) has twice that. If atoms are given, only their
-        distances count.
+        The bound, in length units, is the worst case: rounding moves both atoms by half a step along every
+        axis in opposite directions; for pairs across the boundary, the box error is added. For float64
+        positions, the bound is the rounding error of the distance. A margin to a cutoff has the same error
+        bound; a margin among nearest neighbors (a difference of two distances) has twice this bound. If
+        `atoms` are given, the bound is valid for distances between these atoms.
 
-        Error: valid for a pair through one period of the box; each further period adds the error of the box
-            again.
+        Error: valid for pairs across one period of the box; each further period adds the error of the box.
         """
         if atoms is not None or not np.isfinite(frame.furthest):
             x = frame.positions if atoms is None else frame.positions[atoms]
@@ -100,7 +100,7 @@ class Resolution:
         return float(2 * np.sqrt(3) * coordinate + box + arithmetic)
 
     def usual_step(self, frame: Frame) -> float:
-        """Return the root mean square value of the last digit of a coordinate, in length units."""
+        """Return the root mean square size of the last digit of a coordinate, in length units."""
         if not len(frame.positions):
             return 0.0
         if not self.step:
@@ -117,7 +117,7 @@ class Resolution:
         return self.kind in ("float32", "unknown") or self.bits == 32
 
     def _half(self, frame: Frame) -> float:
-        """Return half of the largest decimal step along an axis, in length units."""
+        """Return half the largest step of the decimal grid along an axis, in length units."""
         if not self.step or not len(frame.positions):
             return 0.0
         if self.kind == "fractions":
@@ -136,8 +136,8 @@ def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resoluti
 
     Args:
         sample: frames of one file, at least one.
-        bits: width of a coordinate as the reader returns it.
-        format: the reader's name of the format, for formats with known rounding.
+        bits: width of the coordinates that the reader returns, in bits.
+        format: name of the file format in the reader, used for formats with known rounding.
     """
     moved = np.zeros(len(sample[0].positions), bool)
     for frame in sample[1:]:
@@ -175,7 +175,7 @@ def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resoluti
 
 
 def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
-    """Return positions as fractions of the box vectors."""
+    """Return positions as fractional coordinates of the box vectors."""
     return np.linalg.solve(frame.box.matrix.T, (frame.positions - frame.box.origin).T).T
 
 
@@ -185,11 +185,11 @@ def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
 def decimal_grid(
     values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values"]
 ) -> tuple[float, int]:
-    """Find the decimal grid that holds all values, each within its slack.
+    """Find the decimal grid that contains all values, each within its tolerance `slack`.
 
     Returns:
         (the coarsest decimal step of which all values are multiples, 0); or (the step of the largest value,
-            the number of significant digits of all values); or (0.0, 0) if the values are not decimals.
+            the common number of significant digits); or (0.0, 0) if the values are not decimals.
     """
     values, index = np.unique(values, return_index=True)
     slack = slack[index]
@@ -213,7 +213,7 @@ def decimal_grid(
 
 
 def steps_of(values: Float[np.ndarray, "*shape"], step: float, digits: int) -> Float[np.ndarray, "*shape"]:
-    """Return the value of the last digit of each number: the step, or by size for significant digits."""
+    """Return the size of the last digit of each number, for a fixed step or for significant digits."""
     if digits == 0:
         return np.full_like(values, step)
     size = np.where(values == 0, 1.0, np.abs(values))
@@ -233,7 +233,7 @@ def _fixed(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values
 
 
 def _chance(parts: Float[np.ndarray, "values"]) -> float:
-    """Return the logarithm of the probability that random values all fall into given fractions of a step."""
+    """Return the log probability that random values all lie within given fractions of a step of the grid."""
     return float(np.log(np.maximum(parts, 1e-300)).sum())
 
 
@@ -249,7 +249,7 @@ Places = tuple[Float[np.ndarray, "draws 3"], ...]
 
 @dataclass(frozen=True)
 class GridEffect:
-    """Estimated shares of flips that the rounding of a file hides or creates."""
+    """Estimated fractions of flips that are hidden or created by rounding in a file."""
 
     missed: float  # share of the flips that happened between two frames and are not in the file at that frame
     invented: float  # share of the flips in the file that did not happen at that frame
@@ -266,25 +266,25 @@ def grid_effect(
     ranked: bool = False,
     draws: int = _DRAWS,
 ) -> GridEffect | None:
-    """Estimate the effect of a file's resolution on flips at a cutoff or among the nearest neighbors.
+    """Estimate how rounding in a file changes the flips at a cutoff or among nearest neighbors.
 
     Args:
         resolution: resolution of the file.
         sample: consecutive frames at the stride of the analysis.
-        radius: the cutoff length; if `ranked`, the approximate distance of the last nearest neighbor.
+        radius: the cutoff length; if `ranked`, the approximate distance of the farthest neighbor.
         first: atoms on one side of a pair, whose neighbors are counted; None for all.
         second: atoms on the other side; None for the same atoms.
-        ranked: True if the order of distances decides, instead of a cutoff.
+        ranked: True if neighbors are defined by the order of distances instead of a cutoff.
         draws: number of pairs or triples drawn.
 
     Returns:
-        the shares; None with fewer than two frames, no motion, all coordinates 0, or no radius.
+        the fractions; None for fewer than two frames, no motion, all coordinates 0, or no radius.
 
-    Error: the atoms of a pair are assumed to move independently and straight, and pairs to be spread evenly
-        around the cutoff; the draws scatter by about 1 % of the shares. In an LJ liquid with known float64
-        positions, the shares were right to 0.01 at strides of 0.0002 to 0.1 τ; for the 4 nearest neighbors to
-        0.02, and for the 12 nearest to 0.07 (tests/trajectories/test_resolution.py). Bonded atoms move
-        together, with less relative motion than assumed.
+    Error: both atoms of a pair are assumed to move independently and straight, and pairs to be uniformly
+        distributed around the cutoff; the statistical error is about 1 % of the fractions. In an LJ liquid
+        with known float64 positions, the fractions were correct to 0.01 at strides of 0.0002 to 0.1 τ; for
+        the 4 nearest neighbors to 0.02, and for the 12 nearest to 0.07
+        (tests/trajectories/test_resolution.py). Bonded atoms have less relative motion than assumed.
     """
     if len(sample) < 2 or not len(sample[0].positions) or not radius > 0:
         return None
@@ -303,7 +303,7 @@ def grid_effect(
     before, after = _drawn(random, one, other, radius, steps, draws, ranked)
 
     def decided(places: Places) -> np.ndarray:
-        """Return True if a pair is inside; for a triple, if its second atom is nearer than its third."""
+        """Return True if a pair is inside, or if the second atom of a triple is nearer than the third."""
         squares = [((place - places[0]) ** 2).sum(axis=1) for place in places[1:]]
         return squares[0] < (squares[1] if ranked else radius**2)
 
@@ -326,7 +326,7 @@ def _drawn(
     draws: int,
     ranked: bool,
 ) -> tuple[Places, Places]:
-    """Draw pairs near the radius, or triples with two equal distances, before and after their motion."""
+    """Draw pairs near the radius, or triples with two equal distances; return start and end positions."""
     moved = [moves[random.integers(len(moves), size=draws)] for moves in (one, other, other)[: 2 + ranked]]
     # the distance of the middle one of three counts twice where the others are on opposite sides
     spread = float(np.sqrt((1 + ranked) * (one**2).mean() + (1 + ranked) * (other**2).mean()))
@@ -341,17 +341,17 @@ def _drawn(
 
 
 def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
-    """Return the vectors of the grid on which positions lie, as rows, in length units."""
+    """Return the grid vectors of rounded positions, as rows, in length units."""
     if resolution.kind == "fractions" and not resolution.digits:
         return resolution.step * frame.box.matrix
     return resolution.usual_step(frame) * np.eye(3)
 
 
 def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]:
-    """Return the displacement of every atom in one frame, corrected for rounding.
+    """Return the displacement of every atom from one frame to the next, corrected for rounding.
 
-    Displacements are measured over enough frames to exceed a step of the grid clearly; the variance that
-    rounding adds is subtracted.
+    Displacements are measured over several frames, until they clearly exceed a step of the grid; the variance
+    due to rounding is subtracted.
     """
     moves, lag, total = np.zeros_like(sample[0].positions), 0, 0.0
     for before, after in pairwise(sample):
@@ -368,11 +368,11 @@ def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]
 
 
 def unrounded(variance: float, size: float) -> float:
-    """Return the variance that displacements had before positions were rounded to multiples of size.
+    """Return the variance of displacements before positions were rounded to multiples of `size`.
 
-    If a displacement exceeds a whole number of steps by a fraction f, rounding adds size² f (1 - f) on
-    average over starting points. For normally distributed displacements of variance v, this averages (by its
-    Fourier series) to size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
+    If a displacement exceeds an integer number of steps by the fraction f of a step, rounding adds size² f (1
+    - f) to its mean square. The mean of this term for normally distributed displacements of variance v is, by
+    its Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
     """
     low, high, k = 0.0, variance, np.arange(1, 200)
     for _ in range(60):

@@ -1,8 +1,8 @@
-"""Membership rules: each defines the neighbors of an atom, and a margin for every decision.
+"""Membership rules, which define the neighbors of an atom and the margin of every decision.
 
-A rule is *symmetric* (a pair is inside or not, in either order) or *directed* (j is a neighbor of i, and i
-need not be a neighbor of j). Distances are compared as float64 squares; a margin is a length, positive
-inside:
+A rule is *symmetric* (i and j are neighbors of each other) or *directed* (j may be a neighbor of i although i
+is not a neighbor of j). Squared distances are compared in float64. The margin of a pair at distance r is a
+length, positive for neighbors:
 
     CutoffRule      r_cut - r
     SpeciesCutoffs  r_cut of the two species - r
@@ -38,7 +38,7 @@ def _count(value: int, where: str) -> None:
 
 
 class _Membership:
-    """Properties that most membership rules share."""
+    """Base class of membership rules, with properties that most rules share."""
 
     directed = False
     needs_species = False
@@ -47,27 +47,27 @@ class _Membership:
 
     @property
     def reach(self) -> float:
-        """Distance beyond which no atom can be a neighbor, in length units."""
+        """Largest distance at which an atom can be a neighbor, in length units."""
         return self.radius
 
     @property
     def shortest(self) -> float:
-        """Shortest length with which distances are compared; infinite if their order decides."""
+        """Smallest cutoff radius of the rule, in length units; infinite if neighbors are defined by order."""
         return self.reach
 
     def table(
         self, species: Sequence[str] | np.ndarray
     ) -> tuple[Int[np.ndarray, "atoms"], Float[np.ndarray, "species species"]]:
-        """Return the species number of each atom, and the radius of each pair of numbers (or `NEVER`)."""
+        """Return the species number of each atom, and the radius of each pair of species or `NEVER`."""
         return np.zeros(len(species), np.int64), np.array([[float(self.reach)]])
 
 
 @dataclass(frozen=True)
 class CutoffRule(_Membership):
-    """Rule by which a pair is inside if its distance r is less than `radius`, a length.
+    """Rule by which a pair is inside if its distance is less than `radius`, a length.
 
-    The decision compares r² with radius² in float64, as most codes do; a pair within rounding error of the
-    radius is ambiguous, whichever way it is decided.
+    Like most codes, the rule compares r² with radius² in float64. A pair whose distance equals the radius
+    within rounding error is marked as ambiguous.
     """
 
     radius: float
@@ -82,7 +82,7 @@ class CutoffRule(_Membership):
 
 @dataclass(frozen=True)
 class SpeciesCutoffs(_Membership):
-    """Rule with a radius (length) for each pair of species, in either order; other pairs are never inside."""
+    """Rule with a cutoff radius per pair of species, in either order; other pairs are never neighbors."""
 
     radii: Mapping[tuple[str, str], float]
 
@@ -116,10 +116,10 @@ class SpeciesCutoffs(_Membership):
     def table(
         self, species: Sequence[str] | np.ndarray
     ) -> tuple[Int[np.ndarray, "atoms"], Float[np.ndarray, "species species"]]:
-        """Return the species numbers and radii, as every rule does.
+        """Return the species number of each atom, and the radius of each pair of species or `NEVER`.
 
         Raises:
-            InputError: no atom has a species of the rule.
+            InputError: a species of the rule does not occur among the atoms.
         """
         names, index = np.unique(np.asarray(species, str), return_inverse=True)
         place = {str(name): k for k, name in enumerate(names)}
@@ -135,7 +135,7 @@ class SpeciesCutoffs(_Membership):
 
 @dataclass(frozen=True)
 class Nearest(_Membership):
-    """Rule for the k nearest neighbors of each atom within a length, directed from atom to neighbor."""
+    """Directed rule: the neighbors of an atom are the k nearest atoms, within an optional distance."""
 
     k: int
     within: float | None = None
@@ -153,7 +153,7 @@ class Nearest(_Membership):
 
     @property
     def most(self) -> int:
-        """Largest number of neighbors that an atom can have."""
+        """Largest possible number of neighbors of an atom."""
         return self.k
 
     @property
@@ -168,9 +168,9 @@ class Nearest(_Membership):
 
 @dataclass(frozen=True)
 class Capped(_Membership):
-    """Cutoff rule that keeps at most the `most` nearest of the atoms inside the radius; the rule is directed.
+    """Directed rule: the neighbors of an atom are the `most` nearest atoms inside a cutoff radius.
 
-    Graph builders with a maximum number of neighbors that keep the nearest ones follow this rule.
+    Graph builders that limit the number of neighbors by keeping the nearest atoms use this rule.
     """
 
     radius: float
@@ -191,5 +191,5 @@ Rule = CutoffRule | SpeciesCutoffs | Nearest | Capped
 
 
 def smallest_radius(rules: Sequence[Rule]) -> float:
-    """Return the shortest length with which any of the rules compares distances; infinite if none does."""
+    """Return the smallest cutoff radius of several rules, a length; infinite if no rule has a radius."""
     return float(min((one.shortest for one in rules), default=math.inf))

@@ -1,7 +1,7 @@
-"""Search of all pairs of a frame within a distance, with images; nearest neighbors; changes between frames.
+"""Search for all pairs of a frame within a distance, and for nearest neighbors; comparison of two frames.
 
-Distances in a search carry the rounding error of wrapped coordinates. A pair closer to its threshold than a
-guard band is decided again from the coordinates as stored (`lattice.square_of`), so all searches agree.
+Distances in a search contain the rounding error of wrapped coordinates. A pair in a guard band around its
+threshold is decided from the stored coordinates (`lattice.square_of`), so all search algorithms agree.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _MOST_IMAGES_EACH, _MOST_REPEATED = 100, 2_000_000
 
 
 class Found(NamedTuple):
-    """Pairs recorded by a search, one row per pair and image, in no particular order."""
+    """Pairs found by a search, one entry per pair and image, in no particular order."""
 
     kind: int  # `INSIDE` or `DIRECTED`
     i: Int[np.ndarray, "pairs"]  # the center of a directed one, else either
@@ -56,7 +56,7 @@ class Found(NamedTuple):
 
 
 class NeighborRows(NamedTuple):
-    """Neighbors of each atom, stored in one row per atom."""
+    """Neighbors of all atoms, stored as one row per atom."""
 
     first: Int[np.ndarray, "atoms"]  # where the row of each atom begins in `other`, and its length
     count: Int[np.ndarray, "atoms"]
@@ -64,7 +64,7 @@ class NeighborRows(NamedTuple):
     square: Float[np.ndarray, "stored"]  # squared distances, where the rule is directed; else empty
 
     def pairs(self) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Return the pairs (i, j) of all rows, row by row."""
+        """Return the arrays i and j of all pairs, row by row."""
         i = np.repeat(np.arange(len(self.first)), self.count)
         inside = np.arange(len(i)) - np.repeat(np.cumsum(self.count) - self.count, self.count)
         return i, self.other[self.first[i] + inside].astype(np.int64)
@@ -80,14 +80,14 @@ def search(
     room: int = 0,
     open_room: int = 0,
 ) -> Found:
-    """Find pairs of atoms; images of an atom itself are not included (see `lattice.own_images`).
+    """Find pairs of atoms within a radius, without images of an atom itself (see `lattice.own_images`).
 
     Args:
-        kind: what to record. `INSIDE`: pairs inside. `DIRECTED`: for each center, all atoms within radius +
-            band.
-        band: pairs this close to their radius are decided from the coordinates as stored, length; at least
-            the rounding error of a distance.
-        bound: pairs within this length of their radius are counted as close; at most the band.
+        kind: pairs to record: `INSIDE` (inside the radius) or `DIRECTED` (within radius + band of each
+            center).
+        band: half width of the guard band, at least the rounding error of a distance, length.
+        bound: pairs whose distance is within this length of their radius are counted as close; at most
+            `band`.
         room, open_room: expected numbers of pairs inside and of pairs in the band, if known.
 
     Raises:
@@ -117,9 +117,9 @@ def search(
 
 @njit(inline="always")
 def exact_square(x, home, i, j, n0, n1, n2, vectors):
-    """Return the deciding squared distance of a pair, found with shift n of the wrapped coordinates of j.
+    """Return the squared distance that decides a pair, given the image shift n of wrapped coordinates of j.
 
-    The result is the same in either order of the two atoms, since all rounded numbers only change sign.
+    Exchanging the two atoms only changes the signs of all rounded numbers, so the result is bitwise the same.
     """
     s0, s1, s2 = n0 + home[i, 0] - home[j, 0], n1 + home[i, 1] - home[j, 1], n2 + home[i, 2] - home[j, 2]
     return square_of(x, i, j, s0, s1, s2, vectors)
@@ -127,10 +127,10 @@ def exact_square(x, home, i, j, n0, n1, n2, vectors):
 
 @njit
 def _settle(x, atoms, kind, square, radius, bound, found):
-    """Decide the candidates that wrapped coordinates left open; return the smallest |margin|.
+    """Decide the pairs that wrapped coordinates left undecided; return the smallest |margin|.
 
-    Values on entry are squared distances of wrapped coordinates; a directed search replaces them by the
-    deciding squares.
+    In a directed search, the squared distances from wrapped coordinates in `found.value` are replaced by the
+    squared distances from stored coordinates.
     """
     smallest, home, vectors, species = np.inf, atoms.home, atoms.lattice.vectors, atoms.species
     for k in range(found.counts[1]):
@@ -151,7 +151,7 @@ def _settle(x, atoms, kind, square, radius, bound, found):
 
 
 def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float) -> float:
-    """Return the expected number of pairs if atoms fill the box evenly; 0 for a box that is not periodic."""
+    """Return the expected number of pairs of uniformly distributed atoms; 0 for a nonperiodic box."""
     if not lattice.periodic.all():
         return 0.0
     images = (4.0 / 3.0 * np.pi * radius**3) / lattice.volume
@@ -169,7 +169,7 @@ def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float)
 
 
 def _check_count(pairs: float, radius: float) -> None:
-    """Reject more pairs than there is memory for."""
+    """Raise an error if the pairs do not fit into memory."""
     memory = _memory()
     if pairs > min(MOST_PAIRS, memory / _BYTES):
         raise InputError(
@@ -182,7 +182,7 @@ def _check_count(pairs: float, radius: float) -> None:
 
 
 def _memory() -> float:
-    """Return the bytes of memory of the machine; 32 GB if they are unknown."""
+    """Return the memory of the machine in bytes; 32 GB if it is unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):
@@ -190,7 +190,7 @@ def _memory() -> float:
 
 
 def rows_of(found: Found, atoms: int) -> NeighborRows:
-    """Sort pairs into rows by their first atom, which is the lower one unless pairs are directed."""
+    """Sort pairs into one row per first atom; in undirected pairs, the atom with the lower index is first."""
     i, j, directed = found.i, found.j, found.kind == DIRECTED
     low, high = (i, j) if directed else (np.minimum(i, j), np.maximum(i, j))
     room = np.empty((4, len(i)), np.int64)
@@ -203,7 +203,7 @@ def rows_of(found: Found, atoms: int) -> NeighborRows:
 
 
 class Chosen(NamedTuple):
-    """Nearest neighbors of each center, nearest first."""
+    """Nearest neighbors of each center, sorted by distance."""
 
     rows: NeighborRows  # the squares are those of the neighbors
     close: int  # as of `Found`
@@ -215,7 +215,7 @@ class Chosen(NamedTuple):
 def nearest(
     placed: Placed, who: Participants, rule: Nearest | Capped, *, band: float, bound: float
 ) -> Chosen:
-    """Find the nearest few neighbors of each center; arguments as in `search`."""
+    """Find the nearest neighbors of each center, as many as the rule defines; arguments as in `search`."""
     positions, lattice = placed.positions, placed.lattice
     atoms, reach, centers = len(positions), rule.reach, who.centers
     # a distance that no pair exceeds: a lattice has no end
@@ -255,7 +255,7 @@ def nearest(
 def _choose(
     rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
 ):  # fmt: skip
-    """Sort each row by (square, index), keep the nearest; return (written, close, smallest, lacking)."""
+    """Sort rows by (square, index), keep the nearest atoms; return (written, close, smallest, lacking)."""
     written, close, smallest, short = 0, 0, np.inf, 0
     for i in range(rows.first.shape[0]):
         if not centers[i]:
@@ -311,7 +311,7 @@ def _choose(
 
 
 def _guess(placed: Placed, who: Participants, most: int, everything: float) -> float:
-    """Estimate a radius within which most atoms have enough neighbors."""
+    """Estimate a radius within which most atoms have as many neighbors as the rule requires."""
     lattice, candidates = placed.lattice, int(who.others.sum())
     if not candidates:
         return 1.0 if not np.isfinite(everything) else max(everything, 1e-300)
@@ -326,7 +326,7 @@ def _guess(placed: Placed, who: Participants, most: int, everything: float) -> f
 
 
 class Changed(NamedTuple):
-    """Decisions that differ between two frames, unordered, by indices of the participating atoms."""
+    """Decisions that differ between two frames, unsorted, by indices of the participating atoms."""
 
     i: Int[np.ndarray, "flips"]
     j: Int[np.ndarray, "flips"]
@@ -335,12 +335,12 @@ class Changed(NamedTuple):
 
     @classmethod
     def room(cls, pairs: int) -> Changed:
-        """Allocate columns for the given number of pairs."""
+        """Allocate the columns of a table for the given number of pairs."""
         return cls._make(np.empty(pairs, kind) for kind in (np.int64, np.int64, np.int64, np.bool_))
 
 
 def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
-    """Return all decisions that differ, by pair and image; `room` is the initial size of the buffers."""
+    """Return all decisions that differ between two frames; `room` is the initial size of the buffers."""
     while True:
         made = Changed.room(room)
         total = _compared(before, now, made)
@@ -351,7 +351,7 @@ def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
 
 @njit
 def _compared(old, new, made):
-    """Write decisions that differ; rows that do not fit are only counted. seen[j] = (images before, now)."""
+    """Write differing decisions; beyond the capacity, only count. seen[j] = (images before, images now)."""
     atoms = old.first.shape[0]
     seen = np.zeros((atoms, 2), np.int32)
     total, room = 0, made.i.shape[0]
@@ -381,9 +381,9 @@ def image_distances(
     rank: Int[np.ndarray, "pairs"],
     directed: bool = False,
 ) -> Float[np.ndarray, "pairs"]:
-    """Return distances, in length units, to the images with `rank` nearer images; inf without such an image.
+    """Return distances (length) to the image of j that has `rank` nearer images; inf if there is none.
 
-    With a directed rule, both images of a ± pair of an atom itself are neighbors.
+    If the rule is directed, opposite images of an atom are two different neighbors of this atom.
     """
     out = np.empty(len(i))
     rank = np.where(i == j, rank // 2, rank) if directed else rank
@@ -407,7 +407,7 @@ def _image_distances(x, lattice, i, j, rank, out):
 
 
 def ranks(i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-    """Return the numbers 0, 1, 2, ... within each run of equal (i, j)."""
+    """Return the numbers 0, 1, 2, ... within each run of entries with equal (i, j)."""
     new = np.ones(len(i), bool)
     new[1:] = (i[1:] != i[:-1]) | (j[1:] != j[:-1])
     at = np.flatnonzero(new)

@@ -1,4 +1,4 @@
-"""Selection of atoms by text in MDAnalysis's selection language, for files of any reader."""
+"""Selection of atoms in MDAnalysis's selection syntax, for trajectories from any reader."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _SHOWN = 8
 
 
 def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
-    """Return the indices of the atoms that a selection matches at the first requested frame, ascending.
+    """Return indices, ascending, of the atoms that match a selection at the first requested frame.
 
-    A selection that depends on positions ("around 5 protein") is evaluated once, at that frame.
+    A selection by positions ("around 5 protein") is evaluated only once, at the first frame.
 
     Raises:
-        InputError: the text is not a selection, matches no atom, or needs information that the file lacks.
+        InputError: the text is not a selection, matches no atom, or needs data that are not in the file.
     """
     from MDAnalysis.exceptions import NoDataError, SelectionError
 
@@ -52,7 +52,7 @@ def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
 
 
 def _universe(trajectory: Trajectory) -> Any:
-    """Return a Universe at the first requested frame; distances in a selection are float32."""
+    """Return a Universe at the first requested frame, in which distances have float32 precision."""
     from MDAnalysis.lib.mdamath import triclinic_box
 
     first = next(iter(trajectory.frames()), None)
@@ -74,7 +74,7 @@ def _universe(trajectory: Trajectory) -> Any:
 
 
 def _there_are(table: AtomTable) -> str:
-    """Describe the names that a selection can use."""
+    """List the atom, residue or segment names that occur in a file, for an error message."""
     if not table.named:
         return "the file has no names of atoms"
     words = []

@@ -1,4 +1,4 @@
-"""Comparison of two frames of the same atoms: separation, common shift, velocities, and growth over time."""
+"""Comparison of two frames of the same atoms: separation, common shift, velocities, and growth in time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _STEEPEST, _BETTER = 4.0, 2.0
 
 @dataclass(frozen=True)
 class Separation:
-    """Displacements of atoms between two frames, summarized."""
+    """Summary of the displacements of atoms between two frames."""
 
     furthest: float  # largest displacement, length
     typical: float  # root mean square displacement, length
@@ -43,16 +43,16 @@ class Separation:
 def displacements(
     start: Frame, end: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | float = 0.0
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """Return (displacements between two frames less a shift, numbers of lattice vectors removed)."""
+    """Return (displacements between two frames minus a common shift, numbers of lattice vectors removed)."""
     x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
     shared = np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool)
     return shortest(y - x - shift, Box(end.box.matrix, shared))
 
 
 def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
-    """Return True if two boxes generate the same lattice, whichever lattice vectors they list.
+    """Return True if two boxes generate the same lattice, possibly from different lattice vectors.
 
-    A component of a lattice vector may differ by the tolerance, in length units.
+    Components of lattice vectors may differ by up to `tolerance`, in length units.
     """
     if (np.asarray(one.pbc, bool) != np.asarray(other.pbc, bool)).any():
         return False
@@ -68,7 +68,7 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
 def separation(
     one: Frame, other: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | None = None
 ) -> Separation:
-    """Return the separation of two frames less a shift, for the given atoms or all."""
+    """Return the separation of two frames minus a common shift, for the given atoms; None for all atoms."""
     moved, whole = displacements(one, other, atoms, 0.0 if shift is None else shift)
     square = np.sum(moved**2, axis=1)
     at = int(np.argmax(square))
@@ -82,7 +82,7 @@ def separation(
 
 
 def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[np.ndarray, "3"]:
-    """Return the displacement that most atoms have in common, up to lattice vectors, in length units."""
+    """Return the displacement common to most atoms, modulo lattice vectors, in length units."""
     shift = displacements(one, other, atoms)[0][0]
     for _ in range(2):
         # nearest images about one atom lie on both sides of the box if that atom is on the other; about the
@@ -95,20 +95,20 @@ def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[n
 
 
 def velocities_of(frame: Frame) -> Frame:
-    """Return a frame whose positions are the velocities of the given frame."""
+    """Return a frame that contains the velocities of the given frame in place of positions."""
     assert frame.velocities is not None
     return Frame(frame.index, frame.time, frame.velocities, Box())
 
 
 def velocities_differ(a: Frame, b: Frame, atoms: AtomIndices, bound: float) -> dict[str, Any] | None:
-    """Describe a difference between the velocities of two frames, beyond a vector common to all atoms.
+    """Describe a difference between the velocities of two frames other than a common velocity of all atoms.
 
     Args:
         bound: error bound of the difference of two velocities, in length per time.
 
     Returns:
-        None if neither frame has velocities, or they agree; kind "zero" and the side without velocities; or
-            kind "other", the factor from A to B by least squares, and the correlation.
+        None if the velocities agree or neither frame has any; kind "zero" and the side without velocities; or
+            kind "other", the least-squares factor from A to B, and the correlation.
     """
     rows = slice(None) if atoms is None else atoms
     u, v = (np.zeros((1, 3)) if one.velocities is None else one.velocities[rows] for one in (a, b))
@@ -123,7 +123,7 @@ def velocities_differ(a: Frame, b: Frame, atoms: AtomIndices, bound: float) -> d
 
 
 class FreeFlight(NamedTuple):
-    """Displacements between two frames compared with those that velocities predict."""
+    """Comparison of the displacements between two frames with displacements predicted from velocities."""
 
     moved: float  # root mean square displacement over that of velocities times time
     factor: float  # displacements over the mean of both velocities times time, by least squares
@@ -134,8 +134,8 @@ class FreeFlight(NamedTuple):
 def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
     """Compare displacements between two frames with velocities; return None without velocities or motion.
 
-    `moved` is near 1 if atoms fly straight, below 1 if they turn around in between, and never far above 1.
-    `factor` is near 1 if velocities keep their direction and are in units of position over time.
+    `moved` is near 1 for straight paths, below 1 if atoms turn around, and never far above 1. `factor` is
+    near 1 if velocities keep their directions, in units of position over time.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None
@@ -157,15 +157,15 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
 
 
 def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
-    """Return the contradiction of displacements with velocities and times, from medians over some frames.
+    """Return the inconsistency of displacements with velocities and times, from medians over frames.
 
-    If atoms turn around between two frames, they move less than velocities predict, without contradiction.
-    A smaller displacement counts only if velocities kept their directions and displacements are parallel to
-    them.
+    If atoms turn around between two frames, displacements are smaller than predicted from velocities, but not
+    inconsistent. A smaller displacement counts only if it is parallel to velocities that kept their
+    directions.
 
     Returns:
         the factor by which displacements are too large (or too small, below 1), and whether it is a lower
-            bound; None if there is no contradiction.
+            bound; None if there is no inconsistency.
     """
     if not flights:
         return None
@@ -180,7 +180,7 @@ def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class GrowthLaw:
-    """Fits of a growing separation: its logarithm against time, and against the logarithm of time."""
+    """Fits of a growing separation: log separation against time, and against log time."""
 
     frames: int  # used
     rate: float  # of an exponential, per time
@@ -196,16 +196,16 @@ def growth(
     limit: float,
     began: tuple[float, float],
 ) -> GrowthLaw | None:
-    """Fit the law by which a separation grows.
+    """Fit an exponential and a power law to a separation that grows in time.
 
-    A constant error of a force or a velocity separates two runs as a low power of time; chaos separates them
-    exponentially. Lengths of 0, and lengths above the limit, which are no longer small, are left out.
+    A constant error of a force or a velocity makes the separation of two runs grow as a low power of time;
+    chaos makes it grow exponentially. Zero lengths, and lengths above `limit`, are left out.
 
     Args:
-        began: times between which the separation began, as the origin of a power law.
+        began: earliest and latest possible time at which the separation began, as the origin of a power law.
 
     Returns:
-        the law; None with fewer than five frames.
+        the law; None for fewer than five frames.
     """
     use = (length > 0) & (length < limit) & np.isfinite(length)
     if np.count_nonzero(use) < 5 or np.ptp(time[use]) == 0:
