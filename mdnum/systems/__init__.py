@@ -1,6 +1,6 @@
-"""System files and how they become programs: schema, loading, checks, and building.
+"""System files: their schema, and how a simulation is loaded, validated and built from a system file.
 
-Importing this package imports neither jax nor jax_md; `build` and `Simulation` are imported on first use.
+Importing this package does not import jax or jax_md; `build` and `Simulation` are imported on first use.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = None) -> Simulation | BallSystem:
-    """Load a system of either world: a simulation, or a ball's system; for arguments see `load`.
+    """Load a molecular-dynamics system or a bouncing-ball system; for the arguments see `load`.
 
     Raises:
         InputError: the system cannot be run; the message is one line.
@@ -36,7 +36,7 @@ def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = Non
 
 
 class _Package(ModuleType):
-    """Module class that keeps `build` and `build_ball` bound to the functions, not to the submodules."""
+    """Module type in which `build` and `build_ball` are functions, not the submodules of the same name."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         # Python binds an imported submodule to its package; here that would hide the function of its name

@@ -1,8 +1,8 @@
-"""Classification and validation of an energy function, by calling it before it is simulated.
+"""Classification and validation of a user's energy function by trial calls before the simulation.
 
 A signature does not reveal whether positions are fractional, whether lattice vectors are rows or columns, or
-whether the given box is used at all, and a wrong guess gives plausible energies. Therefore the function is
-called at the first configuration, with equivalent lists and with slightly different boxes (`trial`).
+whether the function uses the given box. A wrong guess gives plausible energies. Therefore the function is
+called at the first configuration, with equivalent neighbor lists and slightly different boxes.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ _RESOLVED, _BEFORE = 2e-3, 0.03
 
 
 def admitted(simulation: Simulation) -> Simulation:
-    """Return the simulation with a classified energy function: its convention, its smoothness, and notes.
+    """Classify the energy function of a simulation: find its calling convention and its smoothness.
 
     Raises:
-        AdmissionError: the function has one of the defects that are listed in trial.toml.
+        AdmissionError: the energy function has a defect that is listed in trial.toml.
     """
     with jaxmd.standard_promotion():
         trial = _of_a_part(simulation)
@@ -53,7 +53,7 @@ def admitted(simulation: Simulation) -> Simulation:
 
 
 def _of_a_part(simulation: Simulation) -> Trial | None:
-    """Examine a few atoms of a large structure, and check all energies; return None if inconclusive."""
+    """Classify the energy function with a few atoms of a large structure; return None if inconclusive."""
     if simulation.atoms <= _ENOUGH or simulation.model.start is not None:
         return None
     try:
@@ -72,12 +72,12 @@ def _of_a_part(simulation: Simulation) -> Trial | None:
 
 
 def _short(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Round values to six digits, because other processors compute other last digits."""
+    """Round values to six digits, because the last digits depend on the processor."""
     return {key: float(f"{one:.6g}") if isinstance(one, float) else one for key, one in values.items()}
 
 
 def _examine(trial: Trial) -> None:
-    """Classify the energy function; raise an AdmissionError if its values cannot be correct."""
+    """Classify the energy function; raise an AdmissionError if its energies or forces cannot be correct."""
     _resolve(trial)
     _check(trial)
     _at_the_cutoff(trial)
@@ -115,7 +115,7 @@ def _resolve(trial: Trial) -> None:
 
 
 def _keep(trial: Trial, box: str) -> None:
-    """Store how the function uses the box, and the keywords needed for this; energies must be finite."""
+    """Store how the energy function uses the box, and by which keywords; check that energies are finite."""
     how = trial.call.how
     trial.learn(box=box)
     energy, forces = trial.there()
@@ -139,9 +139,9 @@ def _keep(trial: Trial, box: str) -> None:
 
 
 class _Moved:
-    """Effects of moving the atom with most neighbors by lattice vectors, on the energy of its pairs.
+    """Changes of the energy when the atom with the most neighbors is moved by a lattice vector.
 
-    Only pairs whose nearest image remains the same in a sheared box are used.
+    In a sheared box, only the pairs that keep their nearest image are used.
     """
 
     def __init__(self, trial: Trial):
@@ -156,12 +156,12 @@ class _Moved:
         self.whole = np.where(whole, near, n).astype(np.int32)
 
     def by(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
-        """Return positions with the atom moved by each of some vectors, then the original positions."""
+        """Return positions after the atom was moved by each vector, and finally the original positions."""
         x, moved = self.trial.x, np.arange(self.trial.n) == self.central
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 
     def takes_images(self) -> bool:
-        """Return True if the energy is invariant under lattice vectors, but only those of this convention."""
+        """Return True if a move by a lattice vector in this convention does not change the energy."""
         if not self.unchanged(self.trial.cell):
             return False
         # of a fractional function units are lattice vectors, and perhaps these are whole numbers of units
@@ -169,7 +169,7 @@ class _Moved:
         return call.how.fractional or not self.unchanged(np.eye(3) * call.length)
 
     def unchanged(self, vectors, cell=None) -> bool:
-        """Return True if moving the atom by any of some vectors does not change the energy."""
+        """Return True if the energy remains the same when the atom is moved by any of the vectors."""
         trial, idx = self.trial, self.idx
         none = np.nan_to_num(trial.energy(idx=np.full_like(idx, trial.n)))
         *moved, x = self.by(vectors)
@@ -179,7 +179,7 @@ class _Moved:
         return all(abs(trial.energy(x, idx, cell) - energy) <= allowed for x in moved)
 
     def follows(self) -> bool:
-        """Return True if the energy is invariant under lattice vectors of a slightly sheared box."""
+        """Return True if the energy is also invariant under the lattice vectors of a slightly sheared box."""
         trial = self.trial
         cell = trial.cell + trial.cell @ _SHEAR
         energy, push = trial.energy(idx=self.whole), np.abs(trial.there(idx=self.whole)[1]).max()
@@ -192,7 +192,7 @@ class _Moved:
 
 
 def _check(trial: Trial) -> None:
-    """Raise an error if the function's values cannot be correct; add notes about other properties."""
+    """Raise an error if energies or forces cannot be correct; add notes about the function's properties."""
     n, rng, inside = trial.n, np.random.default_rng(0), trial.inside
     energy, wide = trial.there()[0], trial.energy()
 
@@ -238,12 +238,12 @@ def _check(trial: Trial) -> None:
 
 
 def _over_both_lists(trial: Trial) -> dict[str, float]:
-    """Return the energies over the pairs inside the cutoff, and over those including the skin."""
+    """Return the energy for a list of the pairs inside the cutoff, and for a list that includes the skin."""
     return {"inside": trial.energy(), "skin": trial.energy(idx=trial.idx)}
 
 
 def _derivatives(trial: Trial, rng: np.random.Generator) -> None:
-    """Compare forces, and stress if the box is used, with finite differences of the energy."""
+    """Compare forces (and the stress, if the function uses the box) with finite differences of the energy."""
     step, allowed = (1e-5, 1e-4) if trial.double else (3e-3, 5e-2)
     r_cut = trial.model.r_cut
     step *= r_cut
@@ -291,7 +291,7 @@ def _derivatives(trial: Trial, rng: np.random.Generator) -> None:
 
 
 def _at_the_cutoff(trial: Trial) -> None:
-    """Find the effect of crossing the cutoff, for the pairs nearest to it, and the function's own range."""
+    """Find the jumps of energy and force when a pair crosses the cutoff, and the range of the forces."""
     n, r_cut, size = trial.n, trial.model.r_cut, trial.scale
     r = np.where(trial.idx < n, trial.distances(trial.idx, trial.x), np.inf)
     found, acts = [], []
@@ -303,7 +303,7 @@ def _at_the_cutoff(trial: Trial) -> None:
         toward = np.concatenate(displacement(trial.box, trial.x[[i]], trial.x[[j]])) / r[i, slot]
 
         def crossing(factor: float, i=i, j=j, toward=toward, r=r[i, slot]) -> tuple[float, float]:
-            """Return the contributions of the pair to the energy and to a force."""
+            """Return the contribution of the pair to the energy, and its largest to a force component."""
             x = trial.x.copy()
             x[j] += toward * (r_cut * factor - r)
             listed = trial.within(trial.idx, x, r_cut)
@@ -349,8 +349,9 @@ def _threes(trial: Trial) -> tuple[Any, Any, np.ndarray]:
     """Arrange the atoms in isolated groups of three.
 
     Returns:
-        a function that returns the list of chosen groups; a function that returns positions for a distance of
-        third atoms from first atoms, with second atoms at 0.6 of the cutoff; the third atoms.
+        a function that returns the neighbor list of chosen groups; a function that returns positions in which
+        the third atom of each group is at a given distance from the first, and the second atom at 0.6 of the
+        cutoff; the indices of the third atoms.
     """
     n, x = trial.n, trial.x
     first, second, third = np.arange(n - n % 3).reshape(3, -1)
@@ -372,7 +373,7 @@ def _threes(trial: Trial) -> tuple[Any, Any, np.ndarray]:
 
 
 def _adds(trial: Trial) -> bool:
-    """Return True if the energies of two groups of atoms without common pairs are additive."""
+    """Return True if the energies of two separate groups of atoms add up to the energy of both together."""
     listed, placed, third = _threes(trial)
     if len(third) < 2:
         return True
@@ -385,7 +386,7 @@ def _adds(trial: Trial) -> bool:
 def _reach(trial: Trial) -> tuple[float | None, float]:
     """Return the largest distance at which a listed pair has a force, and the largest distance tested.
 
-    The first value is None if the pair has no force at any distance.
+    The first value is None if the pair has no force at any distance that is tested.
     """
     r_cut, (listed, placed, third) = trial.model.r_cut, _threes(trial)
     furthest = min(2 * r_cut, 0.49 * trial.width if trial.pbc.any() else np.inf)
@@ -408,7 +409,7 @@ def _reach(trial: Trial) -> tuple[float | None, float]:
 
 
 def second_derivative(simulation: Simulation) -> str:
-    """Return the first operation that makes second derivatives of an energy function not finite, or ""."""
+    """Return the first operation with a second derivative of the energy that is not finite, or ""."""
     if not isinstance(simulation.model, EnergyFunction):
         return ""
     with jaxmd.standard_promotion():

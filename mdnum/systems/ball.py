@@ -1,7 +1,7 @@
-"""Schema of a system file with `world = "ball"`: frozen pydantic models, with the unit of every number.
+"""Schema of a system file of a bouncing ball (`world = "ball"`): pydantic models with units.
 
-Heights are in m, velocities in m/s, times in s. Stiffness and damping are per mass (1/s², 1/s), so that no
-mass is needed; the gain of a projection has no unit.
+Heights are in m, velocities in m/s, times in s. Stiffness and damping are per mass (1/s², 1/s), so no mass is
+needed; the gain of the projection contact has no unit.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
 
 
 class BoundaryTable(TomlTable):
-    """A batch at rest whose penetrations sum to exactly stop.tol: one is an ulp below it, the others tiny."""
+    """Balls at rest whose penetrations sum to exactly stop.tol: one is large, and the others are tiny."""
 
     terms: int = Field(
         default=8, ge=1, le=1_000_000, description="how many small penetrations make up the missing ulp"
@@ -96,7 +96,7 @@ class SineControl(TomlTable):
 
 
 class ValuesControl(TomlTable):
-    """Each step has a given acceleration, which is constant during the step."""
+    """The acceleration is given for each time step, and is constant during the step."""
 
     kind: Literal["values"]
     values: Annotated[tuple[float, ...], from_array] = Field(
@@ -137,7 +137,7 @@ class PenaltyContact(_Contact):
 
 
 class ProjectionContact(_Contact):
-    """Iterate y <- y + alpha k p, p = max(0, -y), until the rule in [stop] holds; then set y to max(y, 0)."""
+    """Iterate y <- y + alpha k max(0, -y) until the rule in [stop] is met; then set y to max(y, 0)."""
 
     kind: Literal["projection"]
     k: Positive = Field(description="gain (no unit)")
@@ -150,7 +150,7 @@ class ProjectionContact(_Contact):
 
 
 class ImpactContact(_Contact):
-    """Reset the velocity to v <- -e v at the floor."""
+    """At the floor, the velocity v is replaced by -e v, where e is the coefficient of restitution."""
 
     kind: Literal["impact"]
     restitution: Annotated[float, Field(ge=0, le=1)] = Field(
@@ -179,31 +179,31 @@ class _Tolerance(TomlTable):
 
 
 class SumRule(_Tolerance):
-    """The solver is stopped by the sum of all residuals, added in the order of precision.reduction."""
+    """The solver stops when the sum of residuals, in the order of precision.reduction, is below tol."""
 
     rule: Literal["sum"]
 
 
 class PerInstanceRule(_Tolerance):
-    """The solver stops for each ball separately, by the residual of this ball."""
+    """The solver stops for each ball separately, when the residual of this ball is below tol."""
 
     rule: Literal["per-instance"]
 
 
 class MaximumRule(_Tolerance):
-    """The stopping criterion is applied to the largest residual of the batch."""
+    """The solver stops when the largest residual of all balls is below tol."""
 
     rule: Literal["maximum"]
 
 
 class RelativeRule(_Tolerance):
-    """The solver is stopped by the sum of the residuals, relative to the sum before the first iteration."""
+    """The solver stops when the sum of residuals, relative to the initial sum, is below tol."""
 
     rule: Literal["relative"]
 
 
 class FixedRule(TomlTable):
-    """The solver makes a fixed number of iterations, whatever the residual."""
+    """The solver makes a fixed number of iterations and does not test the residual."""
 
     rule: Literal["fixed"]
     count: int = Field(ge=1, le=_MOST, description="iterations of every solve")
@@ -226,7 +226,7 @@ class IntegratorTable(TomlTable):
 
 
 class BallPrecision(TomlTable):
-    """The floating-point format of each role, and the order of sums."""
+    """Floating-point formats, the order in which residuals are summed, and the rounding of the state."""
 
     state: FloatName = Field(default="float64", description="heights and velocities")
     arithmetic: FloatName = Field(default="float64", description="everything a step computes")
@@ -269,7 +269,7 @@ class GradientTable(TomlTable):
 
 
 def _changes(value: Any) -> Any:
-    """Return tables of changes with dotted keys, even if TOML parsed the dots as tables."""
+    """Flatten the nested tables that TOML makes of dotted keys; return tables of changes with dotted keys."""
     if not isinstance(value, Mapping):
         return value
     return {name: flat(table) if isinstance(table, Mapping) else table for name, table in value.items()}
@@ -279,7 +279,7 @@ Variants = Annotated[dict[str, dict[str, Any]], BeforeValidator(_changes)]
 
 
 class BallSpec(TomlTable):
-    """A system file of the ball."""
+    """The contents of a system file of a bouncing ball."""
 
     name: str | None = Field(default=None, description="what to call the system; default the file's name")
     about: str = Field(default="", description="one sentence or more for people, with the source")
@@ -345,12 +345,12 @@ Problem = tuple[str, str, str]
 
 
 def parameters(contact: str) -> tuple[str, ...]:
-    """Return the names of the parameters whose gradient is available for a kind of contact."""
+    """Return the names of the parameters for which a kind of contact has gradients."""
     return (*_PARAMETERS.get(contact, ()), "gravity", "h", "y0", "v0")
 
 
 def solves(contact: str | None, integrator: str | None) -> bool:
-    """Return True if a step iterates: with a projection, or an implicit integrator and a spring."""
+    """Return True if a step needs an iterative solver: a projection, or an implicitly integrated spring."""
     return contact == "projection" or (integrator == "implicit-midpoint" and contact == "penalty")
 
 
@@ -497,7 +497,7 @@ def _stops(spec: BallSpec) -> Iterator[Problem]:
 
 
 def _unrepresentable(spec: BallSpec) -> Iterator[Problem]:
-    """Find numbers that a role's format cannot hold, and tolerances met only by a residual of 0."""
+    """Find numbers outside the range of their format, and tolerances that only a residual of 0 would meet."""
     precision, stop = spec.precision, spec.stop
     # every number with a role: key, value, role, the smallest that the role can use
     held: list[tuple[str, float, str, float | None]] = []
@@ -562,7 +562,7 @@ def _losses(spec: BallSpec) -> Iterator[Problem]:
 
 
 def remarks(spec: BallSpec) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Find settings that run but are probably unintended; yield codes of findings and their values."""
+    """Find valid settings that are probably unintended; yield the code of each finding and its values."""
     stop, contact = spec.stop, spec.contact
     if isinstance(contact, ProjectionContact):
         # a height just below the floor is the difference of two numbers of the size of one step's fall

@@ -1,4 +1,4 @@
-"""Building a simulation from a system file: the only module that converts the file's tables to objects."""
+"""Building a simulation from a system file: conversion of the tables of the file to objects."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def interaction(potential: Mapping[str, Any], cutoff: Mapping[str, Any] | None) 
     """Validate the tables of a potential and of its cutoff.
 
     Raises:
-        InputError: the tables would not be valid in a system file.
+        InputError: the tables are not valid tables of a system file.
     """
     try:
         made = schema.Interaction(
@@ -54,13 +54,13 @@ def interaction(potential: Mapping[str, Any], cutoff: Mapping[str, Any] | None) 
 
 
 def model_of(spec: schema.SystemSpec | schema.Interaction, atoms: Atoms, folder: Path) -> Any:
-    """Create the potential of some tables for atoms: `CutPotential`, `Channels`, or a many-body potential.
+    """Create the potential that tables describe: `CutPotential`, `Channels`, or a many-body potential.
 
     Args:
         folder: folder of the files that the tables name.
 
     Raises:
-        InputError: a species has no constants.
+        InputError: the potential has no constants for a chemical species of the structure.
     """
     if isinstance(spec, schema.SystemSpec) and spec.terms is not None:
         tables = spec.interactions
@@ -136,7 +136,7 @@ def again(folder: Path, given: Simulation | None = None) -> Simulation:
             description.
 
     Raises:
-        InputError: `given` is required but missing, given but not required, or not the simulation that ran.
+        InputError: `given` is missing, is not needed, or is not the simulation that ran in this folder.
     """
     if not (folder / SIMULATION_FILE).is_file():
         if given is not None:

@@ -1,4 +1,4 @@
-"""Objects from a ball's system file: a world, a start and a loss, also for every variant."""
+"""Conversion of a bouncing ball's system file to objects: the model, its initial state and the loss."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _RULES: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class BallVariant:
-    """A problem in which some keys of the file were changed."""
+    """A variant of a bouncing-ball problem, in which some keys of the system file are changed."""
 
     name: str  # what the file calls it
     changes: Mapping[str, Any]  # dotted keys to values
@@ -44,7 +44,7 @@ class BallVariant:
 
 @dataclass(frozen=True)
 class BallSimulation:
-    """A ball's system as objects."""
+    """The objects of a bouncing-ball system: the problem and its variants."""
 
     system: BallSystem  # what the file says
     problem: BallProblem  # world, start, steps and loss
@@ -56,7 +56,7 @@ def build_ball(
     overrides: Mapping[str, Any] | None = None,
     steps: int | None = None,
 ) -> BallSimulation:
-    """Build the objects of a ball's system.
+    """Build the objects of a bouncing-ball system.
 
     Args:
         system: a loaded system, or a name or path to load.
@@ -77,10 +77,10 @@ def build_ball(
 
 
 def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system") -> BallProblem:
-    """Create world, start, steps and loss from the tables of a file.
+    """Create the model, the initial state, the number of steps and the loss from the tables of a system file.
 
     Raises:
-        InputError: the world rejects a number.
+        InputError: a number is outside the range that the model allows.
     """
     steps = spec.integrator.steps if steps is None else steps
     try:
@@ -101,7 +101,7 @@ def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system"
 
 
 def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.ndarray, "balls"]]:
-    """Return heights (m) and velocities (m/s) of the balls at step 0 in float64; the world rounds them."""
+    """Return heights (m) and velocities (m/s) of the balls at step 0, in float64 before rounding."""
     given, count = spec.start, spec.balls
     if given.boundary is not None:
         # one penetration an ulp short of the tolerance, and the ulp in equal parts
@@ -120,7 +120,7 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
 
 
 def _control(table: ball.Control, h: float, steps: int) -> Float[np.ndarray, "steps"] | None:
-    """Return the additional acceleration in each step, m/s²; None for none."""
+    """Return the additional acceleration in each time step, m/s²; None if gravity acts alone."""
     match table:
         case ball.ConstantControl():
             return np.full(steps, table.value)

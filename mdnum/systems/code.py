@@ -1,4 +1,4 @@
-"""Python code that a system file names: it is executed only with explicit permission."""
+"""Execution of Python code that a system file refers to, which needs the user's explicit permission."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ALLOWED: ContextVar[bool] = ContextVar("allowed", default=False)
 
 @contextmanager
 def allow_code(allow: bool = True) -> Iterator[None]:
-    """Allow the execution of Python code that a system file names.
+    """Allow the execution of Python code that a system file refers to.
 
     Example:
         >>> mdnum.allow_code()
@@ -34,12 +34,12 @@ def allow_code(allow: bool = True) -> Iterator[None]:
 
 
 def is_allowed() -> bool:
-    """Return True if code named by a file may be executed in this context."""
+    """Return True if Python code that a system file refers to may be executed in this context."""
     return _ALLOWED.get()
 
 
 def parts(place: str, folder: Path, where: str = "potential.function") -> tuple[Path, str]:
-    """Split text such as "mine.py:morse" into the path of a file in a folder and a name.
+    """Split text such as "mine.py:morse" into the path of the file and the name of the function.
 
     Raises:
         InputError: the text does not have this form.
@@ -51,14 +51,14 @@ def parts(place: str, folder: Path, where: str = "potential.function") -> tuple[
 
 
 def function(place: str, folder: Path, where: str = "potential.function") -> Callable[..., Any]:
-    """Execute the file that a system file or an option names, and return the named function.
+    """Execute a Python file that a system file or an option refers to, and return the named function.
 
     Args:
         place: text such as "mine.py:morse", relative to folder.
         where: the key or option that names it, for messages.
 
     Raises:
-        InputError: execution is not allowed, the file cannot be executed, or it has no such function.
+        InputError: execution is not allowed, the file cannot be executed, or the function does not exist.
     """
     file, name = parts(place, folder, where)
     if not is_allowed():

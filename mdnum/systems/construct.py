@@ -1,4 +1,4 @@
-"""Construction of simulations from objects: compatible parts are assembled, others are rejected."""
+"""Construction of simulations from Python objects, such as an ASE structure and a potential."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Term:
-    """One of several pair potentials that are added, with its own cutoff.
+    """A pair potential with its own cutoff, as a term in a sum of pair potentials.
 
     Example:
         >>> Term(LennardJones(sigma=2.3, epsilon=0.01), Cut("switched", 8.5))
@@ -204,13 +204,13 @@ def simulation(
 def _integrator(
     kind: str | type[Integrator], numbers: Mapping[str, Any], units: Units, where: str
 ) -> Integrator:
-    """Create an integrator from its name or class; options of built-in integrators are validated."""
+    """Create an integrator from its name or class; the options of a built-in integrator are validated."""
     made = INTEGRATORS[kind] if isinstance(kind, str) else kind
     return made.of_file(_validated(made, numbers, where), units)
 
 
 def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -> Mapping[str, Any]:
-    """Return the numbers of an integrator in units of a file; those of a built-in one are checked."""
+    """Return the options of an integrator in system-file units; validate them if it is built in."""
     if kind not in (INTEGRATORS[one] for one in INTEGRATORS.shipped):
         return numbers
     table = {key: one.item() if hasattr(one, "item") else one for key, one in numbers.items()}
@@ -219,10 +219,10 @@ def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -
 
 
 def _check_instance(integrator: Integrator, units: Units, where: str) -> None:
-    """Check the numbers of an integrator object, as those of a system file are checked, and in its units.
+    """Check the numbers of an integrator object in system-file units, by the rules for system files.
 
     Raises:
-        InputError: a number is not a finite float64 scalar or out of range.
+        InputError: a number is not a finite float64 scalar, or is out of range.
     """
     keys, numbers = integrator.keys(), {}
     for key in integrator.numbers():
@@ -241,7 +241,7 @@ def _check_instance(integrator: Integrator, units: Units, where: str) -> None:
 
 
 def of_atoms(atoms: Atoms, model: Any, compare: str = "r <", units: str = "metal") -> Simulation:
-    """Create a static simulation of given atoms with a potential, as evaluated by a calculator."""
+    """Create a simulation of atoms for single-point evaluations by a calculator, without dynamics."""
     return assembled(
         Origin("calculator"), atoms, unit_systems.get(units), model, compare, RebuildRule(0.0), "auto",
         PrecisionPolicy(), REDUCTIONS.parse("sequential"), VelocityVerlet(jax.device_put(np.float64(1.0))),
@@ -259,7 +259,7 @@ def cut(
     *,
     where: str = "",
 ) -> CutPotential:
-    """Add a cutoff to a potential, with one entry per pair type; for arguments see `Cut`.
+    """Combine a pair potential with its cutoff, with one radius per pair type; for arguments see `Cut`.
 
     Args:
         weights: weights of the atoms, if any. where: prefix of parameter names in messages.
@@ -289,7 +289,7 @@ def cut(
 
 
 def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequence[str]) -> None:
-    """Check that a user's function can be called, is smooth across its cutoff, and is symmetric in a pair."""
+    """Check that a user's pair function can be called, is not truncated, and is symmetric in both atoms."""
     here = potential.typed
     is_pair = lambda leaf: isinstance(leaf, tuple)  # noqa: E731
     other = here.with_leaves(
@@ -327,10 +327,10 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
 
 
 def common(terms: Mapping[str, Term]) -> Cut:
-    """Return a cutoff with the comparison convention that all terms share.
+    """Return a cutoff with the comparison (such as r < r_cut) that all terms have in common.
 
     Raises:
-        InputError: there are no terms, or their conventions differ.
+        InputError: there are no terms, or the terms have different comparisons.
     """
     compared = {name: term.cutoff.compare for name, term in terms.items()}
     if len(set(compared.values())) != 1:
@@ -341,7 +341,7 @@ def common(terms: Mapping[str, Term]) -> Cut:
 
 
 def weights(weight: Any, atoms: Atoms, term: str) -> tuple[Any, ...]:
-    """Return the weights of the atoms in the form for `CutPotential`; empty without weights.
+    """Return the weight of each atom as `CutPotential` expects it; empty if the term has no weights.
 
     Raises:
         InputError: a species or an atom has no weight.
@@ -360,7 +360,7 @@ def weights(weight: Any, atoms: Atoms, term: str) -> tuple[Any, ...]:
 
 
 def closest(model: Any, units: str) -> float:
-    """Return the distance (length) below which two atoms of a structure must be a mistake."""
+    """Return the distance below which two atoms of a structure are considered an error, length."""
     if not isinstance(model, CutPotential | Channels):
         return smallest_distance(model.name, units)
     each = [term.potential for term in model.terms.values()]
@@ -369,7 +369,7 @@ def closest(model: Any, units: str) -> float:
 
 
 def _is_array(value: Any) -> bool:
-    """Return True if a list represents an array in a file: numbers, or equally long lists of numbers."""
+    """Return True if a list represents an array: numbers, or lists of numbers of equal length."""
     numbers = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(value))
     try:
         return type(value) in (list, tuple) and numbers and np.array(value).dtype.kind in "iuf"
@@ -378,7 +378,7 @@ def _is_array(value: Any) -> bool:
 
 
 def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, "types"]:
-    """Return one number per pair type, given one number for all or one for each pair of species.
+    """Return one number per pair type, from a single number or from numbers by pair of species.
 
     Raises:
         InputError: the number of a pair is missing or not finite.
@@ -399,7 +399,7 @@ def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, 
 
 
 def by_species(value: Mapping[str, Any], symbols: Sequence[str], what: str) -> Float[np.ndarray, "species"]:
-    """Return one number per species, in the order of the symbols.
+    """Return one number per chemical species, in the order of the chemical symbols.
 
     Raises:
         InputError: the number of a species is missing or not finite.
@@ -435,7 +435,7 @@ def assembled(
     steps: int,
     save_every: int,
 ) -> Simulation:
-    """Assemble a simulation from its parts; the arguments are the attributes of `Simulation`.
+    """Create a simulation from its components; the other arguments are attributes of `Simulation`.
 
     Args:
         atoms: the structure, with momenta unless velocities are drawn.
@@ -443,7 +443,7 @@ def assembled(
         builder: name of the neighbor search; "auto" for the fastest one on this device.
 
     Raises:
-        InputError: the cutoff and skin do not fit the box, or a fixed-point state is not possible.
+        InputError: the box is too small for cutoff and skin, or a fixed-point state is not possible.
     """
     check_not_forked()
     cell = Cell.create(np.asarray(atoms.cell), atoms.pbc)
@@ -520,7 +520,7 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
 
 
 def in_fixed_point(simulation: Simulation) -> Simulation:
-    """Return the simulation with a fixed-point state, in a box adjusted to its units."""
+    """Return the simulation with a fixed-point state; the box is adjusted to the fixed-point units."""
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(

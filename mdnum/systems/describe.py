@@ -1,6 +1,6 @@
-"""Description of a simulation as plain tables: for its folder, its digest, and the comparison of simulations.
+"""Description of a simulation as plain tables, for its run folder, its digest and comparisons.
 
-Tables and keys are those of a system file, even for simulations that were made from objects.
+The tables have the keys of a system file, even if the simulation was made from objects.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def program(simulation: Simulation) -> dict[str, Any]:
-    """Return all numbers and choices of a simulation except its structure, as JSON-compatible tables."""
+    """Return all parameters and settings of a simulation except its structure, as JSON-compatible tables."""
     rule, draw, policy = simulation.rule, simulation.draw, simulation.policy
     tables: dict[str, Any] = {
         "units": simulation.units.name,
@@ -82,7 +82,7 @@ def write(simulation: Simulation, folder: Path) -> None:
 
 
 def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return comparable tables of two simulations: those of their files if both have one."""
+    """Return comparable tables of two simulations, from their system files if both have a system file."""
     files = [one.origin.system for one in (a, b)]
     if a.file is not None and None not in files:
         first, second = (one.spec.model_dump(mode="json") for one in files if one is not None)
@@ -91,12 +91,12 @@ def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any
 
 
 def reduction_word(reduction: Any) -> str:
-    """Return the word of a system file for a reduction, or its representation in Python."""
+    """Return the name of a summation order in system files; if it has none, its Python representation."""
     return next((word for word, known in BY_NAME.items() if known == reduction), repr(reduction))
 
 
 def plain_leaf(leaf: Any) -> Any:
-    """Return a number, a list of a few numbers, or the digest of many numbers."""
+    """Represent an array by a number, by a list of up to 64 numbers, or by a digest if it is larger."""
     array = np.asarray(leaf)
     if array.size == 1:
         return array.reshape(()).item()
@@ -106,7 +106,7 @@ def plain_leaf(leaf: Any) -> Any:
 
 
 def by_pair(simulation: Simulation, leaf: Any) -> Any:
-    """Return one number if all pair types have the same value, else the values by pair of species."""
+    """Return a single number if all pair types have the same value, else one value per pair of species."""
     values = np.asarray(leaf, np.float64)
     if len(set(values.tolist())) == 1:
         return float(values[0])
@@ -127,7 +127,7 @@ def _start(simulation: Simulation) -> str:
 
 
 def _interactions(simulation: Simulation) -> dict[str, Any]:
-    """Return the tables of the potential and its cutoff, or of several terms."""
+    """Return the tables of the potential and its cutoff, or a table for each term of a sum of potentials."""
     model = simulation.model
     if not simulation.pairwise:
         known = {"kind": model.name, **_leaves(model)}
@@ -168,7 +168,7 @@ def _leaves(tree: Any) -> dict[str, Any]:
 
 
 def _code(function: Any) -> dict[str, Any]:
-    """Return the source of a user's function and its digest; without source, the digest of its bytecode."""
+    """Return the source of a user's function and a digest of it (of the bytecode, if there is no source)."""
     if function is None:
         return {}
     try:

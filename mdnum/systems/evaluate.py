@@ -1,4 +1,4 @@
-"""Energies and forces of single configurations, with a Verlet list that is reused while it is valid."""
+"""Energies and forces of single configurations, with a Verlet list that is rebuilt only when necessary."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ class Evaluation:
 
 
 class Evaluator:
-    """Evaluator of successive configurations; the list is rebuilt once motion and strain have used its skin.
+    """Energies and forces of successive configurations; the Verlet list is rebuilt when its skin is used up.
 
     Args:
         simulation: the system as objects.
         skin: skin of the list, length; default the system's. A narrow box gets the largest possible skin.
-        often: whether many calls are expected. If not, the program of an energy function is compiled with few
-            optimizations, which takes a quarter of the time.
+        often: whether many calls are expected. If not, an energy function is compiled with few optimizations,
+            which takes a quarter of the time.
     """
 
     def __init__(self, simulation: Simulation, skin: float | None = None, often: bool = True):
@@ -119,7 +119,7 @@ class Evaluator:
         return float(energy), found
 
     def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
-        """Return the simulation in this cell, wrapped positions, their list, and positions in its order."""
+        """Return the simulation in the cell, wrapped positions, neighbor list, and positions in its order."""
         check_not_forked()
         own = self.simulation
         same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
@@ -131,7 +131,7 @@ class Evaluator:
         return here, wrapped, table, tables, jax.device_put(x)
 
     def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
-        """Return the current list, rebuilt if it may not contain every pair inside the cutoff."""
+        """Return the neighbor list; rebuild it first if pairs inside the cutoff could be missing."""
         if self._kept is not None:
             table, tables, reference, reference_cell = self._kept
             if self._verlet.consumed(wrapped, here.cell, reference, reference_cell) <= 1.0:
@@ -147,7 +147,7 @@ class Evaluator:
 
 
 def _listed(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool) -> Any:
-    """Compute forces and decisions, with the virial as a tensor if the stress is needed."""
+    """Compute forces and the pairs inside the cutoff; also the virial tensor if the stress is needed."""
     return force(x, tables, decisions=True, tensor=stress)
 
 

@@ -1,4 +1,4 @@
-"""Locating system files (shipped files by name, a user's files by path), and loading them."""
+"""Finding and loading system files: shipped systems by name, a user's files by path."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def names(world: Literal["md", "ball"] | None = None) -> list[str]:
     """Return the names of the shipped systems, such as "argon/liquid-864".
 
     Args:
-        world: "md" or "ball" to return only the systems of this world.
+        world: "md" or "ball" to return only the systems of this kind.
     """
     root = shipped_folder()
     return [name for name in shipped_systems() if world in (None, _world(root / f"{name}.toml"))]
 
 
 def world_of(name: Any) -> str:
-    """Return the world, "md" or "ball", of an object or an unvalidated file; "md" if the file is not TOML.
+    """Return "ball" if an object or an unvalidated file describes a bouncing ball, otherwise "md".
 
     Raises:
         InputError: no system has this name.
@@ -62,7 +62,7 @@ def _world(path: Path) -> str:
 
 
 def find(name: str | Path) -> tuple[str, Path]:
-    """Find the name and file of a system: a TOML file, a folder that contains system.toml, or a shipped name.
+    """Find the name and file of a system, given a TOML file, a folder with system.toml, or a shipped name.
 
     Raises:
         InputError: no system has this name; the message suggests the most similar shipped name.
@@ -97,7 +97,7 @@ def find(name: str | Path) -> tuple[str, Path]:
 
 
 def shown(path: Path) -> str:
-    """Return a path for messages: relative to the working directory if it is inside."""
+    """Return a path for use in messages, relative to the working directory if the path lies inside it."""
     try:
         return str(path.resolve().relative_to(Path.cwd()))
     except ValueError:
@@ -114,7 +114,7 @@ def _made(folder: str | Path) -> Path:
 
 @dataclass(frozen=True)
 class System:
-    """A validated system: the tables of a file, and the atoms that they describe.
+    """A validated molecular-dynamics system: the tables of its system file, and its atoms.
 
     Attributes:
         name: name of the system, such as "argon/liquid-864".
@@ -131,12 +131,12 @@ class System:
 
     @property
     def units(self) -> unit_systems.Units:
-        """Unit system of the file."""
+        """Unit system of the system file: "metal" or "lj"."""
         return unit_systems.get(self.spec.units)
 
     @property
     def folder(self) -> Path:
-        """Folder of the files that the system names."""
+        """Folder that contains the files to which the system file refers."""
         return self.path.parent if self.path else Path()
 
     @property
@@ -152,13 +152,13 @@ class System:
 
     @property
     def without_skin(self) -> System:
-        """The same system with a list whose skin is 0, for small boxes."""
+        """The same system with a Verlet skin of 0, for boxes that are too small for a skin."""
         neighbors = self.spec.neighbors.model_copy(update={"skin": 0.0})
         return replace(self, spec=self.spec.model_copy(update={"neighbors": neighbors}))
 
     @property
     def ignored(self) -> list[str]:
-        """Structure file columns that look like velocities, unless any velocities are read from it."""
+        """Columns of the structure file that look like velocities; empty if the velocities are read."""
         structure = self.spec.structure
         return structures.ignored(structure, self.folder) if structure.velocities == "file" else []
 
@@ -169,7 +169,7 @@ class System:
 
     @property
     def program(self) -> dict[str, Any]:
-        """All numbers and choices except the structure, as plain values, for hashing."""
+        """All parameters and settings of the system except its structure, as plain values, for hashing."""
         made = self.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
         if made.get("terms") is None:
             made.pop("terms", None)
@@ -179,7 +179,7 @@ class System:
         return made
 
     def _potentials(self, data: dict[str, Any]) -> list[tuple[dict[str, Any], Any]]:
-        """Return the table of each potential in the file's tables, with its validated model."""
+        """Return each potential's table in the system file, together with its validated model."""
         tables = {"": data} if self.spec.terms is None else data["terms"]
         return [(tables[name]["potential"], one.potential) for name, one in self.spec.interactions.items()]
 
@@ -190,16 +190,16 @@ class System:
 
     @property
     def tables(self) -> set[Path]:
-        """Files that the potential reads or executes."""
+        """Files that are read or executed to create the potential."""
         return {file for one in self.spec.interactions.values() for file in self._files(one.potential)}
 
     def to_toml(self, *, beside: bool = True) -> str:
         """Return the text of the system file with every default written out.
 
         Args:
-            beside: True for the folder that write() creates: the text refers to the structure file in this
-                folder, and loading it there recreates the system bit for bit. If False, the text refers to
-                the original files of this system by absolute paths.
+            beside: True if the text is stored in the folder that write() creates. The text then refers to the
+                structure file in this folder, and loading it there recreates the system bit for bit. If
+                False, the text refers to the original files of this system by absolute paths.
         """
         spec = self.spec.model_dump(mode="python", exclude_none=True)
         structure = spec["structure"]
@@ -219,7 +219,7 @@ class System:
         return toml.dump({"name": self.name, **spec})
 
     def write(self, folder: str | Path) -> Path:
-        """Write system.toml, structure.extxyz and the potential's tables; return system.toml's path."""
+        """Write system.toml, structure.extxyz and the potential's tables; return the path of system.toml."""
         target = _made(folder)
         with disk_errors(target):
             for table in self.tables:
@@ -234,7 +234,7 @@ class System:
 
 @dataclass(frozen=True)
 class BallSystem:
-    """A validated system of the ball.
+    """A validated bouncing-ball system: the tables of its system file, and its variants.
 
     Attributes:
         name: name of the system, such as "ball/drop".
@@ -250,7 +250,7 @@ class BallSystem:
 
     @property
     def program(self) -> dict[str, Any]:
-        """All numbers and choices, as plain values, for hashing."""
+        """All parameters and settings of the system, as plain values, for hashing."""
         return self.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
 
     @property
@@ -259,14 +259,14 @@ class BallSystem:
         return self.spec.balls
 
     def against(self, changes: Mapping[str, Any], name: str | None = None) -> BallSystem:
-        """Return this system with an additional variant.
+        """Return this bouncing-ball system with an additional variant.
 
         Args:
             changes: dotted keys to values; text is parsed as a TOML value.
             name: name of the variant; default the text of the changes.
 
         Raises:
-            InputError: the variant cannot be run, or its name is taken.
+            InputError: the variant cannot be run, or a variant with this name exists already.
         """
         name = name or ", ".join(f"{key}={value}" for key, value in changes.items())
         if name in self.variants:
@@ -278,7 +278,7 @@ class BallSystem:
         return BallSystem(self.name, spec, self.path, {**self.variants, name: variant})
 
     def for_steps(self, steps: int) -> BallSystem:
-        """Return this system with another number of steps; control values are cut or extended.
+        """Return this system with another number of steps; a list of accelerations is shortened or extended.
 
         Args:
             steps: number of steps of a run, at least 1.
@@ -300,7 +300,7 @@ class BallSystem:
         return toml.dump({"name": self.name, **self.spec.model_dump(exclude_none=True)})
 
     def write(self, folder: str | Path) -> Path:
-        """Write system.toml; return its path."""
+        """Write the system file system.toml; return its path."""
         path = _made(folder) / SYSTEM_FILE
         write_text(path, self.to_toml())
         return path
@@ -347,10 +347,10 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
 
 
 def copy(name: str | Path, folder: str | Path) -> Path:
-    """Copy a shipped system, its structure and its tables, for editing; return the copied system file.
+    """Copy a shipped system with its structure and potential tables, for editing; return the new system file.
 
     Raises:
-        InputError: the system does not exist, or a file of the same name exists already.
+        InputError: the system does not exist, or a file with this name already exists.
     """
     system: System | BallSystem = load(name)
     if system.path is None:
@@ -397,7 +397,7 @@ def load(
     *,
     world: Literal["md", "ball"] | None = None,
 ) -> System | BallSystem:
-    """Load and validate a system by name or path: a System, or a BallSystem if the file has `world = "ball"`.
+    """Load and validate a system; return a BallSystem if its file has `world = "ball"`, otherwise a System.
 
     Example:
         >>> mdnum.load("argon/liquid-864").spec.cutoff.kind
@@ -409,7 +409,7 @@ def load(
         overrides: dotted key to value, as given by `--set`: `{"cutoff.kind": "switched"}`; text is parsed as
             a TOML value. A changed kind removes keys that the new kind does not have; a changed temperature
             or seed of an NVE run draws new velocities.
-        world: "md" or "ball" to reject systems of the other world.
+        world: "md" or "ball" to reject systems of the other kind.
 
     Raises:
         InputError: the system cannot be run; the message is one line.
@@ -494,7 +494,7 @@ def _ball(spec: BallSpec, source: Source) -> BallSystem:
 
 
 def json_schema(file: str) -> dict[str, Any]:
-    """Return the JSON schema of system files for editors, of schema.json or BALL_SCHEMA."""
+    """Return the JSON schema of system files, which editors use to check and complete keys."""
     root, title = (BallSpec, " of the ball") if file == BALL_SCHEMA else (schema.SystemSpec, "")
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -1,7 +1,7 @@
-"""Constants and cutoff radii of every pair of species, by pair type, and the longest interaction radius.
+"""Potential constants and cutoff radii for every pair of species, and the longest interaction radius.
 
-A system file gives one set of constants, or one per pair of species. No mixing rule is applied: a structure
-with several species must list every pair, so that a forgotten cross term is an error and not a guess.
+A system file gives one set of constants, or one set per pair of species. No mixing rule is applied: the file
+must list every pair of species in the structure, and a forgotten cross term is an error.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> 
 
 
 def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tuple[Table, Table | None]:
-    """Return cutoff radius and onset for every pair of species.
+    """Return cutoff radius and onset of switching for every pair of species.
 
     Returns:
         radius and onset, in the order of `pair_constants`; the onset is None for a cutoff that does not
@@ -110,7 +110,7 @@ def many_body(
     """Create the many-body potential (a `ManyBody`) that a table describes.
 
     Raises:
-        InputError: the table has no constants for these species, or its file cannot be used.
+        InputError: the table has no constants for these species, or the potential file cannot be used.
     """
     from mdnum.md import embedded_atom, tetrahedral
 

@@ -1,13 +1,14 @@
-"""Parameters of a simulation by path: their values and units, and the simulation with other values.
+"""Parameters of a simulation: their values and units by path, and simulations with changed values.
 
-A parameter is a number or an array of numbers. Its name is a path: the key of a system file if one exists
-("potential.sigma", "cutoff.radius", "dynamics.timestep"), extended into the components of a potential
-("potential.layers.0.weight"). A single entry is a parameter too: "potential.pairs.Ni-P.sigma" as in files,
-"position.17.x", "velocity.17.x", or path and indices, "potential.layers.0.weight.3.2".
+A parameter is a number or an array of numbers, and its name is a path. Paths are keys of a system file
+("potential.sigma", "cutoff.radius", "dynamics.timestep") or lead to a component of a potential
+("potential.layers.0.weight"). A single entry of an array is also a parameter: "potential.pairs.Ni-P.sigma" as
+in system files, "position.17.x", "velocity.17.x", or path and indices, "potential.layers.0.weight.3.2".
 
-`dynamics.temperature` is the temperature of drawn velocities, which scale with its square root, and of a
-thermostat. Given velocities are not changed by it; `velocity.scale` scales any velocities. `cutoff.radius`
-also moves the onset if the cutoff does not switch. `box.scale` scales the box and all positions.
+`dynamics.temperature` is the temperature of drawn velocities, which scale with its square root, and of the
+thermostat; it does not change velocities of the structure. `velocity.scale` scales any velocities.
+`cutoff.radius` also moves the onset if the cutoff does not switch. `box.scale` scales the box and all
+positions.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ class Parameter:
 
 
 def parameters(simulation: Simulation) -> dict[str, Parameter]:
-    """Return all parameters of a simulation by path; use `changed` to change them.
+    """Return all parameters of a simulation by path; `changed` returns a simulation with other values.
 
     Example:
         >>> mdnum.parameters(sim)["potential.sigma"].value
@@ -115,17 +116,17 @@ def _is_number(simulation: Simulation, name: str) -> bool:
 
 
 def number(simulation: Simulation, name: str) -> float:
-    """Return the value of one of `numbers`."""
+    """Return the value of a scalar parameter (a path in `numbers`)."""
     return float(value(simulation, name).flat[0])
 
 
 def with_number(simulation: Simulation, name: str, given: float) -> Simulation:
-    """Return the simulation with another value of one of `numbers`, without recompilation."""
+    """Return the simulation with another value of a scalar parameter; nothing is compiled again."""
     return with_values(simulation, {name: np.full(value(simulation, name).shape, given)})
 
 
 def is_positive(simulation: Simulation, name: str) -> bool:
-    """Return True if only positive values of a number are meaningful: not for coordinates and weights."""
+    """Return True if a parameter must be positive; coordinates and weights can have any sign."""
     whole = entry(simulation, name).whole
     if "potential." in whole:
         return _is_typed(simulation, whole) and number(simulation, name) > 0
@@ -133,7 +134,7 @@ def is_positive(simulation: Simulation, name: str) -> bool:
 
 
 def by(simulation: Simulation, name: str) -> str:
-    """Return "pair type", "species" or "atom" if a parameter has an entry for each, else ""."""
+    """Return "pair type", "species" or "atom" if a parameter has one entry for each of them, else ""."""
     if name.startswith("initial.") or is_weight(name):
         return "atom"
     if not _is_typed(simulation, name) or simulation.pair_types == 1:
@@ -142,7 +143,7 @@ def by(simulation: Simulation, name: str) -> str:
 
 
 def is_weight(name: str) -> bool:
-    """Return True if a path refers to the weights of a term."""
+    """Return True if a path refers to the atomic weights of a term of the potential."""
     return name.startswith("terms.") and name.split(".")[2:] == ["weight"]
 
 
@@ -151,13 +152,13 @@ def _is_typed(simulation: Simulation, name: str) -> bool:
 
 
 def _by_species(simulation: Simulation) -> set[str]:
-    """Return the paths of parameters with an entry for each species."""
+    """Return the paths of parameters that have one entry for each chemical species."""
     every = pair_leaves(simulation.model, shared=False)
     return set(every) - set(pair_leaves(simulation.model, shared=False, species=False))
 
 
 def unit(simulation: Simulation, name: str) -> str:
-    """Return the unit of a parameter: "" if it has none, its name in brackets if the unit is unknown."""
+    """Return the unit of a parameter: "" for a pure number, the name in brackets if the unit is unknown."""
     table, whole = name.partition(".")[0], entry(simulation, name).whole
     last = whole.rpartition(".")[2]
     field = simulation.integrator.keys().get(last) if table == "dynamics" else None
@@ -168,7 +169,7 @@ def unit(simulation: Simulation, name: str) -> str:
 
 
 def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
-    """Return the value of a parameter: a scalar for one pair type, else one entry per pair type."""
+    """Return the value of a parameter: a scalar if there is one pair type, else one entry per pair type."""
     place = entry(simulation, name)
     if place.index:
         return np.asarray(value(simulation, place.whole)[place.index] * place.factor)
@@ -187,7 +188,7 @@ def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
 
 
 def leaf_of(model: Any, name: str) -> Any:
-    """Return the array in a potential or its cutoff that holds a parameter."""
+    """Return the array of a potential or its cutoff that contains a parameter."""
     if not isinstance(model, CutPotential | Channels):
         return quantities_of(model)[name.removeprefix("potential.")]
     return pair_leaves(model)[name]
@@ -196,9 +197,9 @@ def leaf_of(model: Any, name: str) -> Any:
 def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bool = True) -> dict[str, Any]:
     """Return the arrays of pair potentials and their cutoffs by path.
 
-    Arrays without pair types (`shared`) and arrays by species (`species`) are optional. The path
-    `cutoff.radius` is the radius of all terms if they agree; otherwise each term has the path of the radius
-    that it shares.
+    `shared` includes arrays that do not depend on the pair type, `species` includes arrays with one entry per
+    species. The path `cutoff.radius` is the radius of all terms if all radii agree. Otherwise each term has
+    its own path, and terms with equal radii refer to the same array.
     """
     found: dict[str, Any] = {}
     for part in model.parts:
@@ -217,7 +218,7 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
 
 
 def shared_radius(model: Any, name: str) -> tuple[str, ...]:
-    """Return all terms that share decisions with the term of this radius path; empty if there are none."""
+    """Return all terms that share the cutoff radius of the term in a path; empty if the term is alone."""
     table, term, key = (*name.split(".", 2), "", "")[:3]
     if table != "terms" or key != "cutoff.radius":
         return ()
@@ -227,10 +228,10 @@ def shared_radius(model: Any, name: str) -> tuple[str, ...]:
 
 
 def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
-    """Return the simulation with other values of some parameters, without reapplying its file's rules.
+    """Return the simulation with other parameter values, without applying the rules of system files again.
 
     Raises:
-        InputError: a value is not finite, complex, of the wrong shape, or not allowed.
+        InputError: a value is not finite, is complex, has the wrong shape, or is not allowed.
     """
     for name, given in values.items():
         here, new = value(simulation, name), np.asarray(given)
@@ -247,7 +248,7 @@ def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation
 
 
 def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
-    """Return the simulation with another value, which has the correct shape."""
+    """Return the simulation with another value of a parameter; the shape is not checked."""
     table, _, key = name.partition(".")
     model, integrator = simulation.model, simulation.integrator
     if table == "potential" and not simulation.pairwise:
@@ -288,7 +289,7 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
 
 
 def _heated(simulation: Simulation, new: float) -> Simulation:
-    """Set the temperature of drawn velocities; velocities that differ from the draw are scaled."""
+    """Set the temperature of drawn velocities; if they were changed after the draw, scale them."""
     old = simulation.draw
     heated = replace(simulation, draw=replace(old, temperature=new))
     if not (old.temperature and old.drawn) and "temperature" in simulation.integrator.numbers():
@@ -306,7 +307,7 @@ def _heated(simulation: Simulation, new: float) -> Simulation:
 
 
 class Entry(NamedTuple):
-    """A path resolved into a parameter, an index and a unit factor."""
+    """The parameter, index and unit factor to which a path refers."""
 
     whole: str  # path of the parameter
     index: tuple[int, ...] = ()  # which of its entries; empty for all of it
@@ -314,7 +315,7 @@ class Entry(NamedTuple):
 
 
 def entry(simulation: Simulation, name: str) -> Entry:
-    """Find the parameter or entry that a path names; an unknown path is returned itself."""
+    """Find the parameter or array entry to which a path refers; an unknown path is returned unchanged."""
     if (of_pair := _of_pairs(simulation).get(name)) is not None:
         return of_pair
     table, *at = name.split(".")
@@ -336,7 +337,7 @@ def entry(simulation: Simulation, name: str) -> Entry:
 
 
 def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
-    """Return the paths of entries for single pairs of species or single species, if there are several."""
+    """Return the paths of entries for single species or pairs of species; empty for a single species."""
     if not simulation.pairwise or simulation.pair_types == 1:
         return {}
     single = _by_species(simulation)
@@ -352,13 +353,13 @@ def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
 
 
 def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
-    """Find the parameter path for a word: a known path, or a single entry of a known parameter.
+    """Find the parameter path for a given name, which can be a path, an alias or an unambiguous ending.
 
     Args:
         word: a path, an alias such as "r_cut" or "dt", or an ending that only one path has.
 
     Raises:
-        InputError: no parameter or several parameters match; the message lists the known ones.
+        InputError: no parameter matches, or several do; the message lists the known parameters.
     """
     full = _ALIASES.get(word, word)
     for name in (word, full):
@@ -382,10 +383,10 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
 
 
 def changed(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
-    """Return the simulation with other values of some system-file keys or parameters, after validation.
+    """Return the simulation with other values of system-file keys or parameters, after validation.
 
-    A simulation from a file is rebuilt from the file with these keys and keeps its file, unless a parameter
-    has no key in the file.
+    A simulation from a system file is rebuilt from this file with the new values. If a parameter has no key
+    in system files, the new simulation does not have a file.
 
     Example:
         >>> mdnum.changed(sim, {"cutoff.radius": 9.0, "precision.force": "float32"})
@@ -425,7 +426,7 @@ def _of_file(system: System, values: Mapping[str, Any]) -> Simulation:
 
 
 def _changed(simulation: Simulation, key: str, given: Any) -> Simulation:
-    """Return a simulation of objects with another value of one key."""
+    """Change one key in a simulation that was made from objects; return the new simulation."""
     table, _, name = key.partition(".")
     if key == "precision.reduction":
         return replace(simulation, reduction=REDUCTIONS.parse(given))
@@ -472,7 +473,7 @@ def _drawn(simulation: Simulation) -> Simulation:
 
 
 def floats(simulation: Simulation) -> dict[str, float]:
-    """Return the floating-point numbers that enter a step, by their dotted keys."""
+    """Return the floating-point numbers in the settings of a simulation, by dotted key."""
     if simulation.file is not None:
         data = simulation.file.spec.model_dump(mode="python", exclude_none=True, exclude={"fork"})
         return {key: value for key, value in toml.flat(data).items() if isinstance(value, float)}

@@ -1,8 +1,8 @@
-"""Schema of a system file: frozen pydantic models, one per table, with the unit of every number.
+"""Schema of a molecular-dynamics system file: one pydantic model per table, with the unit of each number.
 
-Validation is strict because a system file decides what is computed: a misspelled key or a string in place of
-a number is an error (mdnum.systems.load prints one line for each). Lengths, energies and times are in the
-units of the file: Å, eV, amu, ps and K for "metal"; multiples of σ, ε, m and τ for "lj".
+Validation is strict: a misspelled key, or a string in place of a number, is an error. Lengths, energies,
+masses, times and temperatures are in the units of the file: Å, eV, amu, ps and K for "metal", and reduced
+Lennard-Jones units (σ, ε, m, τ) for "lj".
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ ONSET_FRACTION = 0.9
 
 
 def pair_key(a: str, b: str) -> str:
-    """Return the unique name of a pair of species for look-up: "Ni-P" for either order."""
+    """Return the name of a pair of species, which does not depend on their order, such as "Ni-P"."""
     return "-".join(sorted((a, b)))
 
 
 def pair_names(symbols: Sequence[str]) -> list[str]:
-    """Return the pairs of some species in the order of pair types, such as "Ni-Ni", "Ni-P", "P-P"."""
+    """Return the names of all pairs of species in the order of pair types, such as "Ni-Ni", "Ni-P", "P-P"."""
     return [f"{a}-{b}" for a, b in combinations_with_replacement(symbols, 2)]
 
 
@@ -97,7 +97,7 @@ class PairPotentialTable(TomlTable):
 
 
 def _pair_table(name: str, kind: str, row: type[TomlTable], description: str) -> Any:
-    """Create a potential's table, with constants given once or for each pair of species."""
+    """Create the table model of a pair potential, with constants given once or for each pair of species."""
     columns: dict[str, Any] = {"kind": (Literal[kind], ...)}
     for key, field in row.model_fields.items():
         value: Any = Annotated[field.annotation, *field.metadata]
@@ -126,28 +126,28 @@ class ManyBodyTable(TomlTable):
 
 
 class StillingerWeberTable(ManyBodyTable):
-    """Stillinger-Weber's two- and three-body potential (Phys. Rev. B 31, 5262, 1985)."""
+    """Two- and three-body potential of Stillinger and Weber (Phys. Rev. B 31, 5262, 1985)."""
 
     kind: Literal["stillinger-weber"]
     parameters: Literal["Si"] = Field(default="Si", description="set of constants; Si: the original silicon")
 
 
 class TersoffTable(ManyBodyTable):
-    """Tersoff's bond-order potential (Phys. Rev. B 38, 9902, 1988)."""
+    """Bond-order potential of Tersoff (Phys. Rev. B 38, 9902, 1988)."""
 
     kind: Literal["tersoff"]
     parameters: Literal["Si"] = Field(default="Si", description="set of constants; Si: Tersoff's T3 silicon")
 
 
 class EmbeddedAtomTable(ManyBodyTable):
-    """Embedded-atom potential, read from a table."""
+    """Embedded-atom potential, read from a tabulated potential file."""
 
     kind: Literal["eam"]
     file: str = Field(description="setfl table (.eam.alloy), relative to this file")
 
 
 class PythonTable(PairPotentialTable):
-    """A pair potential as a function u(r, ...) or u(r2, ...) in a Python file, executed only if allowed."""
+    """A pair potential u(r, ...) or u(r2, ...) from a Python file that is executed only with permission."""
 
     kind: Literal["python"]
     function: str = Field(description='file and name, "mine.py:morse", relative to this file')
@@ -159,7 +159,7 @@ class PythonTable(PairPotentialTable):
 
     @property
     def constants(self) -> tuple[str, ...]:
-        """Always empty, because the function itself checks its parameters."""
+        """Always empty, because the Python function defines its own parameters."""
         return ()
 
 
@@ -172,19 +172,19 @@ def _kinds(*tables: type[TomlTable]) -> list[str]:
 
 
 def _other_than(*tables: type[TomlTable]) -> Any:
-    """Define a kind that an editor distinguishes from the kinds of these tables."""
+    """Return the type of the key `kind` for tables whose kind is not one of the built-in kinds."""
     return Field(json_schema_extra={"not": {"enum": [*_kinds(*tables)]}})
 
 
 class OtherRow(TomlTable):
-    """Constants of one pair of species, for a potential from another package."""
+    """Constants of one pair of species for a pair potential from another package."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float]
 
 
 class OtherTable(PairPotentialTable):
-    """A pair potential from another package; its constants are the fields of its class."""
+    """A pair potential from another package; the keys of the table are the fields of its class."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float]
@@ -212,7 +212,7 @@ def _check_names(given: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def _or_other(tables: Sequence[type[TomlTable]], other: type[TomlTable], registry: str) -> Any:
-    """Define a union of tables selected by kind, plus a table for kinds that other packages register."""
+    """Return a union of tables selected by kind, with a further table for kinds from other packages."""
     tags = dict(zip(_kinds(*tables), tables, strict=True))
 
     def kind_of(value: Any) -> Any:
@@ -264,7 +264,7 @@ class CutoffTable(TomlTable):
 
     @property
     def base(self) -> float | None:
-        """Length or multiple of sigma that the onset refers to."""
+        """Reference length of the onset of switching: the radius, as a length or a multiple of sigma."""
         return self.radius if self.radius is not None else self.in_sigma
 
     @staticmethod
@@ -328,7 +328,7 @@ class FileStructure(_Structure):
 
 
 class BuilderStructure(_Structure):
-    """A perfect crystal that is generated."""
+    """A perfect crystal that is generated from its lattice type and lattice constant."""
 
     builder: Literal["fcc", "bcc", "sc", "diamond"] = Field(description="lattice, with its cubic cell")
     symbol: str = Field(description="chemical symbol")
@@ -358,7 +358,7 @@ Structure = Annotated[
 
 
 class RebuildTable(TomlTable):
-    """When the list is rebuilt, with the options of LAMMPS's neigh_modify."""
+    """The rule by which the neighbor list is rebuilt, with the options of LAMMPS's neigh_modify."""
 
     every: int = Field(default=1, ge=1, description="consider a rebuild every so many steps")
     delay: int = Field(
@@ -371,7 +371,7 @@ class RebuildTable(TomlTable):
 
 
 class NeighborsTable(TomlTable):
-    """Settings of the Verlet list."""
+    """Settings of the Verlet neighbor list."""
 
     skin: NonNegative | None = Field(
         default=None, description="extra radius of the list (Å or σ); default 1.0 Å for metal, 0.3 σ for lj"
@@ -457,7 +457,7 @@ _DYNAMICS = (NVETable, LangevinTable, NoseHooverTable, CSVRTable, MTKTable, Cell
 
 
 class OtherDynamics(_Dynamics):
-    """An integrator from another package; its keys are the fields of its class."""
+    """An integrator from another package; the keys of the table are the fields of its class."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, bool | int | float | str]
@@ -482,13 +482,13 @@ Dynamics = _or_other(_DYNAMICS, OtherDynamics, _INTEGRATORS)
 
 
 class DynamicsAlone(TomlTable):
-    """A dynamics table without a system, for simulations made from objects."""
+    """A dynamics table by itself, for simulations that are made from objects and not from a system file."""
 
     dynamics: Dynamics
 
 
 class PrecisionTable(TomlTable):
-    """The floating-point format of each role."""
+    """The floating-point format of each quantity, such as positions, forces and energies."""
 
     state: Literal["float64", "float32", "lattice"] = Field(
         default="float64",
@@ -515,7 +515,7 @@ class PrecisionTable(TomlTable):
 
 
 class ForkTable(TomlTable):
-    """Defaults of `mdnum fork` for this system, used for options missing on the command line."""
+    """Options of `mdnum fork` for this system, used if they are not given on the command line."""
 
     vary: str | None = Field(
         default=None,
@@ -530,7 +530,7 @@ class ForkTable(TomlTable):
 
 
 class RecordTable(TomlTable):
-    """Data to record in addition to series, flips and epochs."""
+    """Data that a run records in addition to time series, flips and list rebuilds."""
 
     save_every: int = Field(
         default=0, ge=0, description="write a trajectory frame every so many steps; 0: none"
@@ -538,14 +538,14 @@ class RecordTable(TomlTable):
 
 
 class Interaction(NamedTuple):
-    """A potential and its cutoff, independent of a system."""
+    """A potential and its cutoff, without the other tables of a system file."""
 
     potential: Any  # a table of `Potential`
     cutoff: CutoffTable | None
 
 
 def check_interaction(potential: Any, cutoff: CutoffTable | None) -> None:
-    """Raise ValueError if a potential and a cutoff are incompatible."""
+    """Raise ValueError if a potential and a cutoff cannot be combined."""
     kind = potential.kind
     if isinstance(potential, PairPotentialTable):
         if cutoff is None:
@@ -557,7 +557,7 @@ def check_interaction(potential: Any, cutoff: CutoffTable | None) -> None:
 
 
 class TermTable(TomlTable):
-    """One of several pair potentials that are added."""
+    """A pair potential with its cutoff, as a term in a sum of pair potentials."""
 
     potential: Potential
     cutoff: CutoffTable | None = None
@@ -582,12 +582,12 @@ def _with_onset(cutoff: CutoffTable | None) -> CutoffTable | None:
 
 
 def _one_of(made: dict[str, Any]) -> None:
-    """Replace a nullable table in the JSON schema by the table itself, as editors expect."""
+    """In the JSON schema, replace the type "table or null" by the table, which editors handle better."""
     made |= made.pop("anyOf")[0]
 
 
 class SystemSpec(TomlTable):
-    """The contents of a system file."""
+    """The contents of a molecular-dynamics system file."""
 
     name: str | None = Field(default=None, description="what to call the system; default the file's name")
     about: str = Field(default="", description="one sentence or more for people, with the source")
@@ -620,25 +620,25 @@ class SystemSpec(TomlTable):
 
     @property
     def interactions(self) -> dict[str, Interaction]:
-        """Potentials with their cutoffs by name of the term; the name is "" if there are no terms."""
+        """Potentials and cutoffs by term; the name "" stands for a potential without terms."""
         if self.terms is None:
             return {"": Interaction(self.potential, self.cutoff)}
         return {name: Interaction(one.potential, one.cutoff) for name, one in self.terms.items()}
 
     @property
     def compare(self) -> str:
-        """Comparison that defines the inside of a cutoff."""
+        """Comparison that defines whether a pair is inside the cutoff, such as "r2 <"."""
         return next((one.cutoff.compare for one in self.interactions.values() if one.cutoff), "r <")
 
     @property
     def skin(self) -> float:
-        """Verlet skin; if the file gives none, the default of the unit system."""
+        """Skin of the Verlet list; the default depends on the unit system."""
         skin = self.neighbors.skin
         return DEFAULT_SKIN[unit_systems.get(self.units).name] if skin is None else skin
 
     @property
     def resolved(self) -> SystemSpec:
-        """Tables in which defaults that depend on other keys are filled in."""
+        """Tables of the file, in which defaults that depend on other keys are filled in."""
         update: dict[str, Any] = {"neighbors": self.neighbors.model_copy(update={"skin": self.skin})}
         update["cutoff"] = _with_onset(self.cutoff)
         if self.terms is not None:
@@ -650,7 +650,7 @@ class SystemSpec(TomlTable):
 
     @staticmethod
     def follow(data: dict[str, Any], values: Mapping[Key, Any]) -> None:
-        """Draw new velocities for a requested temperature or seed, which would otherwise have no effect."""
+        """If temperature or seed is changed, set velocities to be drawn, so that the change has an effect."""
         structure, dynamics = data.get("structure"), data.get("dynamics")
         if not isinstance(structure, dict) or not isinstance(dynamics, dict) or dynamics.get("kind") != "nve":
             return

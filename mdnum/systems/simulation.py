@@ -1,4 +1,4 @@
-"""A simulation as objects: structure, potential, list rule, integrator, precision, start, and units."""
+"""The simulation object: structure, potential, neighbor-list rule, integrator, precision and units."""
 
 from __future__ import annotations
 
@@ -50,10 +50,9 @@ class Origin:
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation as objects, used by every verb, reference and calculator.
+    """A simulation, which is the input of every command, reference method and calculator.
 
-    `mdnum.simulation` creates a simulation from a structure and a potential, `mdnum.build` from a system
-    file.
+    A simulation is created from a structure by `mdnum.simulation`, or from a system file by `mdnum.build`.
 
     Example:
         >>> sim = mdnum.build("argon/liquid-864")
@@ -62,16 +61,15 @@ class Simulation:
     Attributes:
         origin: source of the simulation.
         structure: atoms as given by the user; step 0 uses the positions and velocities below.
-        units: units of all input and output for people.
+        units: unit system of user input and printed output.
         symbols: chemical symbols present, sorted.
-        cell: the box of step 0. If the integrator changes the box, `Segment.cell_of` returns the box of a
-            row.
+        cell: the box of step 0. If the integrator changes the box, `Segment.cell_of` returns a later box.
         positions: positions of the structure (not wrapped), shape (atoms, 3), length.
         velocities: velocities of step 0, shape (atoms, 3), length per internal time.
         masses: masses of the atoms, shape (atoms,).
         species: index of each atom's species in symbols, shape (atoms,).
         model: a CutPotential, Channels, or a many-body potential.
-        decider: the pair decision.
+        decider: the comparison that decides whether a pair is inside the cutoff.
         rule: rule that determines when lists are rebuilt.
         builder: name of the list builder.
         policy: dtype by role.
@@ -132,7 +130,7 @@ class Simulation:
 
     @property
     def timestep(self) -> float:
-        """Time step in the time unit of `units`."""
+        """Time step of the simulation, in the time unit of `units`."""
         step, factor = float(self.integrator.timestep), self.units.time_factor
         # the shortest number that makes this step, which is what a person wrote
         short = float(f"{step / factor:.15g}")
@@ -145,22 +143,22 @@ class Simulation:
 
     @property
     def pairwise(self) -> bool:
-        """True if the fast path for pair potentials applies, else the general path is used."""
+        """True if the potential is a pair potential or a sum of pair potentials, which have faster code."""
         return isinstance(self.model, CutPotential | Channels)
 
     @property
     def imposable(self) -> bool:
-        """True if decisions can be imposed; an energy function that decides by itself ignores them."""
+        """True if decisions can be imposed; an energy function that applies the cutoff ignores them."""
         return self.pairwise or self.model.trusts_list
 
     @property
     def pbc(self) -> tuple[bool, bool, bool]:
-        """Periodicity along each axis."""
+        """Whether the box is periodic along each of its three axes."""
         return self.cell.pbc
 
     @property
     def potential(self) -> Any:
-        """The bare pair potential, or the many-body potential."""
+        """The pair potential before truncation, or the many-body potential."""
         return self.model.potential if self.pairwise else self.model
 
     @property
@@ -175,7 +173,7 @@ class Simulation:
 
     @cached_property
     def force(self) -> PairForce | ManyBodyForce:
-        """Function for forces and decisions over a list, for use in jit."""
+        """Function that computes forces and cutoff decisions for a neighbor list, for use inside jit."""
         # kept for later calls, so it must hold no tracer even where its first use is inside a jit
         with jax.ensure_compile_time_eval():
             parts = (self.model, self.cell, self.decider, self.policy, self.reduction)
@@ -187,10 +185,10 @@ class Simulation:
 
     @cached_property
     def propagator(self) -> Integrator:
-        """Integrator for the state: the integrator itself, or its fixed-point version.
+        """The integrator of the simulation, or its fixed-point version if the state is fixed-point.
 
         Raises:
-            InputError: the integrator or its friction is not possible for a fixed-point state.
+            InputError: the integrator or its friction does not support a fixed-point state.
         """
         if self.fixed_point is None:
             return self.integrator
@@ -199,7 +197,7 @@ class Simulation:
 
     @property
     def smooth(self) -> Simulation:
-        """The same system with a floating-point state, for linearization: an integer has no derivative."""
+        """The same system with a floating-point state, for linearization; integers have no derivative."""
         return self if self.fixed_point is None else replace(self, fixed_point=None)
 
     @property
@@ -209,15 +207,15 @@ class Simulation:
 
     @property
     def program(self) -> dict[str, Any]:
-        """All numbers and choices except the structure, as plain values, for hashing."""
+        """All parameters and settings except the structure, as plain values, for hashing."""
         return self.file.program if self.file is not None else describe.program(self)
 
     def write(self, folder: str | Path) -> None:
-        """Write the simulation into a folder: its file and structure, or a description of its objects."""
+        """Write a folder with the system file and the structure, or with a description of the objects."""
         describe.write(self, Path(folder))
 
     def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-        """Return positions and velocities of step 0 as stored in the state, neither wrapped nor narrowed."""
+        """Return the unwrapped positions and the velocities of step 0, as the state represents them."""
         if self.fixed_point is None:
             return self.positions, self.velocities
         scheme, masses = self.propagator, jnp.asarray(self.masses)
@@ -228,7 +226,7 @@ class Simulation:
 
     @property
     def channels(self) -> int:
-        """Number of decisions per pair; terms with the same radii share one decision."""
+        """Number of cutoff decisions per pair; terms with the same cutoff radii share one decision."""
         return len(self.model.parts) if self.pairwise else 1
 
     @property
@@ -237,10 +235,10 @@ class Simulation:
         return len(self.decider.r_cut) // self.channels
 
     def type_of(self, i, j) -> Int[np.ndarray, "..."]:
-        """Return the decision type of atoms i and j: their pair type plus the types of preceding channels.
+        """Return the index of a pair's cutoff radius: its pair type plus an offset for the channel.
 
         Args:
-            i: first atoms, plus the number of atoms for each channel before that of the decision.
+            i: index of the first atom, plus the number of atoms times the index of the channel.
         """
         channel, i = np.divmod(i, self.atoms)
         if self.pair_types == 1:
@@ -248,27 +246,27 @@ class Simulation:
         return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
 
     def first_atoms(self, i: Any) -> dict[str, Any]:
-        """Return the first atoms of decisions (i as in `type_of`), and terms if there are channels."""
+        """Return the first atom of each decision, and its term if there are several; for i see `type_of`."""
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """Return the terms of given decision types as a column; empty if there are no channels."""
+        """Return the term of each decision type as a table column; empty if all terms share one decision."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])
         return {"terms": names[kind // self.pair_types]}
 
     def pair_of(self, i: int, j: int) -> dict[str, Any]:
-        """Return the labels of a decision's pair (i as in `type_of`), and the term if there are channels."""
+        """Return the atoms of a pair, and the term if terms have separate radii; for i see `type_of`."""
         return {key: np.asarray(one).item() for key, one in self.first_atoms(i).items()} | {"j": int(j)}
 
     def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
-        """Return the changes of energy and radial force when a pair enters, per decision type.
+        """Return the jumps of energy and radial force when a pair enters the cutoff, per decision type.
 
-        If atoms have weights, the values are the largest absolute ones; for single pairs see `jumps_of`.
+        If atoms have weights, the largest absolute jumps of any pair are returned; see also `jumps_of`.
         """
         if not self.pairwise:
             smoothness = self.model.smoothness
@@ -281,14 +279,14 @@ class Simulation:
 
     @property
     def _weights(self) -> Float[np.ndarray, "terms atoms"] | None:
-        """Weights of all terms; None if no term has weights."""
+        """Weight of each atom in each term of the potential; None if no term has weights."""
         if not self.pairwise or not self.model.weights:
             return None
         each = (term.weights for term in self.model.terms.values())
         return np.stack([np.asarray(own[0]) if own else np.ones(self.atoms) for own in each])
 
     def jumps_of(self, i, j) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """Return the changes of energy and radial force when given pairs enter; for i see `type_of`."""
+        """Return the jumps of energy and radial force when given pairs enter; for i see `type_of`."""
         kind, weights = self.type_of(i, j), self._weights
         if weights is None:
             energy, force = (jump[kind] for jump in self.jumps())
@@ -300,7 +298,7 @@ class Simulation:
 
     @property
     def lists(self) -> tuple[Any, ...]:
-        """Properties that determine the neighbor lists and their order; equal values give equal lists."""
+        """Settings that determine the neighbor lists and their order; equal values give equal lists."""
         return self.rule, self.builder
 
     def verlet_list(self, skin: float | None = None) -> VerletList:
@@ -310,12 +308,12 @@ class Simulation:
 
     @property
     def _guard(self) -> float:
-        """Margin for rounding of the displacements that are compared with the skin, length."""
+        """Allowance for rounding errors of displacements when they are compared with the skin, length."""
         coarsest = max(unit_roundoff(self.policy.dtype(role)) for role in ("state", "decision"))
         return 16 * coarsest * float(np.linalg.norm(self.decider.reach.coordinate))
 
     def tables(self, table: PairTable) -> Tables:
-        """Put a pair table on the device, with pair types."""
+        """Copy a neighbor table to the device, and add the pair type of each entry."""
         index, order = table.found, table.sorting
         atoms = index.shape[1]
         shape = (-1, SLOTS, atoms)
@@ -333,11 +331,11 @@ class Simulation:
         return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order), edges)
 
     def with_model(self, model: Any) -> Simulation:
-        """Return the system with other pair terms or a many-body potential, and decisions at their radii.
+        """Return the system with another potential, and with cutoff decisions at the radii of this potential.
 
         Raises:
-            InputError: the longest radius and the skin do not fit the box, or the precision of a many-body
-                potential is neither float64 nor float32.
+            InputError: the box is too small for the longest radius and the skin, or the precision of a
+                many-body potential is neither float64 nor float32.
         """
         radii = tuple(np.atleast_1d(np.asarray(model.r_cut, np.float64)).tolist())
         check_radius(self.cell, max(radii), self.rule.skin)
@@ -346,11 +344,11 @@ class Simulation:
 
     @property
     def apart(self) -> Simulation:
-        """The same system with a separate decision for each term, even if radii agree."""
+        """The same system with separate cutoff decisions for each term, even if terms have equal radii."""
         return self.with_model(Channels.of_terms(self.model.terms, apart=True))
 
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
-        """Return the system with another kind of cutoff; radius and pairs remain the same.
+        """Return the system with another kind of cutoff; the cutoff radius remains the same.
 
         The onset of switching is kept; if the previous cutoff did not switch, the onset is 0.9 of the radius.
         """
@@ -370,22 +368,22 @@ class Simulation:
 
     @property
     def continuous(self) -> Simulation:
-        """The same forces, with an energy that is continuous at the cutoff."""
+        """The system with the same forces, and with an energy that is continuous at the cutoff."""
         if not self.pairwise or self.cutoff.smoothness >= 0:
             return self
         return self._ended(lambda end: end.continuous)
 
     def with_policy(self, policy: PrecisionPolicy = PrecisionPolicy()) -> Simulation:
-        """Return the system with the dtypes of a policy and a floating-point state; default float64."""
+        """Return the system with a floating-point state and a policy's dtypes (default float64)."""
         decider = replace(self.decider, dtype=policy.decision, state=policy.state)
         return replace(self, policy=policy, decider=decider, fixed_point=None)
 
     def in_row(self, cell: Cell | None) -> Simulation:
-        """Return the system in the box of a row; unchanged if the integrator does not move the box."""
+        """Return the system in the box of a step; unchanged if the integrator keeps the box constant."""
         return self.with_cell(jax.tree.map(np.asarray, cell)) if self.integrator.moves_cell else self
 
     def with_cell(self, cell: Cell) -> Simulation:
-        """Return the system in another box."""
+        """Return the same system in another simulation box."""
         check_radius(cell, self.r_cut, 0.0)
         if not self.pairwise and getattr(self.model, "fixed_box", False):
             message = f"{self.model.name} always uses the box with which it was made"
@@ -400,11 +398,11 @@ class Simulation:
         cell: Float[np.ndarray, "3 3"] | None = None,
         stress: bool = True,
     ) -> Evaluation:
-        """Evaluate one configuration with a temporary list; for arguments see `Evaluator.__call__`."""
+        """Compute energy and forces of one configuration; for arguments see `Evaluator.__call__`."""
         return Evaluator(self, skin=0.0, often=False)(positions, cell, stress)
 
     def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
-        """Compute only the potential energy of one configuration and related numbers, with a temporary list.
+        """Compute the potential energy, the forces and extreme pair distances of one configuration.
 
         Args:
             positions: shape (atoms, 3), length; default those of the structure.
@@ -417,7 +415,7 @@ class Simulation:
         return Evaluator(self, skin=0.0, often=False).numbers(positions)
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the pairs i < j that are inside the cutoff, sorted, with their distances."""
+        """Return the pairs i < j that are inside the cutoff, sorted by i and j, and their distances."""
         i, j = table.decided(bits)
         if self.channels > 1:
             i, j = np.divmod(np.unique(i % self.atoms * self.atoms + j), self.atoms)
@@ -428,7 +426,7 @@ class Simulation:
 
 
 def _edges(index: Int[np.ndarray, "slots atoms"], form: str) -> Int[np.ndarray, "first second"]:
-    """Return the pairs of a table in the format of `Tables.edges`, grouped by atom."""
+    """Return the pairs of a neighbor table in the format of `Tables.edges`, grouped by atom."""
     atoms = index.shape[1]
     if form == "dense":
         return np.ascontiguousarray(index.T, np.int32)

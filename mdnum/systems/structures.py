@@ -1,4 +1,4 @@
-"""Structures: reading or building, validation for a simulation, and writing without loss of a bit."""
+"""Atomic structures: reading, building, validating, and writing them without rounding."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _SMALLEST_IN_SIGMA = 0.4
 
 @dataclass(frozen=True)
 class Draw:
-    """How the velocities of step 0 are created, unless the structure contains velocities."""
+    """Settings by which the velocities of step 0 are drawn, if those of the structure are not used."""
 
     temperature: float  # Maxwell-Boltzmann's, and a thermostat's, in the unit of the simulation
     seed: int = 0  # of the draw and of a thermostat's noise
@@ -62,7 +62,7 @@ class Draw:
 
 
 def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, folder: Path) -> Atoms:
-    """Create the atoms that a [structure] table describes, in float64, without a calculator or constraints.
+    """Create the atoms that a [structure] table describes, in float64 and without a calculator.
 
     Args:
         structure: the structure table.
@@ -105,7 +105,7 @@ def species_of(atoms: Atoms) -> tuple[tuple[str, ...], Int64[np.ndarray, " atoms
 
 
 def ignored(structure: schema.FileStructure | schema.BuilderStructure, folder: Path) -> list[str]:
-    """Return the columns of a structure file that look like velocities but are not read as velocities."""
+    """Return the columns of a structure file that have names like velocities but are not read as such."""
     if isinstance(structure, schema.BuilderStructure):
         return []
     return ignored_velocities(_read(folder / structure.file, structure.index).arrays)
@@ -232,7 +232,7 @@ def _check_finite(atoms: Atoms) -> None:
 
 
 def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
-    """Raise an error if coordinates are so large that their rounding spoils distances."""
+    """Raise an error if coordinates are so large that rounding makes pair distances inaccurate."""
     farthest = _FARTHEST * r_cut
     places = np.abs(atoms.positions).max(axis=1)
     if (places > farthest).any():
@@ -270,12 +270,12 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
 
 
 def repeats(cell: Cell, r_list: float) -> str:
-    """Return how often a box must be repeated along a, b and c for the minimum image to be sufficient."""
+    """Return the number of repeats of the box along a, b and c that the minimum-image convention requires."""
     return " x ".join(str(max(1, math.ceil(2 * r_list / width))) for width in cell.widths)
 
 
 def smallest_distance(kind: str, units: str, sigmas: Sequence[float] = ()) -> float:
-    """Return the distance (length) below which two atoms with this potential and sigma must be a mistake."""
+    """Return the distance below which two atoms with this potential are considered an error, length."""
     if kind == "soft-sphere":
         # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
         return 1e-9
@@ -309,7 +309,7 @@ def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> No
 def _nearest(
     atoms: Atoms, within: float
 ) -> tuple[Float64[np.ndarray, " atoms"], Int64[np.ndarray, " atoms"], int]:
-    """Find the nearest periodic neighbor of each atom within a distance, and the number of such pairs."""
+    """Find the nearest periodic neighbor of each atom, and the number of pairs, within a given distance."""
     from scipy.spatial import KDTree
 
     count = len(atoms)
@@ -324,7 +324,7 @@ def _nearest(
 
 
 def nearest_distance(atoms: Atoms, within: float) -> float:
-    """Return the distance of the closest pair of atoms, or `within` if no pair is as close."""
+    """Return the distance of the closest pair of atoms, or `within` if all pairs are farther apart."""
     from scipy.spatial import KDTree
 
     places, _ = with_images(atoms, within)
@@ -335,7 +335,7 @@ def nearest_distance(atoms: Atoms, within: float) -> float:
 def with_images(
     atoms: Atoms, reach: float
 ) -> tuple[Float64[np.ndarray, "places 3"], Int64[np.ndarray, " places"]]:
-    """Return wrapped positions and images up to twice the reach beyond the faces, with the atom of each."""
+    """Return positions of atoms and of images up to 2 `reach` outside the box, and the atom of each one."""
     from mdnum.md.cell import complete
 
     cell = complete(atoms.cell.array, atoms.pbc)
@@ -365,7 +365,7 @@ _LONGEST_HEAD = 1000
 
 
 def _from_extxyz(path: Path) -> Atoms | None:
-    """Read atoms from a file in the exact format of `to_extxyz`; return None for any other file."""
+    """Read atoms from a file that `to_extxyz` wrote; return None if the file has another format."""
     from ase import Atoms
     from pyarrow import ArrowInvalid, csv
 
@@ -403,7 +403,7 @@ def _from_extxyz(path: Path) -> Atoms | None:
 
 
 def to_extxyz(atoms: Atoms, names: Sequence[str] = ("momenta", "masses")) -> str:
-    """Write extended XYZ text that preserves every float64 bit for bit (ASE's own writer keeps 8 decimals).
+    """Return extended XYZ text that keeps every bit of each float64 (ASE's writer keeps 8 decimals).
 
     Args:
         atoms: any atoms.

@@ -1,9 +1,9 @@
-"""System files as text and tables: reading with line numbers in errors, writing, messages, and overrides.
+"""Reading and writing system files in TOML format, error messages with line numbers, and overrides.
 
-The standard library reads TOML, but does not write TOML or record the position of keys; both are simple for
-the tables of a system file. A table whose keys depend on its kind is a union of pydantic models, selected by
-a key such as `kind` or `rule`; `models` follows a key through such unions. Errors become one line: what was
-found, what was expected, and where.
+The standard library reads TOML, but neither writes TOML nor records the line of a key. This module does both
+for the tables of a system file. A table whose keys depend on its kind is a union of pydantic models, selected
+by a key such as `kind` or `rule`; `models` finds the model of a key in such unions. Each error message is one
+line with the value found, the expected value and the line of the file.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
     """Parse a TOML text into tables.
 
     Raises:
-        InputError: the text is not TOML; the message names and shows the line.
+        InputError: the text is not valid TOML; the message quotes the line.
     """
     try:
         tables = tomllib.loads(text)
@@ -69,7 +69,7 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
 
 
 def scalar(text: str) -> Any:
-    """Parse a value from the command line as a TOML value, or as plain text if this fails.
+    """Parse a command-line value as TOML; text that is not valid TOML is used as a string.
 
     `switched` and `"switched"` are equivalent; `0.5` is a number, `true` a Boolean, `[2, 2, 2]` an array.
     """
@@ -81,7 +81,7 @@ def scalar(text: str) -> Any:
 
 
 def _is_deep(value: Any) -> bool:
-    """Return True if tables and arrays are nested more deeply than in any reasonable file."""
+    """Return True if tables and arrays are nested too deeply for a system file."""
     level = [value]
     for _ in range(_DEEPEST):
         level = [
@@ -99,7 +99,7 @@ def dotted(text: str) -> Key:
     """Split a dotted key such as `potential.pairs.Ni-P.sigma` into its parts.
 
     Raises:
-        InputError: the text is not a dotted key.
+        InputError: the text is not a valid dotted key.
     """
     parts, end = _dotted_prefix(text)
     if not parts or end != len(text):
@@ -124,7 +124,7 @@ def _dotted_prefix(text: str) -> tuple[Key, int]:
 
 
 def line_of(text: str, key: Key) -> int | None:
-    """Return the line (from 1) that sets a key, else the line of the nearest enclosing table, else None."""
+    """Return the line (from 1) that sets a key or starts its innermost table; None if there is neither."""
     best: tuple[int, int] | None = None
     table: Key = ()
     for number, line in enumerate(text.splitlines(), start=1):
@@ -144,9 +144,10 @@ def line_of(text: str, key: Key) -> int | None:
 
 
 def dump(tables: Mapping[str, Any]) -> str:
-    """Return TOML text of nested tables; None means absent, and floats keep every bit.
+    """Return the TOML text of nested tables; values of None are omitted, and floats keep every bit.
 
-    In each table, scalars come first, as TOML requires, the kind or rule first; empty tables are omitted.
+    In each table, `kind` or `rule` is written first, then other scalars, then tables; TOML requires this
+    order.
     """
     lines: list[str] = []
     _dump_table((), tables, lines)
@@ -199,18 +200,18 @@ _LARGEST_INT = 2**62
 
 
 def loaded(registry: str) -> Any:
-    """Import the registry at "module:attribute", whose module may be slow to import."""
+    """Import and return the registry that "module:attribute" refers to."""
     module, _, attribute = registry.partition(":")
     return getattr(importlib.import_module(module), attribute)
 
 
 class Named:
-    """Type annotation for a name from a registry, possibly with an argument; validated in files.
+    """Type annotation for a key of a system file whose value must be a name from a registry.
 
     Args:
         registry: "module:attribute"; imported for the first validation, because the module may be slow to
             import.
-        others: further allowed words.
+        others: further allowed values.
     """
 
     def __init__(self, registry: str, *others: str):
@@ -241,7 +242,7 @@ class Named:
 
 
 class TomlTable(BaseModel):
-    """Base class of all tables: frozen, strict, no unknown keys, finite numbers only."""
+    """Base class of system-file tables: immutable, strictly typed, no unknown keys, finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -265,17 +266,17 @@ class TomlTable(BaseModel):
 
     @staticmethod
     def foreign_keys(table: Mapping[str, Any]) -> set[str]:
-        """Return the keys that do not apply to the kind in a table."""
+        """Return the keys of a table that do not apply to the kind given in this table."""
         return set()
 
 
 def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
-    """Create the error for a table that cannot be run, with the dotted key at fault."""
+    """Create the validation error for a value that cannot be run, with the dotted key of this value."""
     return PydanticCustomError("unusable", "{said}", {"said": message, "remedy": remedy, "key": key})
 
 
 def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
-    """Return the possible models of the table at a key, best match first; empty if the key is a value."""
+    """Return the possible models of the table at a key, best match first; empty if the key has no table."""
     found, table = [root], data
     for part in key:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}
@@ -296,7 +297,7 @@ def _models_in(annotation: Any) -> Iterator[type[TomlTable]]:
 
 
 def _chosen(options: Sequence[type[TomlTable]], table: Any) -> type[TomlTable] | None:
-    """Select the model of a union for a table."""
+    """Select the model of a union that matches the contents of a table."""
     tag = _tag_of(options)
     given = table.get(tag) if tag and isinstance(table, Mapping) else None
     if tag and isinstance(given, str):
@@ -310,7 +311,7 @@ def _chosen(options: Sequence[type[TomlTable]], table: Any) -> type[TomlTable] |
 
 
 def _tag_of(options: Sequence[type[TomlTable]]) -> str | None:
-    """Return the key that distinguishes the models of a union, or None."""
+    """Return the key that distinguishes the models of a union ("kind" or "rule"), or None."""
     keys = {name for model in options for name in model.model_fields}
     return next((name for name in ("kind", "rule") if name in keys), None)
 
@@ -352,7 +353,7 @@ _BOUNDS = {
 
 @dataclass(frozen=True)
 class Source:
-    """A system file as it was read."""
+    """The text and location of a system file, and the overrides of its keys."""
 
     name: str  # what the system was called by
     path: Path  # the file
@@ -361,7 +362,7 @@ class Source:
     values: Mapping[Key, Any] = field(default_factory=dict)  # overrides, by key
 
     def place(self, key: Key) -> str:
-        """Return the file and line, or the override, that set a key."""
+        """Return the file and line that set a key, or the command-line override that set the key."""
         if any(key[: len(given)] == given for given in self.values):
             return f"--set {'.'.join(key)}"
         number = line_of(self.text, key) if key else None
@@ -376,10 +377,10 @@ Root = TypeVar("Root", bound=TomlTable)
 
 
 def checked(root: type[Root], data: Mapping[str, Any], source: Source) -> Root:
-    """Validate the tables of a file and return their model.
+    """Validate the tables of a system file and return the model of the whole file.
 
     Raises:
-        InputError: the model rejects the tables; the message is one line about the most informative mistake.
+        InputError: the tables are not valid; the message describes the most informative error in one line.
     """
     try:
         return root.model_validate(data)
@@ -504,10 +505,10 @@ def read_overrides(overrides: Mapping[str, Any] | None) -> dict[Key, Any]:
 
 
 def apply_overrides(data: dict[str, Any], values: Mapping[Key, Any], root: type[TomlTable]) -> None:
-    """Put override values into the tables, and remove keys that do not apply to a newly chosen kind.
+    """Set overrides in the tables; if a kind is overridden, remove keys that do not apply to the new kind.
 
     Raises:
-        InputError: a key lies below a key that holds a value instead of a table.
+        InputError: an enclosing key has a value that is not a table.
     """
     for key, value in values.items():
         table = data

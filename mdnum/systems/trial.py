@@ -1,7 +1,7 @@
-"""Trial calls of an energy function at one configuration, over equivalent lists.
+"""Trial calls of a user's energy function at one configuration, with equivalent neighbor lists.
 
-One program computes energy and derivatives, another only the energy, over a list with more padding. Both are
-compiled with few optimizations, because classifying a function takes only a few dozen calls (`admission`).
+One compiled function computes energy and derivatives; another computes only the energy, for a list with more
+padding. Both are compiled with few optimizations, because classification needs only a few dozen calls.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MORE = 8
 
 
 class AdmissionError(InputError):
-    """Error for an energy function that cannot be simulated; `code` is the reason, `values` its numbers."""
+    """Error for an energy function that cannot be simulated; `code` is the reason, `values` are numbers."""
 
     def __init__(self, code: str, name: str, **values: Any):
         entry = _TEXTS[code]
@@ -43,7 +43,7 @@ class AdmissionError(InputError):
 
 
 class Trial:
-    """Trial of an energy function at one configuration, with atoms in the order of the structure.
+    """Trial calls of an energy function at one configuration, with atoms in the order of the structure.
 
     Args:
         atoms: number of atoms in the trial: those closest to the first atom, in the box of the whole
@@ -93,17 +93,17 @@ class Trial:
 
     @property
     def call(self) -> Call:
-        """The function with the calling convention found so far."""
+        """The energy function with the calling convention that was found so far."""
         return self.model.call
 
     def learn(self, **found: Any) -> None:
-        """Store properties of the calling convention."""
+        """Store properties that were found for the calling convention of the energy function."""
         self.model = replace(self.model, function=replace(self.call, how=replace(self.call.how, **found)))
 
     # --- the programs ---------------------------------------------------------------------------------
 
     def _lists(self) -> None:
-        """Find the format of the function's own list, whether an atom lists itself, and the parameters."""
+        """Find the format of the function's own neighbor list, whether it has self-pairs, and parameters."""
         model, lists, own = self.model, self.model.lists, None
         if lists is not None:
             for x in (self.x / self.call.length, self.x @ np.linalg.inv(self.cell)):
@@ -130,7 +130,7 @@ class Trial:
             self.model = replace(model, parameters=model.start(key, x, own))
 
     def bare(self, parameters, x, idx, real, cell, box, strain, code):
-        """Return the function's own energy, for positions and a box in the function's own convention."""
+        """Return the energy in the function's own unit, for positions and a box in its own convention."""
         call, model = self.call, self.model
         neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
         if call.how.images:
@@ -138,7 +138,7 @@ class Trial:
         return call.bare(parameters, x, neighbor, {"cell": cell, "box": box, "perturbation": strain})
 
     def arguments(self, idx=None, x=None, cell=None, code=0) -> tuple[Any, ...]:
-        """Return the arguments of `bare` for real positions in a box, by the convention found so far."""
+        """Convert real positions and a box to arguments of `bare`, with the convention found so far."""
         call, how = self.call, self.call.how
         idx, x, cell = (
             own if one is None else one for one, own in ((idx, self.inside), (x, self.x), (cell, self.cell))
@@ -151,7 +151,7 @@ class Trial:
         return (self.model.parameters, *map(jnp.asarray, given))
 
     def _compile(self) -> None:
-        """Find a format, keywords and a result that work, and compile energy and derivatives."""
+        """Find a list format and keywords that the function accepts, and compile energy and derivatives."""
         formats = FORMATS if self.model.format == "any" else (self.model.format,)
         words, failed = self.call.how.keywords, ""
         # a space of jax-md may raise at a keyword that the function passes on
@@ -172,7 +172,7 @@ class Trial:
         raise self.error("NOT_CALLABLE", error=failed, tried=", ".join(formats))
 
     def _returned(self) -> str:
-        """Return the kind of the function's result, as defined by `Convention.returns`."""
+        """Return the kind of result of the energy function, one of the values of `Convention.returns`."""
         shape = jax.tree.map(lambda one: one.shape, jax.eval_shape(self.bare, *self.arguments()))
         one = ((), (1,))
         if isinstance(shape, Mapping):
@@ -185,13 +185,13 @@ class Trial:
 
     @cached_property
     def _alone(self) -> tuple[Any, Any]:
-        """Compiled program for the energy over a list with more padding, and its traced operations."""
+        """The compiled energy function for a neighbor list with more padding, and its traced operations."""
         traced = jax.jit(self.bare).trace(*self.arguments(self._padded(self.inside)))
         return _quick(traced), traced.jaxpr
 
     @property
     def jaxpr(self) -> Any:
-        """Traced operations of the energy."""
+        """Traced operations (jaxpr) of the energy function."""
         return self._alone[1]
 
     def _padded(self, idx) -> Int[np.ndarray, "atoms slots"]:
@@ -208,7 +208,7 @@ class Trial:
         return float(energy) * call.unit, -np.asarray(slope) @ by_x * call.unit
 
     def energy(self, x=None, idx=None, cell=None) -> float:
-        """Compute only the energy, over a list with more padding, in a quarter of the time."""
+        """Compute only the energy, for a list with more padding, in a quarter of the time of `there`."""
         idx = self._padded(self.inside if idx is None else idx)
         return float(self._alone[0](*self.arguments(idx, x, cell))) * self.call.unit
 
@@ -222,25 +222,25 @@ class Trial:
         return float(made(*arguments)) * self.call.unit
 
     def within(self, idx, x, radius: float) -> Int[np.ndarray, "atoms slots"]:
-        """Keep the listed pairs that are closer than a radius."""
+        """Return the neighbor list without the pairs at distances of `radius` or more."""
         near = (idx < self.n) & (self.distances(idx, x) < radius)
         return np.where(near, idx, self.n).astype(np.int32)
 
     def distances(self, idx, x) -> Float[np.ndarray, "atoms slots"]:
-        """Compute the distances of listed pairs; values for padding are arbitrary."""
+        """Return the distances of all pairs in a neighbor list; values for padding entries are arbitrary."""
         d = displacement(self.box, x[:, None], x[np.minimum(idx, self.n - 1)])
         return np.sqrt(sum(c * c for c in d))
 
     def culprit(self, idx) -> str:
-        """Return the first operation over a list that makes the energy or its derivative not finite."""
+        """Return the first operation whose result is not finite in the energy or its derivative."""
         return named(first_not_finite(jax.value_and_grad(self.bare, 1), *self.arguments(idx)))
 
 
 def _quick(traced: Any) -> Any:
-    """Compile a traced program with few optimizations, for a few calls."""
+    """Compile a traced function with few optimizations, because it is called only a few times."""
     return traced.lower().compile(compiler_options={"xla_backend_optimization_level": 0})
 
 
 def named(found: Operation | None) -> str:
-    """Return the name of an operation and its place in the source code."""
+    """Return the name of an operation and its location in the source code."""
     return "one of several" if found is None else f"{found.name} ({found.source or 'in a function of jax'})"
