@@ -1,4 +1,4 @@
-"""Sensitivity studies: which choices affect which results, how significantly, and which setting suffices.
+"""Sensitivity studies: which numerical choices affect which results, and which setting is accurate enough.
 
 design      choices and their values, and the points that they make
 points      storage of points, in one folder each, so that none is lost or computed twice

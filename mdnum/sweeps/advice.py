@@ -1,4 +1,4 @@
-"""Search for the cheapest setting whose results agree with those of the converged one within a tolerance."""
+"""Search for the cheapest setting whose results agree with converged results within a tolerance."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ _ENDS = {
 
 @dataclass(frozen=True)
 class EndComparison:
-    """A value of an axis, or a setting, compared with the converged end."""
+    """Result of comparing a value of an axis, or a whole setting, with the converged end of the axis."""
 
     value: Any
     by_measure: Mapping[str, Within]
 
     @property
     def worst(self) -> str | None:
-        """The measure outside its tolerance; if there is none, the one that needs the most further seeds."""
+        """Measure outside its tolerance, or else the undecided measure that needs the most seeds."""
         each = self.by_measure
         ranked = sorted(each, key=lambda name: (each[name].inside is not False, -each[name].more))
         return next((name for name in ranked if each[name].inside is not True), None)
 
     @property
     def inside(self) -> bool | None:
-        """True if all measures are within their tolerances; None if undecided."""
+        """True if all measures are within their tolerances; None if the errors are too large to decide."""
         each = [one.inside for one in self.by_measure.values()]
         return False if False in each else None if None in each else True
 
     @property
     def more(self) -> float:
-        """Factor by which the number of seeds must increase to decide about the tolerances."""
+        """Factor by which the number of seeds must increase for a decision on all tolerances."""
         return max((one.more for one in self.by_measure.values()), default=1.0)
 
 
 @dataclass(frozen=True)
 class Advice:
-    """Recommended value of one axis.
+    """Recommended value of one axis (one varied choice), with the comparisons that lead to it.
 
     Attributes:
         key: key of the axis. end: the value that is regarded as converged; None if there is none.
@@ -72,7 +72,7 @@ class Advice:
 
 
 def end_of(key: str, values: Sequence[Any], given: Mapping[str, str] = {}) -> Any:
-    """Return the value of an axis that is regarded as converged; None if there is none."""
+    """Return the value of an axis that is regarded as converged; None if the axis has no such value."""
     word = given.get(key, _ENDS.get(key) or _ENDS.get(key.rpartition(".")[2], ""))
     if word == "largest":
         return max(values, key=_size)
@@ -92,13 +92,13 @@ def advise(
     tolerances: Mapping[str, float],
     given: Mapping[str, str] = {},
 ) -> Advice | None:
-    """Return the recommended value of an axis; None if no end is converged, or no measure has a tolerance.
+    """Return the recommended value of an axis; None without a converged end or without tolerances.
 
     Args:
         values: values of the axis.
         found: differences from the end, as `difference` returns them, by measure and by label of a value.
         tolerances: tolerances by measure, in its unit.
-        given: ends by key, in place of the usual ones: each is "largest", "smallest" or a value.
+        given: converged ends by key, instead of the default ends: "largest", "smallest" or a value.
     """
     end = end_of(key, values, given)
     if end is None or not tolerances:
@@ -125,7 +125,7 @@ def compared_with_end(
     tolerances: Mapping[str, float],
     comparisons: int,
 ) -> EndComparison:
-    """Compare a value, or a setting, with the converged end.
+    """Compare the results of a value, or of a setting, with those of the converged end.
 
     Args:
         key: its label in `found`. found, tolerances: as for `advise`. comparisons: their number.

@@ -1,4 +1,4 @@
-"""Results of a sweep, from its points on disk: means, differences, failures and recommended values."""
+"""Analysis of a sweep from its points on disk: means, differences, failures and recommended values."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOVES = {True: "yes", False: "no", None: "undecided"}
 
 @dataclass
 class _Results:
-    """Results of points, grouped as needed for comparisons."""
+    """Results of all points of a sweep, grouped by measure, setting and seed."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)  # of the table of points
     # (value, error, independent samples) of each run, by measure, setting and seed
@@ -45,7 +45,7 @@ class _Results:
 
 
 def analyzed(place: Workspace, plan: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return tables and summary of a sweep whose points have been computed."""
+    """Return the tables and the summary of a sweep, from the stored results of its points."""
     results = _read(place, plan)
     joint = [plan.setting(choices) for choices in plan.question.joint]
     along = {setting for axis in plan.axes for _, setting in plan.along(axis)}
@@ -149,7 +149,7 @@ def _along(
     reference: Setting,
     names: Sequence[str],
 ) -> dict[str, dict[str, Raw]]:
-    """Return the differences of several settings from a reference setting, by measure and by label."""
+    """Return the differences between several settings and a reference setting, by measure and by label."""
     found = {}
     for name in names:
         runs = results.values.get(name, {})
@@ -175,7 +175,7 @@ def _labels(plan: Plan, axis: Axis) -> dict[str, Setting]:
 
 
 def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[str, ...], Raw]:
-    """Return the differences of each value of each axis from the value in the system."""
+    """Return the change of each measure for each value of each axis, relative to the system's own value."""
     found = {}
     for axis in plan.axes:
         each = _along(means, results, _labels(plan, axis), plan.origin, plan.names)
@@ -184,7 +184,7 @@ def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[
 
 
 def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
-    """Return the change of each measure between the ends of each axis, for a space-filling design."""
+    """Return the change of each measure from one end of each axis to the other (space-filling design)."""
     choices, ends = {one.setting: one.point.choices for one in plan.points}, {}
 
     def share(axis: Axis, value: Any) -> float:
@@ -206,7 +206,7 @@ def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
 
 
 def _tolerances(plan: Plan, means: Means) -> dict[str, float]:
-    """Return tolerances by measure, in the measure's unit."""
+    """Return the tolerance of each measure, in the unit of the measure."""
     given = plan.question.tolerance
     if given is None:
         return {}
@@ -230,7 +230,7 @@ def _advice(
     compared: Mapping[tuple[str, ...], Difference],
     results: _Results,
 ) -> list[dict[str, Any]]:
-    """Return the recommended value of each axis as plain values; the fastest if an axis affects no result."""
+    """Return the recommended value of each axis; for an axis in `FREE`, the value with the fastest runs."""
     physical = {measure.name for measure in plan.measures if measure.physical}
     moving = {(key, value) for (name, key, value), one in compared.items() if one.moves and name in physical}
     rows = []
@@ -262,9 +262,9 @@ def _advice(
 
 
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the setting with all recommended values and the setting with all converged ends; empty if equal.
+    """Return two settings: with all recommended values, and with all converged ends; empty if they are equal.
 
-    Each choice was varied alone, so the combined effect of several choices is known only after these runs.
+    Each choice was varied alone; runs with these two settings show the combined effect of all choices.
     """
     best = {row["choice"]: row["best"] for row in advice if row["best"] is not None}
     ends = {row["choice"]: row["end"] for row in advice if row["end"] is not None}
@@ -275,7 +275,7 @@ def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[st
 
 
 def _means(results: _Results, without: Collection[Setting] = ()) -> dict[tuple[str, Setting], SeedMean]:
-    """Return means over seeds; settings that were added later do not change the errors of the others."""
+    """Return the mean over seeds of each measure at each setting, except for the settings in `without`."""
     return {
         (name, setting): mean
         for name, runs in results.values.items()
@@ -289,7 +289,7 @@ def _together(
     means: Means, results: _Results, joint: Sequence[Setting],
     tolerances: Mapping[str, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return whether the setting with all recommended values is within the tolerances."""
+    """Return whether results with all recommended values agree with converged results within tolerances."""
     setting, end = joint
     found = _along(means, results, {"": setting}, end, list(tolerances))
     one = compared_with_end(setting, "", found, tolerances, len(tolerances))
@@ -301,7 +301,7 @@ def _together(
 
 
 def _fastest(plan: Plan, axis: Axis, moving: set[tuple[str, str]], results: _Results) -> dict[str, Any]:
-    """Return the value with the fastest runs without lost pairs, for a choice that affects no result."""
+    """Return the value of an axis with the fastest runs that lose no pairs and do not change results."""
     rows = []
     for value, setting in plan.along(axis):
         speeds, lost = np.array(results.speeds.get(setting, [(np.nan, 0)])).T

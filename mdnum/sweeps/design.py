@@ -1,7 +1,7 @@
-"""Design of a sweep: choices with their values, and the points that are run.
+"""Design of a sweep: the varied choices, their values, and the points (settings with seeds) to run.
 
-A choice is a key of the system file, or a word for several keys that belong together (`precision`). Values
-are written as in a system file.
+A choice is a key of the system file, or a name for several keys that are varied together (`precision`).
+Values are written as in a system file.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ Design = Literal["one-at-a-time", "factorial", "space-filling"]
 
 @dataclass(frozen=True)
 class Axis:
-    """A choice and its values."""
+    """A choice that is varied in a sweep, and its values."""
 
     key: str
     values: tuple[Any, ...]
 
     @property
     def ordered(self) -> bool:
-        """True if the values are numbers."""
+        """True if the values of the axis are numbers."""
         return all(isinstance(one, int | float) and not isinstance(one, bool) for one in self.values)
 
     def settings(self, value: Any, world: str = "md") -> dict[str, Any]:
-        """Return the keys of a system file, of molecular dynamics or of a ball, that a value sets."""
+        """Return the keys of the system file that a value of this axis sets, with their values."""
         if self.key == "precision" and isinstance(value, str):
             return {f"precision.{role}": value for role in _ROLES[world]}
         return {self.key: value}
@@ -50,17 +50,17 @@ class Axis:
 
 @dataclass(frozen=True)
 class Point:
-    """One setting of all choices, with a seed."""
+    """One setting (a value of each choice) and a random seed."""
 
     choices: Mapping[str, Any]  # a value for each axis
     seed: int | None  # None: the system's own
 
 
 def parse(text: str) -> Axis:
-    """Return the axis given as KEY=LOW:HIGH:STEP, KEY=VALUE,VALUE,… or the word precision.
+    """Return the axis that a text describes: KEY=LOW:HIGH:STEP, KEY=VALUE,VALUE,… or "precision".
 
     Raises:
-        InputError: the text has another form, or repeated values.
+        InputError: the text has a different form, or contains repeated values.
     """
     key, equals, rest = (part.strip() for part in text.partition("="))
     if key == "precision" and not equals:
@@ -77,7 +77,7 @@ def parse(text: str) -> Axis:
 
 
 def checked(axis: Axis) -> Axis:
-    """Return the axis, if its values are valid.
+    """Return the axis unchanged; raise an error if its values are invalid.
 
     Raises:
         InputError: there are no values, a value is not finite, or values are repeated.
@@ -111,7 +111,7 @@ def _range(text: str, low: Any, high: Any, step: Any) -> tuple[Any, ...]:
 
 
 def with_base(axis: Axis, base: Any) -> Axis:
-    """Return the axis with the base value added, in ascending order if the values are numbers."""
+    """Return the axis with the base value included, in ascending order if the values are numbers."""
     same = [one for one in axis.values if one == base and type(one) is not bool]
     values = axis.values if same else (base, *axis.values)
     made = Axis(axis.key, values)
@@ -125,7 +125,7 @@ def points(
     design: Design = "one-at-a-time",
     samples: int = 0,
 ) -> list[Point]:
-    """Return all points, ordered by seed, so that an interrupted sweep contains results for every setting.
+    """Return all points, ordered by seed, so that an interrupted sweep has results for every setting.
 
     Args:
         base: the value of each axis that is kept while another axis is varied.
@@ -156,7 +156,7 @@ def points(
 
 
 def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
-    """Return a scrambled Sobol sequence between the ends of each axis; values that are words alternate."""
+    """Return settings from a scrambled Sobol sequence between the ends of each axis."""
     from scipy.stats import qmc
 
     if samples < 2 or samples & (samples - 1):
@@ -178,5 +178,5 @@ def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
 
 
 def label(value: Any) -> str:
-    """Format a value for tables."""
+    """Format a value of a choice for tables and keys."""
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,7 +1,7 @@
-"""Execution of a sweep's tasks by any `concurrent.futures.Executor`; by default new processes on all cores.
+"""Execution of a sweep's tasks by any `concurrent.futures.Executor`; by default processes on all cores.
 
-An engine only starts processes. Its report on a task is not trusted: whether a point was computed is
-determined from the point's folder, so that a worker that dies loses only its own point.
+An engine (executor) only starts processes. Whether a point was computed is determined from the folder of the
+point, not from the engine. A worker process that dies therefore loses only its current point.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ _LOOK = 5.0
 def _pinned(width: int) -> None:
     """Restrict this process to reserved cores, because XLA uses all visible cores despite OMP_NUM_THREADS.
 
-    A core is reserved by a lock that is released when the process ends, so that all sweeps on a machine share
-    the cores; if no core is free, a core is used twice.
+    A core is reserved by a file lock, which is released when the process ends. Sweeps on the same machine
+    therefore use different cores. If no core is free, two processes use the same core.
     """
     with suppress(ImportError, AttributeError, OSError):
         import fcntl
@@ -71,7 +71,7 @@ def _pinned(width: int) -> None:
 def _answered(
     work: Callable[[Any], Any], task: Any, caller: tuple[str, int], width: int
 ) -> tuple[Any, Exception | None]:
-    """Return the result or exception of a task; an exception of its future then comes from the engine."""
+    """Return a task's result or its exception, so that only errors of the engine itself are raised."""
     if (socket.gethostname(), os.getpid()) != caller:
         _pinned(width)
     try:
@@ -84,7 +84,7 @@ def _answered(
 
 
 class _Engine:
-    """Executor of tasks, recreated after it has broken unless it belongs to the caller."""
+    """Executor of tasks, with functions to replace a broken executor and to close it."""
 
     def __init__(
         self, make: Callable[[], Executor], width: int, threads: int,
@@ -99,7 +99,7 @@ class _Engine:
         self.executor = make()
 
     def again(self) -> None:
-        """Make a new executor if possible; all tasks of the old one are then forgotten."""
+        """Replace the executor by a new executor if possible; tasks of the previous executor are lost."""
         self.close()
         with suppress(Exception):
             self.executor = self.make()
@@ -111,7 +111,7 @@ class _Engine:
 
 
 def _local(workers: int | None) -> _Engine:
-    """Start processes on this machine that do not import the main program, so that scripts need no guard."""
+    """Return an engine of local processes; they do not import the main script, which needs no guard."""
     from loky import get_reusable_executor  # noqa: F401 (its pool starts processes by fork and exec)
     from loky.backend.context import get_context
     from loky.process_executor import ProcessPoolExecutor
@@ -149,7 +149,7 @@ def _dask(address: str, workers: int | None) -> _Engine:
 
 
 def _executorlib(file: str, workers: int | None) -> _Engine:
-    """Return an executor of executorlib, with the class and keywords of a TOML file; default SLURM jobs."""
+    """Return an engine from executorlib, with the class (default SLURM jobs) and keywords in a TOML file."""
     try:
         import executorlib  # pyright: ignore[reportMissingImports]
         from executorlib.api import ExecutorlibSocketError  # pyright: ignore[reportMissingImports]
@@ -204,7 +204,7 @@ def _executorlib(file: str, workers: int | None) -> _Engine:
 
 
 def _ends_with(parent: int) -> dict[str, Any]:
-    """End this worker when the process that started it ends, if both are on the same machine."""
+    """Make this worker process end when its parent process ends, if both are on the same machine."""
     if os.getppid() == parent:
         guard(parent)
     return {}
@@ -212,10 +212,10 @@ def _ends_with(parent: int) -> dict[str, Any]:
 
 @contextmanager
 def opened(on: str | Executor | None, workers: int | None) -> Iterator[_Engine]:
-    """Context manager of an engine: None, tcp://host:port of dask, a TOML file, or the user's executor.
+    """Context manager: make an engine from None (local), a dask address, a TOML file or an executor.
 
     Raises:
-        InputError: no such engine, or its package is missing.
+        InputError: the engine is unknown, or its package is not installed.
     """
     if on is None:
         engine = _local(workers)
@@ -242,7 +242,7 @@ def computed(
     workers: int | None = None,
     lost: Callable[[Any, str], bool] = lambda task, why: True,
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield tasks with their results, as they finish.
+    """Run tasks in worker processes, and yield each task with its result when the task has finished.
 
     Args:
         work: function that processes a task, in another process.
@@ -313,7 +313,7 @@ def computed(
 
 
 def _error(future: Future[Any]) -> BaseException | None:
-    """Return the exception of a finished future, or None."""
+    """Return the exception of a finished future, or None if the future has a result."""
     try:
         return future.exception()
     except CancelledError as cancelled:

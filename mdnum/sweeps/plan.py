@@ -1,4 +1,4 @@
-"""Plan of a sweep: its settings, their points, and the address of each, before any run."""
+"""Plan of a sweep, made before any run: settings, points, and the address of each point on disk."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Setting = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Question:
-    """Arguments of a sweep, as for `mdnum.sweep`."""
+    """Arguments of a sweep, with the names and meanings of arguments of `mdnum.sweep`."""
 
     seeds: int | Sequence[int] = 4
     measure: Sequence[str] | str = USUAL["md"]
@@ -38,7 +38,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Planned:
-    """A point and its place on disk."""
+    """A point of a sweep, with the data that define it and its address on disk."""
 
     point: Point
     setting: Setting
@@ -50,7 +50,7 @@ class Planned:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that is determined before any run.
+    """Settings, points and measures of a sweep, determined before any run.
 
     Attributes:
         loaded: the system or simulation with its own values. system, overrides: the arguments from which it
@@ -75,31 +75,31 @@ class Plan:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the measures."""
+        """Names of the measures of this sweep."""
         return tuple(measure.name for measure in self.measures)
 
     @property
     def wanted(self) -> dict[str, str]:
-        """Digests of the source files of its measures by name, as stored with the points."""
+        """Digest of the source files of each measure, by name; digests are stored with the points."""
         return {measure.name: measure.digest for measure in self.measures}
 
     @property
     def origin(self) -> Setting:
-        """Setting with the system's own values."""
+        """The setting with the system's own value of each choice."""
         return self.setting(self.base)
 
     def setting(self, choices: Mapping[str, Any]) -> Setting:
-        """Return the labels of a value of each axis."""
+        """Return a setting as labels: the formatted value of each axis."""
         return tuple(label(choices[axis.key]) for axis in self.axes)
 
     def along(self, axis: Axis) -> Iterator[tuple[Any, Setting]]:
-        """Yield each value of an axis with its setting; all other choices have their base values."""
+        """Yield (value, setting) for each value of an axis; other choices keep their base values."""
         for value in axis.values:
             yield value, self.setting({**self.base, axis.key: value})
 
 
 def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, Any] | None) -> Plan:
-    """Return the plan of a sweep.
+    """Return the plan of a sweep from its arguments.
 
     Raises:
         InputError: a choice or a measure does not exist, or the system cannot be swept.
@@ -181,7 +181,7 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
 
 
 def _of_seed(one: Planned, point: Point, settings: Mapping[str, Any]) -> Planned:
-    """Return a point of a setting that was already resolved for another seed."""
+    """Derive a planned point from a point with the same setting and another seed."""
     system = one.state["system"]
     dynamics = {**system["dynamics"], "seed": settings["dynamics.seed"]}
     state = {**one.state, "system": {**system, "dynamics": dynamics}}
@@ -189,9 +189,9 @@ def _of_seed(one: Planned, point: Point, settings: Mapping[str, Any]) -> Planned
 
 
 def resolved(simulation: Any, settings: Mapping[str, Any]) -> Any:
-    """Return a simulation made from objects, or a loaded ball, with other values.
+    """Return a copy of a simulation or of a ball system with other values of the given keys.
 
-    Velocities of atoms are drawn with the seed, as for a system file.
+    Initial velocities of atoms are drawn with the seed, as for a system file.
     """
     from mdnum.systems import BallSystem
     from mdnum.systems.load import vary
@@ -220,7 +220,7 @@ def _axes(over: Any) -> list[Axis]:
 
 
 def _own_value(axis: Axis, own: Mapping[str, Any], loaded: Any, system: Any, overrides: Any) -> Any:
-    """Return the value that an axis has in the system file."""
+    """Return the value of an axis in the system file (for a default, the first value of the axis)."""
     from mdnum.systems import BallSystem, load
     from mdnum.systems.parameters import names, number, resolve
 

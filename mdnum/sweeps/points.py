@@ -1,4 +1,4 @@
-"""Storage of points, in one folder each, named by content, so that none is lost or computed twice.
+"""Storage of a sweep's points: one folder per point, named by a hash of the data that define the point.
 
     sweep/
       .signac/config                  a signac workspace
@@ -8,10 +8,10 @@
         series.parquet                values at each step
       claims/ADDRESS.N                the process that is computing it
 
-The address is that of signac: the MD5 of the state point as JSON. A point is computed in a separate folder,
-which one rename moves to its address; a process that is killed before leaves nothing there. A process claims
-a point by creating a claim file, which only one process can (O_EXCL); if this process ends, another creates a
-claim with the next number. This does not depend on how processes are started.
+The address of a point is defined as in signac: the MD5 hash of the state point as JSON. A point is computed
+in a temporary folder, and a single rename moves the folder to the address; a killed process therefore leaves
+no partial result there. To claim a point, a process creates a claim file, which only one process can do
+(O_EXCL). If this process ends without a result, another process creates a claim with the next number.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _ARITHMETIC = ("jax", "jaxlib", "numpy", "llvmlite")
 
 @cache
 def code() -> str:
-    """Return a digest of the source code that computes points, and of the versions of its packages."""
+    """Return a digest of the source code that computes points, and of the versions of numerical packages."""
     versions = package_versions()
     packages = json.dumps([versions.get(name) for name in _ARITHMETIC])
     return hashlib.sha256((digest(_COMPUTES) + packages).encode()).hexdigest()[:16]
@@ -76,7 +76,7 @@ def digest(places: Sequence[str]) -> str:
 def state_point(
     program: Mapping[str, Any], structure: str | None, asked: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the data that define a point: all parameters and choices of its system, and the request.
+    """Return the state point, the data that define a point: parameters of the system, structure, and run.
 
     Args:
         program: the program of a system (`System.program`); entries that are None are omitted. structure:
@@ -87,14 +87,14 @@ def state_point(
 
 
 def _given(tables: Any) -> Any:
-    """Remove entries that are None, and replace the dots in keys, which signac does not allow."""
+    """Remove entries that are None, and replace dots in keys by "-", since signac does not allow dots."""
     if not isinstance(tables, dict):
         return tables
     return {key.replace(".", "-"): _given(one) for key, one in tables.items() if one is not None}
 
 
 def address_of(point: Mapping[str, Any]) -> str:
-    """Return the name of a state point in signac."""
+    """Return the address of a state point, which is its identifier in signac."""
     return hashlib.md5(json.dumps(point, sort_keys=True).encode(), usedforsecurity=False).hexdigest()
 
 
@@ -105,7 +105,7 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
 
 
 class Workspace:
-    """Storage of the points of a sweep on disk.
+    """Folder with the results of the points of one or several sweeps.
 
     Raises:
         FolderError: the folder cannot be created or read.
@@ -123,14 +123,14 @@ class Workspace:
                 write_text(config, 'schema_version = "2"\n')
 
     def folder(self, address: str) -> Path:
-        """Return the folder of the results of a point."""
+        """Return the path of the folder with the results of a point."""
         return self.place / address
 
     def result(self, address: str) -> dict[str, Any] | None:
-        """Return the result of a point; None if the point was not computed.
+        """Return the stored result of a point; None if the point was not yet computed.
 
         Raises:
-            FolderError: the file of the result is damaged.
+            FolderError: the file with the result is damaged.
         """
         file = self.folder(address) / RESULT
         try:
@@ -144,7 +144,7 @@ class Workspace:
             ) from None
 
     def nearest(self, point: Mapping[str, Any]) -> list[str] | None:
-        """Return the fields in which a point differs from the most similar stored point; None without any."""
+        """Return the fields in which a point differs from the most similar stored point, or None."""
         best: list[str] | None = None
         for file in self.place.glob(f"*/{STATE_POINT}"):
             with suppress(OSError, ValueError):
@@ -162,9 +162,9 @@ class Workspace:
 
     @contextmanager
     def claimed(self, address: str) -> Iterator[bool]:
-        """Claim a point for this process until the end of the block; yield whether the claim succeeded.
+        """Context manager: claim a point for this process, and yield whether the claim succeeded.
 
-        Another process may have finished the point shortly before the claim: check for its result again.
+        After a claim, check again for a result: another process may have finished the point just before.
         """
         claim = self._claim(address)
         if claim is None:
@@ -215,7 +215,7 @@ class Workspace:
 
     @contextmanager
     def filling(self, address: str, point: Mapping[str, Any]) -> Iterator[Path]:
-        """Yield an empty folder, which becomes the folder of the point if the block ends without an error."""
+        """Yield an empty folder, which becomes the folder of the point if the block raises no error."""
         here = self.place / f".{address}.{socket.gethostname()}.{os.getpid()}"
         shutil.rmtree(here, ignore_errors=True)
         with disk_errors(here):
@@ -240,7 +240,7 @@ class Workspace:
                 os.replace(file, target / file.name)
 
     def swept(self) -> int:
-        """Remove unfinished folders of processes that no longer exist, and return their number."""
+        """Remove unfinished folders of processes that no longer exist; return the number of folders."""
         count = 0
         # folders before claims: whoever makes a folder has claimed its point before
         for folder in [one for one in self.place.glob(".*.*.*") if one.is_dir()]:
@@ -251,7 +251,7 @@ class Workspace:
 
 
 def write_result(folder: Path, found: Mapping[str, Any]) -> None:
-    """Write the results of a point to its folder."""
+    """Write the results of a point to the file point.json in its folder."""
     write_text(folder / RESULT, json.dumps(plain(dict(found)), indent=1))
 
 
@@ -266,14 +266,14 @@ def me() -> dict[str, Any]:
 
 @cache
 def boot() -> str:
-    """Return an identifier of the current boot of this machine; empty if it is not available."""
+    """Return the identifier of this machine's current boot; empty if the identifier is not available."""
     with suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return ""
 
 
 def born(pid: int) -> str | None:
-    """Return the start time of a local process, in ticks; None if it does not exist, "" if unknown."""
+    """Return the start time of a local process, in ticks; None if no such process exists, "" if unknown."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -289,9 +289,9 @@ def born(pid: int) -> str | None:
 
 
 def gone(claim: Path) -> bool:
-    """True if the process that made a claim has ended, or its machine was restarted.
+    """True if the process that made a claim has ended, or if its machine was restarted.
 
-    For a process on another machine: true if the claim file was last updated more than three minutes ago.
+    A process on another machine counts as ended if its claim file is older than three minutes.
     """
     try:
         silent = time.time() - claim.stat().st_mtime

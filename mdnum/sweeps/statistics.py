@@ -1,9 +1,9 @@
-"""Means over seeds and differences between choices, each with its error.
+"""Means over random seeds, and differences between settings, each with its statistical error.
 
-Each run gives a mean and, from its autocorrelation, the error of this mean; the means of several seeds
-scatter. Errors and scatter estimate the same variance. The errors have many degrees of freedom, but are too
-small if the relaxation of a mode takes longer than a run. They are therefore multiplied by one factor, which
-is determined from all seeds of all settings.
+Each run gives a mean and, from its autocorrelation, an error of this mean. The scatter of the means of
+several seeds estimates the same variance. The errors from autocorrelation have many degrees of freedom, but
+are too small if a mode relaxes more slowly than the length of a run. These errors are therefore multiplied by
+one factor, which is determined from the scatter of all seeds of all settings.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Name = tuple[str, ...]
 
 @dataclass(frozen=True)
 class SeedMean:
-    """A mean over seeds."""
+    """Mean of a measure over runs with different random seeds, with its standard error."""
 
     value: float
     error: float  # standard error; nan from a single run without one of its own, 0 of what does not vary
@@ -39,17 +39,17 @@ class SeedMean:
 
     @property
     def known(self) -> bool:
-        """True if the mean has a value and an error."""
+        """True if the mean and its error are known (finite)."""
         return bool(np.isfinite(self.value) and np.isfinite(self.error))
 
 
 def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K, SeedMean]:
-    """Return means of one measure at each setting, over runs that differ only in their seed.
+    """Return the mean of one measure at each setting, over runs that differ only in their random seed.
 
-    The error of a mean is that of its runs, multiplied by the ratio of the scatter between seeds to the runs'
-    own errors. This ratio is one number for all settings of a measure, and is more precise the more settings
-    there are. If the runs' own errors have less weight than the scatter of the seeds of one setting, only
-    that scatter is used.
+    The error of a mean follows from the errors of its runs, multiplied by the ratio of the scatter between
+    seeds to these errors. The ratio is one number for all settings of a measure; more settings make it more
+    precise. If the resulting error has fewer degrees of freedom than the scatter between the seeds of the
+    setting, the scatter is used instead.
 
     Args:
         found: (value, standard error, independent samples) of each run; nan if unknown.
@@ -76,7 +76,7 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
 
 
 class _Runs(NamedTuple):
-    """Variance of a mean over runs, from the runs' own errors and from their scatter; nan if unknown."""
+    """Variance of a mean over runs, from the errors of the runs and from their scatter; nan if unknown."""
 
     runs: int
     within: float
@@ -103,7 +103,7 @@ class _Runs(NamedTuple):
 
 @dataclass(frozen=True)
 class Difference:
-    """Change of a measure due to a choice, relative to the base."""
+    """Change of a measure due to another value of a choice, relative to the base value."""
 
     value: float
     error: float  # of the difference
@@ -124,7 +124,7 @@ class Difference:
 
 
 def difference(one: SeedMean, base: SeedMean) -> tuple[float, float, float]:
-    """Return value, error and Welch's degrees of freedom; the last is nan if an error is unknown."""
+    """Return the difference of two means, its error, and Welch's degrees of freedom (nan if unknown)."""
     variances = np.array([one.error**2, base.error**2])
     value, error = one.value - base.value, float(np.sqrt(variances.sum()))
     if not (one.known and base.known):
@@ -136,12 +136,12 @@ def difference(one: SeedMean, base: SeedMean) -> tuple[float, float, float]:
 def paired(
     raw: Mapping[K, tuple[float, float, float]], by_seed: Mapping[K, Float[np.ndarray, "seeds"]]
 ) -> dict[K, tuple[float, float, float]]:
-    """Return differences from a setting, computed seed by seed if the runs with the same seed are correlated.
+    """Return differences from a reference setting, seed by seed if runs with the same seed are correlated.
 
-    Runs at constant energy with the same initial velocities may stay correlated. For uncorrelated runs, the
-    scatter of a few differences would be a poor estimate of the error. The comparison is therefore made seed
-    by seed only if the differences of the seeds, over all comparisons together, scatter significantly less
-    than those of independent runs.
+    Runs at constant energy with the same initial velocities may remain correlated. For uncorrelated runs, the
+    scatter of a few differences would be a poor estimate of the error. Runs are therefore compared seed by
+    seed only if the differences between runs with the same seed scatter significantly less, over all
+    comparisons, than differences between independent runs.
 
     Args:
         raw: results of `difference` for each comparison of one measure. by_seed: the differences of each
@@ -166,7 +166,7 @@ def paired(
 
 
 def _quantile(chance: float, freedom: float) -> float:
-    """Value that Student's t exceeds with this probability."""
+    """Return the value that Student's t exceeds with probability `chance`."""
     from scipy.special import stdtrit
 
     # scipy.stats has the same, and takes a hundred times as long
@@ -174,9 +174,9 @@ def _quantile(chance: float, freedom: float) -> float:
 
 
 def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Difference]:
-    """Add p-values, corrected for all comparisons together (Holm 1979), to values with known errors.
+    """Add p-values, corrected for multiple comparisons (Holm 1979), to differences with known errors.
 
-    An entry without degrees of freedom (nan) gets no p-value, and does not count as a comparison.
+    A difference with unknown degrees of freedom (nan) gets no p-value, and does not count as a comparison.
     """
     from scipy.special import stdtr
 
@@ -200,7 +200,7 @@ def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Diff
 
 
 def effects(places: Float[np.ndarray, "points axes"], values: Float[np.ndarray, "points"]) -> list[Any]:
-    """Return the change of a measure between the ends of each axis, from a plane fitted to all points.
+    """Return the change of a measure from end to end of each axis, by a linear fit to all points.
 
     Args:
         places: position of each point along each axis, from 0 to 1.
@@ -224,7 +224,7 @@ def effects(places: Float[np.ndarray, "points axes"], values: Float[np.ndarray, 
 
 @dataclass(frozen=True)
 class Within:
-    """Result of a comparison of a difference with a tolerance."""
+    """Result of the comparison of a difference with a tolerance."""
 
     inside: bool | None  # None: not decided
     # times as many seeds that would decide it, if the difference stays what it is; 1 where it is decided
@@ -232,7 +232,7 @@ class Within:
 
 
 def within(value: float, error: float, freedom: float, tolerance: float, comparisons: int = 1) -> Within:
-    """Test whether |difference| ≤ tolerance, by comparing its confidence interval with it (Schuirmann 1987).
+    """Test whether |difference| ≤ tolerance with the difference's confidence interval (Schuirmann 1987).
 
     Args:
         comparisons: number of comparisons among which the error probability, ALPHA, is divided.

@@ -94,7 +94,7 @@ class View:
         return self._tables[name]
 
     def kept(self, codes: Mapping[str, Any]) -> list[Finding]:
-        """Return findings in summary.json that the verb cannot derive again because it lacks these codes."""
+        """Return the findings in summary.json whose codes are not in `codes`; the verb cannot derive them."""
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
 
