@@ -285,16 +285,22 @@ def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]
         if row[WORDS.index("undecided")]
     )
     target = f"{100 * TARGET:.0f} %"
+    met = f"With 95 % confidence, the target is met for {'' if short else 'all rows: '}{named(shown, False)}."
     sentences = (
-        f"The target is that each kind of false verdict is the word of fewer than {target} of all starts.",
+        f"The target is that each kind of false verdict occurs for fewer than {target} of the starting "
+        "states.",
+        *([met] if shown else []),
         *(
-            [f"It is shown, with 95 % confidence, for {'' if short else 'every row: '}{named(shown, False)}."]
-            if shown
+            [
+                "The results do not yet show with 95 % confidence that the target is met for the following "
+                f"rows and verdicts (number of false verdicts, upper bound): {named(short, True)}."
+            ]
+            if short
             else []
         ),
-        *([f"It is not shown for {named(short, True)}."] if short else []),
-        f"There are {fewer} to {most} starts of a row (the tables say how many); the fewer, the wider the "
-        f"bound. How often the word is undecided: {open_ or 'never'}; of the others, never.",
+        f"Each row has {fewer} to {most} starting states (see the tables); with fewer starting states, the "
+        f"upper bound is larger. The verdict was undecided for these starting states: {open_ or 'none'}; in "
+        "the other rows it was never undecided.",
     )
     return "\n\n".join(fill_text(one, 118, break_on_hyphens=False) for one in sentences)
 
