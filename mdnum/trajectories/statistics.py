@@ -1,16 +1,16 @@
-"""Statistics of contact durations, whose beginning or end may not have been observed, and of pairs that flip.
+"""Statistics of contact durations, including partly observed contacts, and of the pairs that flip.
 
-Three quantities describe how long contacts last:
+Three quantities describe the durations of contacts:
 
-- the **lifetime** of a contact whose beginning was observed: the product-limit estimate (Kaplan and Meier, J.
-  Am. Stat. Assoc. 53, 457, 1958), in which contacts that outlast the last frame count for the time observed;
-- the **mean by rate**: time inside divided by the number of departures, which uses every frame of every
-  contact, even if its ends were not observed. It is the mean lifetime if pairs leave at a constant rate;
-- the **residence**: of the pairs inside at some frame, the share still inside, without a break, after a given
-  lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more often, so
-  residence differs from lifetime.
+- The **lifetime** is the product-limit estimate (Kaplan and Meier, J. Am. Stat. Assoc. 53, 457, 1958) for
+  contacts whose beginning was observed. Contacts that continue after the last frame are right-censored.
+- The **mean by rate** is the total contact time divided by the number of departures. It includes contacts
+  whose beginning or end was not observed, and equals the mean lifetime if pairs leave at a constant rate.
+- The **residence** is the fraction of the pairs in contact at a frame that stay in contact, without a break,
+  for a given lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more
+  often, so the residence differs from the lifetime.
 
-Durations are in frames; times are those of the frames. Counts for subsets of the pairs are additive.
+Durations are numbers of frames. Counts for disjoint subsets of the pairs can be added.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _CLASSES = 60
 
 @dataclass(frozen=True)
 class Durations(Sums):
-    """Contacts counted by duration: entry n is the number of contacts that lasted n frames."""
+    """Histograms of contact durations: entry n is the number of contacts that lasted n frames."""
 
     seen: Int[np.ndarray, "lengths"]  # seen to begin and to end
     goes_on: Int[np.ndarray, "lengths"]  # seen to begin, but not to end (censored on the right)
@@ -45,24 +45,24 @@ class Durations(Sums):
 
     @classmethod
     def of(cls, stays: Contacts, frames: int) -> Durations:
-        """Count contacts by duration, in the given number of frames."""
+        """Count contacts by duration, for a trajectory with the given number of frames."""
         kinds = [(b, e) for b in (stays.began, ~stays.began) for e in (stays.ended, ~stays.ended)]
         return cls(*(np.bincount(stays.length[b & e], minlength=frames + 1) for b, e in kinds))
 
     @property
     def all(self) -> Int[np.ndarray, "lengths"]:
-        """Number of contacts of any kind, by duration."""
+        """Histogram of the durations of all contacts, completely observed or not."""
         return self.seen + self.goes_on + self.older + self.throughout
 
     @property
     def followed(self) -> Int[np.ndarray, "lengths"]:
-        """Contacts whose beginning was observed, by the frames until their end or until last observed."""
+        """Contacts whose beginning was observed, by the number of frames during which they were observed."""
         # one that goes on after n frames was seen to survive n - 1 times
         return self.seen + np.append(self.goes_on[1:], 0)
 
     @property
     def exposure(self) -> int:
-        """Number of times that a pair inside at one frame was examined again at the next frame."""
+        """Number of times that a pair in contact at one frame was also observed at the next frame."""
         length = np.arange(len(self.seen))
         # a stay of n frames that goes on after the last one has been examined again n - 1 times
         whole, cut = self.seen + self.older, self.goes_on + self.throughout
@@ -76,7 +76,7 @@ class Durations(Sums):
 
 @dataclass(frozen=True)
 class Survival:
-    """Share of contacts that last longer than n frames, from contacts whose beginning was observed."""
+    """Fraction of contacts that last longer than n frames, from contacts whose beginning was observed."""
 
     frames: Int[np.ndarray, "points"]  # lengths at which some ended, from 1, rising
     share: Float[np.ndarray, "points"]  # still inside after that many frames
@@ -85,22 +85,22 @@ class Survival:
     longest: int  # frames for which any was followed: nothing is known beyond
 
     def at(self, share: float) -> int | None:
-        """Return the frames after which at most this share is left (0.5: the median), or None if never."""
+        """Return the number of frames after which at most this fraction survives (0.5: median), or None."""
         below = np.flatnonzero(self.share <= share)
         return int(self.frames[below[0]]) if len(below) else None
 
     @property
     def mean(self) -> float:
-        """Area below the curve up to `longest`: the mean in frames, or less if some contacts last longer."""
+        """Area below the survival curve up to `longest`: a lower bound of the mean duration, in frames."""
         edges = np.concatenate([[0], self.frames, [self.longest]])
         return float(np.sum(np.diff(edges) * np.concatenate([[1.0], self.share])))
 
 
 def survival(found: Durations) -> Survival:
-    """Compute the product-limit estimate from the contacts whose beginning was observed.
+    """Compute the product-limit estimate from contacts whose beginning was observed.
 
-    Contacts present at the first frame are left out: their age is unknown, and long ones are sampled more
-    often.
+    Contacts present at the first frame are excluded: their age is unknown, and long contacts are
+    overrepresented.
     """
     followed, points = found.followed, np.flatnonzero(found.seen)
     at_risk = np.cumsum(followed[::-1])[::-1][points]
@@ -114,9 +114,9 @@ def survival(found: Durations) -> Survival:
 
 
 def mean_by_rate(found: Durations) -> tuple[float, float]:
-    """Return (frames inside per departure, standard error) over all contacts; inf without departures.
+    """Return (contact frames per departure, standard error) over all contacts; inf without departures.
 
-    The error assumes independent departures (Poisson); chatter makes the true error larger.
+    The error assumes independent departures (Poisson); repeated crossings make the true error larger.
     """
     if not found.leaves:
         return float("inf"), float("nan")
@@ -125,10 +125,10 @@ def mean_by_rate(found: Durations) -> tuple[float, float]:
 
 
 def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
-    """Return the share of pairs inside at a frame that stay inside without a break, for each lag.
+    """Return the fraction of pairs in contact at a frame that stay in contact, without a break, by lag.
 
-    Lags begin at 0; shares are averaged over all frames that leave room for the lag, and nan if no pair was
-    inside. `pairs` are the numbers of pairs inside at each frame.
+    Lags begin at 0. A fraction is averaged over all frames with a later frame at this lag, and is nan if no
+    pair was inside. `pairs` is the number of pairs inside at each frame.
     """
     count, lags = found.all, np.arange(len(pairs))
     stays = np.cumsum(count[::-1])[::-1]
@@ -140,13 +140,13 @@ def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.nd
 
 
 def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Count pairs that are inside both at a frame and after a lag, whatever happened in between.
+    """Count pairs inside both at a frame and at a later frame, whether or not they left in between.
 
-    The ratio of the two results is the intermittent counterpart of `residence` (counts for subsets of the
-    pairs are additive). Each lag is from 0 to frames - 1.
+    The ratio of the two results is the intermittent counterpart of `residence`. Counts for disjoint subsets
+    of the pairs can be added. Lags are between 0 and frames - 1.
 
     Returns:
-        for each lag, the number of times that a pair was inside at both frames, and at the first frame.
+        for each lag, the number of pairs, summed over frames, inside at both frames and at the earlier frame.
     """
     both, once = np.zeros(len(lags), np.int64), np.zeros(len(lags), np.int64)
     pairs = np.append(np.flatnonzero(_new_pairs(stays)), len(stays))
@@ -173,7 +173,7 @@ def _again(pairs, begin, end, lags, frames, both, once):
 
 
 def _new_pairs(stays: Contacts) -> np.ndarray:
-    """Return True for each contact that is the first of its pair."""
+    """Return True for each contact that is the first contact of its pair."""
     changed = [np.diff(column) != 0 for column in (stays.i, stays.j, stays.rank)]
     return np.concatenate([[True], np.any(changed, axis=0)])[: len(stays)]
 
@@ -183,21 +183,21 @@ def _new_pairs(stays: Contacts) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Classes:
-    """Classification of atoms: a class index for each atom, and the names of the classes."""
+    """Classes of atoms: a class index for each atom, and the names of the classes."""
 
     of: Int[np.ndarray, "atoms"]
     names: Sequence[str]
 
     @classmethod
     def by(cls, words: np.ndarray) -> Classes:
-        """Put atoms with the same word into one class."""
+        """Classify atoms by label: atoms with equal labels are in the same class."""
         names, index = np.unique(words.astype(str), return_inverse=True)
         return cls(index.reshape(-1), [str(one) for one in names])
 
 
 @dataclass(frozen=True)
 class Labels:
-    """Classes of atoms by species, by residue name and by residue; None without residues in the file."""
+    """Classes of atoms by species, residue name and residue; None for the latter two without residues."""
 
     species: Classes
     residue_names: Classes | None
@@ -205,7 +205,7 @@ class Labels:
 
     @classmethod
     def of(cls, table: AtomTable) -> Labels:
-        """Build the classes of atoms from a topology."""
+        """Build the classes of atoms from a table of atoms."""
         if not any(table.residue_names):
             return cls(Classes.by(table.species), None, None)
         first = np.unique(table.residues, return_index=True)[1]
@@ -216,7 +216,7 @@ class Labels:
 
 @dataclass(frozen=True)
 class ClassTally(Sums):
-    """Numbers of flips and frames inside by pair of classes."""
+    """Numbers of flips and of frames in contact for each pair of atom classes."""
 
     _common = ("names",)
 
@@ -228,10 +228,9 @@ class ClassTally(Sums):
 
     @classmethod
     def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> ClassTally:
-        """Count flips and frames inside by the classes of the two atoms, over the given number of frames.
+        """Count flips and frames in contact by the classes of both atoms, over the given number of frames.
 
-        If directed, i -> j and j -> i count separately; otherwise they count as one, under the lower class
-        first.
+        For a directed rule, i -> j and j -> i are counted separately; otherwise the lower class comes first.
         """
         first, second = classes.of[stays.i], classes.of[stays.j]
         if not directed:
@@ -248,12 +247,12 @@ class ClassTally(Sums):
 
     @property
     def mean_stay(self) -> Float[np.ndarray, "classes classes"]:
-        """Mean number of frames inside for each departure of a pair; nan if no pair left."""
+        """Mean number of frames in contact per departure, by pair of classes; nan if no pair left."""
         none = np.full(self.left.shape, np.nan)
         return np.divide(self.exposure, self.left, out=none, where=self.left > 0)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return table rows for pairs of classes that were ever inside, those with most flips first."""
+        """Return table rows for pairs of classes with any contacts, sorted by descending number of flips."""
         stay = self.mean_stay
         rows = [
             {
@@ -267,7 +266,7 @@ class ClassTally(Sums):
 
 @dataclass(frozen=True)
 class Chatter(Sums):
-    """Flips counted by the time until the same pair flips back."""
+    """Histograms of the time between a flip and the reverse flip of the same pair."""
 
     inside: Int[np.ndarray, "lengths"]  # visits inside by their length in frames, 0 to the window
     outside: Int[np.ndarray, "lengths"]  # excursions outside by their length
@@ -275,7 +274,7 @@ class Chatter(Sums):
 
     @classmethod
     def of(cls, history: History, window: int) -> Chatter:
-        """Count the flips that are reversed within a window of frames."""
+        """Count the flips that the same pair reverses within a window of frames."""
         pair = history.pair
         same = pair[1:] == pair[:-1]
         apart, from_inside = np.diff(history.frame)[same], history.entered[:-1][same]
@@ -287,18 +286,18 @@ class Chatter(Sums):
 
     @property
     def window(self) -> int:
-        """Number of frames within which the reversal of a flip was searched for."""
+        """Length of the time window, in frames, in which reversed flips are counted."""
         return len(self.inside) - 1
 
     @property
     def undone(self) -> int:
-        """Number of flips that the same pair reverses within the window."""
+        """Number of flips that the same pair reversed within the time window."""
         return int(self.inside.sum() + self.outside.sum())
 
 
 @dataclass(frozen=True)
 class Busiest(Columns):
-    """Pairs sorted by the number of their flips, in descending order."""
+    """Pairs with the largest numbers of flips, in descending order."""
 
     i: Int[np.ndarray, "pairs"]  # the pairs
     j: Int[np.ndarray, "pairs"]
@@ -308,7 +307,7 @@ class Busiest(Columns):
 
     @classmethod
     def of(cls, history: History, stays: Contacts, most: int = _BUSIEST) -> Busiest:
-        """Return the pairs of a history that flipped most often."""
+        """Return the pairs of a history with the largest numbers of flips."""
         # stays are in the order of the history's pairs, of which some were never inside
         inside = np.zeros(len(history), np.int64)
         ever = history.inside | (history.flips > 0)
@@ -316,26 +315,26 @@ class Busiest(Columns):
         return cls(history.i, history.j, history.rank, history.flips, inside).first(most)
 
     def first(self, most: int = _BUSIEST) -> Busiest:
-        """Return the first `most` pairs, without pairs that never flipped."""
+        """Return the first `most` pairs, excluding pairs without flips."""
         order = np.lexsort((self.rank, self.j, self.i, -self.flips))[:most]
         order = order[self.flips[order] > 0]
         return self[order]
 
     def __add__(self, other: Busiest) -> Busiest:
-        """Return the busiest pairs of two parts that have no pair in common."""
+        """Return the pairs with the most flips from two tables that have no pair in common."""
         return Busiest.concatenate([self, other]).first()
 
 
 @dataclass(frozen=True)
 class Residues(Sums):
-    """Flips of each group of atoms (for example a residue), with other groups and within itself."""
+    """Flips of each group of atoms (such as a residue), with other groups and within the group."""
 
     between: Int[np.ndarray, "groups"]
     within: Int[np.ndarray, "groups"]
 
     @classmethod
     def of(cls, history: History, classes: Classes) -> Residues:
-        """Count flips by the groups of the two atoms."""
+        """Count flips by the groups of both atoms."""
         first, second, flips = classes.of[history.i], classes.of[history.j], history.flips
         own, count = first == second, len(classes.names)
         between = (np.bincount(one[~own], flips[~own], count) for one in (first, second))
@@ -348,7 +347,7 @@ class Residues(Sums):
 
 @dataclass(frozen=True)
 class AgainSums(Sums):
-    """Sums of the counts that `again` returns, over some of the contacts."""
+    """Sums of the counts returned by `again`, over a sample of the contacts."""
 
     both: Int[np.ndarray, "lags"]
     once: Int[np.ndarray, "lags"]
@@ -357,7 +356,7 @@ class AgainSums(Sums):
 
 @dataclass(frozen=True)
 class Statistics(Sums):
-    """All statistics of the pairs of a rule."""
+    """All statistics of the pairs that one membership rule defines."""
 
     durations: Durations  # of contacts, and of contacts whose short gaps are overlooked
     intermittent: Durations
@@ -375,10 +374,10 @@ class Statistics(Sums):
     def of(
         cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
     ) -> tuple[Statistics, Contacts]:
-        """Return statistics of some pairs, added to earlier statistics, and the contacts of these pairs.
+        """Return statistics of a subset of the pairs, added to `before`, and the contacts of these pairs.
 
-        Within a window of frames, a flip that is reversed is chatter, and an absence is ignored in an
-        intermittent contact.
+        A flip reversed within `window` frames is counted as chatter. Intermittent contacts include absences
+        of up to `window` frames.
         """
         frames, stays = history.frames, contacts(history)
         named, residues = labels.residue_names, labels.residues
@@ -406,9 +405,9 @@ class Statistics(Sums):
         return counted if before is None else before + counted, stays
 
     def curves(self, pairs: Int[np.ndarray, "frames"], interval: float) -> dict[str, np.ndarray]:
-        """Return table columns of lifetimes by lag, from the numbers of pairs inside at each frame.
+        """Return table columns of survival and residence by lag; `pairs` is the number of pairs per frame.
 
-        The time between frames, `interval`, is nan if unknown.
+        `interval` is the time between frames, nan if unknown.
         """
         lags = lags_of(len(pairs))
         left, loose = survival(self.durations), survival(self.intermittent)
@@ -429,7 +428,7 @@ class Statistics(Sums):
 
 @dataclass(frozen=True)
 class Lifetime:
-    """Contact lifetimes as numbers, in frames; None if the file does not determine a value."""
+    """Median, mean and other measures of contact lifetimes, in frames; None for undetermined values."""
 
     followed: int  # contacts seen to begin
     median: int | None  # frames after which so many are over
@@ -444,7 +443,7 @@ class Lifetime:
 
     @classmethod
     def of(cls, durations: Durations) -> Lifetime:
-        """Compute lifetimes from contacts counted by duration."""
+        """Compute lifetimes from the histograms of contact durations."""
         left, any_left = survival(durations), bool(durations.seen.any())
         return cls(
             int(durations.seen.sum() + durations.goes_on.sum()), left.at(0.5), left.at(0.75), left.at(0.25),
@@ -454,7 +453,7 @@ class Lifetime:
 
 
 def lags_of(frames: int) -> Int[np.ndarray, "lags"]:
-    """Return the lags of curves, in frames: all small lags, then lags with growing spacing."""
+    """Return the lags of correlation functions, in frames: all small lags, then increasing spacing."""
     if frames < 2:
         return np.zeros(1, np.int64)
     return np.unique(np.concatenate([[0], np.round(np.geomspace(1, frames - 1, _POINTS))]).astype(np.int64))

@@ -1,13 +1,13 @@
-"""Trajectories that ASE reads, and text files that are read frame by frame, with every digit kept.
+"""Trajectories read through ASE, and readers of text formats that preserve all digits.
 
-Text formats read by this module, and what other libraries lose when they read these formats (as
-tests/trajectories/test_source.py confirms):
+This module reads three text formats itself, because other libraries lose information (confirmed by
+tests/trajectories/test_source.py):
 
 - LAMMPS's `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org/dump.html,
-  Howto_triclinic): MDAnalysis reduces them to float32 and reads a tilted box without its tilt;
-- GROMACS's gro files with any number of frames, in columns as wide as the distance of two decimal points
-  (manual.gromacs.org, reference manual, file formats): MDAnalysis and ASE read the first frame alone;
-- extended XYZ, each block through ASE, which would otherwise scan the whole file before the first frame.
+  Howto_triclinic): MDAnalysis reduces coordinates to float32 and ignores the tilt of a box.
+- GROMACS's gro files with any number of frames, whose column width is the distance of two decimal points
+  (manual.gromacs.org, reference manual, file formats): MDAnalysis and ASE read only the first frame.
+- Extended XYZ, with ASE called for each frame: otherwise, ASE scans the whole file before the first frame.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _NUMBER = re.compile(r"[-+]?(\d*)(?:\.(\d*))?(?:[eEdD]([-+]?\d*))?")
 
 
 class AseFrames(Trajectory):
-    """Base class of readers that read each frame as an ASE Atoms object."""
+    """Base class of readers that obtain each frame as an ASE Atoms object."""
 
     reader = "ASE"
     _timed, _per_time = False, 1.0
@@ -54,7 +54,7 @@ class AseFrames(Trajectory):
         return raw
 
     def _of_atoms(self, first: Any) -> AtomTable:
-        """Return the table of atoms of the first frame; set the units, those of ASE or of a run of mdnum."""
+        """Return the atom table of the first frame, and set the units to those of ASE or of an mdnum run."""
         self._timed = "time" in first.info
         units = METAL
         if self.path.name == "trajectory.traj":
@@ -84,13 +84,13 @@ class AseFrames(Trajectory):
 
 
 def _ids(atoms: Any) -> np.ndarray | None:
-    """Return the ids of the atoms; None if they are missing or not unique."""
+    """Return the ids of the atoms; None if ids are missing or not unique."""
     ids = atoms.arrays.get("id")
     return ids if ids is not None and ids.ndim == 1 and len(np.unique(ids)) == len(ids) else None
 
 
 class AseTrajectory(AseFrames):
-    """Trajectory that `ase.io` reads, frame by frame if its format allows it."""
+    """Trajectory read frame by frame with `ase.io`, or all at once if the format requires this."""
 
     def __init__(self, path: Path, topology: Topology | None, frames: slice, format: str):
         super().__init__(path, topology, frames)
@@ -119,7 +119,7 @@ class AseTrajectory(AseFrames):
 
 
 def format_of(path: Path) -> str:
-    """Return ASE's name for the format of a file.
+    """Return ASE's name for the format of a trajectory file.
 
     Raises:
         InputError: ASE does not know the format, or the file cannot be read.
@@ -137,17 +137,17 @@ def format_of(path: Path) -> str:
 
 
 def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
-    """Reject a last line that was cut within its last number, since the remaining digits form another number.
+    """Reject a last line that was truncated within its last number, which would be read as another number.
 
-    A missing newline proves nothing by itself, since some programs omit it. The number was cut if it has
-    fewer digits than the numbers at the same place in the lines before.
+    A missing newline is not sufficient evidence, since some programs omit the last newline. The number counts
+    as truncated if it has fewer digits than the numbers in the same column of earlier lines.
 
     Args:
-        lines: lines of a frame, all with a number in the last place.
-        like: numbers to compare with instead of those in the lines.
+        lines: lines of a frame, each of which ends with a number.
+        like: numbers to compare with, instead of the last numbers of the lines.
 
     Raises:
-        ValueError: the last number was cut.
+        ValueError: the last number was truncated.
     """
     if not lines or lines[-1].endswith(("\n", "\r")):
         return
@@ -185,7 +185,7 @@ def _is_cut(word: str, others: Sequence[str]) -> bool:
 
 
 def _digits(word: str) -> tuple[int, int, int] | None:
-    """Return (decimals, significant digits, digits of the exponent or -1); None for text without a number."""
+    """Return (decimals, significant digits, digits of the exponent or -1) of a number; None for a word."""
     match = _NUMBER.fullmatch(word)
     if match is None:
         return None
@@ -195,7 +195,7 @@ def _digits(word: str) -> tuple[int, int, int] | None:
 
 
 class TextTrajectory(Trajectory):
-    """A text file of frames. A subclass for a format defines where a block ends and how it is decoded."""
+    """Base class of text readers; a subclass defines the end of a frame and its decoding."""
 
     def __init__(self, path: Path, topology: Topology | None, frames: slice):
         super().__init__(path, topology, frames)
@@ -206,7 +206,7 @@ class TextTrajectory(Trajectory):
 
     @abstractmethod
     def _block(self, lines: Any) -> list[str] | None:
-        """Return the lines of the next frame; None at the end of the file.
+        """Read the lines of the next frame; return None at the end of the file.
 
         Raises:
             ValueError: the lines do not form a frame.
@@ -214,7 +214,7 @@ class TextTrajectory(Trajectory):
 
     @abstractmethod
     def _described(self, block: list[str]) -> AtomTable:
-        """Return the table of atoms that the first frame defines."""
+        """Return the table of atoms, derived from the lines of the first frame."""
 
     @contextmanager
     def raw_frames(self) -> Iterator[Callable[[int], Any]]:
@@ -232,7 +232,7 @@ def _whole_number(line: str, what: str) -> int:
 
 
 def _rows(lines: Any, head: int, atoms: int, cut: bool = True) -> list[str]:
-    """Read `head` lines and, after them, one line for each atom."""
+    """Read `head` lines, followed by one line for each atom."""
     if atoms < 0:
         raise ValueError(f"expected the number of atoms; found {atoms}")
     rows = list(islice(lines, head + atoms))
@@ -266,7 +266,7 @@ class ExtxyzTrajectory(AseFrames, TextTrajectory):
 
 
 class XdatcarTrajectory(ExtxyzTrajectory):
-    """VASP's XDATCAR; the header is repeated if the cell changes. ASE's reader returns all frames or none."""
+    """Trajectory in VASP's XDATCAR format, where the header is repeated if the cell changes."""
 
     format = "vasp-xdatcar"
     # lines with the cell and the atoms, and how many atoms there are
@@ -300,7 +300,7 @@ _ROUNDED = 1e-4
 
 
 class LammpsDump(TextTrajectory):
-    """Text dump of LAMMPS; atoms are in the order of their ids."""
+    """Trajectory in a LAMMPS text dump, with atoms sorted by id."""
 
     format = "lammpstrj"
 
@@ -341,7 +341,7 @@ class LammpsDump(TextTrajectory):
         return Frame(number, time, positions, box, velocities, labels, identified=True)
 
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
-        """Return the order of the rows by id; the ids must be the same as in the first frame."""
+        """Return the indices that sort the rows by id; the set of ids must not change between frames."""
         if "id" not in columns:
             message = "the dump has no atom ids, but LAMMPS changes the order of atoms as they move"
             raise self._refused(message, "Write the dump with the column id")
@@ -369,13 +369,13 @@ class LammpsDump(TextTrajectory):
 
 
 def _labels(columns: list[str], rows: np.ndarray) -> np.ndarray | None:
-    """Return the elements of the atoms, or their types; None if the dump has neither."""
+    """Return the elements of the atoms, or their types if there are no elements; None without either."""
     name = next((one for one in ("element", "type") if one in columns), None)
     return None if name is None else rows[:, columns.index(name)].astype(str)
 
 
 def _items(block: list[str]) -> dict[str, list[str]]:
-    """Return lines by the name of their item; the box and the atoms keep their header line as the first."""
+    """Return the lines of a frame by the name of their ITEM header."""
     items: dict[str, list[str]] = {}
     rows: list[str] = []
     for k, line in enumerate(block):
@@ -392,7 +392,7 @@ def _items(block: list[str]) -> dict[str, list[str]]:
 
 
 def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
-    """Return (names of the columns, the words of every atom with shape (atoms, columns))."""
+    """Return (names of the columns, words of all atoms with shape (atoms, columns))."""
     head, *rows = items["ATOMS"]
     columns = head.split()
     words = np.array("".join(rows).split(), dtype=object)
@@ -403,7 +403,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
 
 
 def _bounds(items: dict[str, list[str]]) -> Box:
-    """Return the box of a dump frame; its origin, a corner of the box, moves when the volume changes."""
+    """Return the box of a dump frame; the origin of the box is a corner, which moves with the volume."""
     head, *rows = items["BOX BOUNDS"]
     names, words = head.split(), [row.split() for row in rows[:3]]
     pbc, values = np.array([name == "pp" for name in names[-3:]], bool), np.array(words, np.float64)
@@ -432,7 +432,7 @@ _NANOMETER = 10.0
 
 
 class GroTrajectory(TextTrajectory):
-    """GROMACS gro file, in Å and Å/ps as in MDAnalysis."""
+    """Trajectory in a GROMACS gro file, in Å and Å/ps, the units of MDAnalysis."""
 
     format = "GRO"
     # numbers of the box in the frame before
@@ -482,7 +482,7 @@ class GroTrajectory(TextTrajectory):
 
 
 def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray, "atoms numbers"]:
-    """Return the numbers in fixed columns, which may touch one another."""
+    """Return the numbers in columns of fixed width, which need not be separated by spaces."""
     size = _HEAD + count * width
     text = np.array([row[:size].ljust(size).encode() for row in rows], dtype=f"S{size}")
     letters = np.frombuffer(text.tobytes(), "S1").reshape(len(rows), size)[:, _HEAD:]
@@ -490,7 +490,7 @@ def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray,
 
 
 def _gro_box(line: str) -> Box:
-    """Return the box from three diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros: no box."""
+    """Return the box from three diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; no box if zero."""
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
         raise ValueError(f"the box line has {len(values)} numbers; expected 3 or 9")
@@ -501,5 +501,5 @@ def _gro_box(line: str) -> Box:
 
 
 def _box_words(line: str) -> list[str]:
-    """Split a box line into numbers with five decimals, which touch in boxes of 10 µm and more."""
+    """Split a box line into numbers with five decimals, not separated by spaces in boxes above 10 µm."""
     return _TOUCHING.findall(line) if max(map(len, line.split())) > _LONG else line.split()

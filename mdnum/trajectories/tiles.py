@@ -1,14 +1,14 @@
-"""Decisions on all near pairs of each frame, sixteen at once; only changed decisions are processed further.
+"""Decisions on all near pairs of each frame, sixteen at a time in float32 vectors.
 
-Atoms are sorted into clusters of sixteen by halving space. Two clusters and the lattice vector between them
-form a tile: a row of sixteen decisions, as bits, for each atom of the first cluster. At each frame, the rows
-that may hold a near pair are computed in float32 vectors and compared with the previous frame. A pair closer
-to its threshold than float32 can resolve is decided by the number that all searches use
-(`search.exact_square`), and so is a pair whose margin is needed.
+Atoms are sorted into clusters of sixteen by bisecting space. A tile consists of two clusters and the lattice
+vector between them, with sixteen decisions, as bits, for each atom of the first cluster. At each frame, the
+decisions of near clusters are computed in float32 and compared with the previous frame; only changed
+decisions are processed further. If float32 cannot decide a pair, or the margin of a pair is needed, the exact
+squared distance is computed (`search.exact_square`).
 
-Tiles remain valid as long as each cluster stays in the box around it with which the tiles were found. Atoms
-are followed through the lattice, so an atom that a code wraps into the box between two frames has not moved
-far.
+Tiles remain valid as long as all atoms of each cluster stay inside an enlarged bounding box of the cluster.
+Coordinates are unwrapped from frame to frame, so that wrapping of atoms in the file does not invalidate
+tiles.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _UNIT = 2.0**-24
 
 
 class Tiled(NamedTuple):
-    """Tiles of pairs with the same radius, and their decisions at the last frame."""
+    """Tiles of pairs with the same cutoff radius, and their decisions at the last frame."""
 
     first: Int[np.ndarray, "tiles"]  # clusters
     second: Int[np.ndarray, "tiles"]
@@ -48,7 +48,7 @@ class Tiled(NamedTuple):
 
 
 class _Numbers(NamedTuple):
-    """Data from which the exact squared distances of a frame are computed."""
+    """Data for the exact computation of squared distances at one frame."""
 
     positions: Float[np.ndarray, "atoms 3"]
     home: Int[np.ndarray, "atoms 3"]  # lattice vectors that have been taken off each atom
@@ -57,7 +57,7 @@ class _Numbers(NamedTuple):
 
 
 class _Limits(NamedTuple):
-    """Thresholds for the pairs with the same radius."""
+    """Thresholds for the pairs with the same cutoff radius."""
 
     radius: float
     square: float  # of the radius
@@ -70,7 +70,7 @@ class _Limits(NamedTuple):
 
 @dataclass
 class Tiles:
-    """Tiles currently in use, with the followed coordinates of the atoms."""
+    """Current tiles, with the unwrapped coordinates of the atoms."""
 
     order: Int[np.ndarray, "slots"]
     kinds: list[tuple[float, Tiled]]  # (radius, tiles) of each two kinds of atoms that can be neighbors
@@ -84,7 +84,7 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Follow atoms to a frame; return True if all pairs within `clear` of their radius are in tiles."""
+        """Update to a frame; return True if tiles contain all pairs within `clear` of their radius."""
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
@@ -98,7 +98,7 @@ class Tiles:
         )
 
     def _follow(self, before: Placed, now: Placed, change: np.ndarray) -> tuple[float, float, float]:
-        """Update columns and boxes; return (largest, second, root mean square) displacement lengths."""
+        """Update coordinates and boxes; return (largest, second largest, root mean square) displacement."""
         lattice = now.lattice
         most, second, total = _follow(
             before.positions, now.positions, self.order, self.home, lattice.vectors, change, lattice.inverse,
@@ -108,7 +108,7 @@ class Tiles:
         return math.sqrt(most), math.sqrt(second), math.sqrt(total / max(len(now.positions), 1))
 
     def doubt(self, now: Placed, radius: float) -> float:
-        """Return the float32 error bound of a distance near the radius, in length units."""
+        """Return the float32 error bound of a distance near the cutoff radius, in length units."""
         largest = float(np.abs(self.boxes).max(initial=0.0))
         vectors = float(np.abs(now.lattice.vectors).sum())
         # rounding of two coordinates and a shift, of a difference with each, and of the square
@@ -117,10 +117,10 @@ class Tiles:
     def examine(
         self, now: Placed, *, bound: float, horizon: float, pairs: int, record: bool = True
     ) -> tuple[Changed, int, float]:
-        """Decide all pairs at the frame to which the atoms were followed last.
+        """Decide all pairs at the frame to which the coordinates were last updated.
 
         Args:
-            bound: pairs within this length of their radius are counted.
+            bound: pairs whose distance deviates from their radius by at most this length are counted.
             horizon: the smallest |margin| is determined up to this length.
             pairs: approximate number of pairs inside.
             record: True to return the pairs that flipped.
@@ -164,7 +164,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if pairs that approach by `moved` are inside through one image, the same in both frames."""
+    """Return True if a pair can be inside through one image only, before and after approaching by `moved`."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
@@ -173,10 +173,10 @@ def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool
 def tiles_of(
     before: Placed, now: Placed, who: Participants, clear: float, pairs: int, spare: Tiles | None = None
 ) -> Tiles | None:
-    """Build tiles that are valid from one frame to the next, with the decisions of the first frame.
+    """Build tiles that are valid at two successive frames, with the decisions of the first frame.
 
-    The result is None if atoms move too far, or the box repeats too soon. `pairs` is the approximate number
-    of pairs inside; the memory of `spare`, tiles that are no longer needed, is reused.
+    The result is None if atoms move too far, or the box is too narrow. `pairs` is the approximate number of
+    pairs inside; the memory of discarded tiles, `spare`, is reused.
     """
     radius, lattice, x = who.radius, before.lattice, before.positions
     if not _one_image(before, now, radius, 0.0):
@@ -237,7 +237,7 @@ def tiles_of(
 
 
 def _aligned(clusters: int) -> Float32[np.ndarray, "clusters 3 16"]:
-    """Allocate coordinates so that no vector spans two cache lines."""
+    """Allocate an array of coordinates aligned such that no vector spans two cache lines."""
     room = np.empty(3 * CLUSTER * clusters + CLUSTER, np.float32)
     first = -room.ctypes.data % 64 // 4
     return room[first : first + 3 * CLUSTER * clusters].reshape(clusters, 3, CLUSTER)
@@ -252,7 +252,7 @@ def _tiled(
     shifts: Float32[np.ndarray, "27 3"],
     reach: np.float32,
 ) -> Tiled:
-    """Return the tiles of two kinds of atoms whose cluster boxes are within reach."""
+    """Return the tiles of two kinds of atoms whose cluster boxes are within the cutoff."""
     room = 32 * int(runs[a + 1] - runs[a]) + 64
     while True:
         made = np.empty((3, room), np.int32)
@@ -267,9 +267,9 @@ def _tiled(
 
 @njit
 def _halved(x, order):
-    """Sort atoms so that each run of sixteen is compact, by repeated bisection along the longest edge.
+    """Sort atoms into compact groups of sixteen, by repeated bisection along the longest edge.
 
-    Bisection is approximate: a half may hold an atom that belongs in the other, which costs nothing but time.
+    Bisection is approximate: an atom in the wrong half costs computing time, but causes no error.
     """
     count, scratch = order.shape[0], np.empty(order.shape[0], np.int32)
     stack, edges = np.empty((64, 2), np.int64), np.empty((64, 6))
@@ -314,10 +314,10 @@ def _halved(x, order):
 
 @njit
 def _nodes(boxes, runs):
-    """Return the bounding box of the clusters of each run, followed by those of its halves, and so on.
+    """Return a tree of bounding boxes: of each run of clusters, of its two halves, and so on.
 
-    The first half of a node is the next node; the second half follows at a distance of twice the number of
-    clusters in the first half.
+    Node n is followed by the first half of its clusters, at node n + 1. The second half is at node n + 2 c,
+    where c is the number of clusters in the first half.
     """
     nodes, spans = np.empty((2 * runs[-1], 6), np.float32), np.empty((2 * runs[-1], 2), np.int64)
     stack = [(0, 0, 0)]
@@ -344,7 +344,7 @@ def _nodes(boxes, runs):
 
 @njit
 def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
-    """Write the tiles between two runs of clusters, as far as they fit; return their number."""
+    """Write the tiles between two runs of clusters, up to the capacity; return the number of tiles found."""
     count, square, same = 0, reach * reach, a == b
     stack = np.empty((256, 6), np.int64)
     for code in codes:
@@ -382,9 +382,9 @@ def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
 
 @njit
 def _follow(before, now, order, home, vectors, change, inverse, periodic, center, columns):
-    """Write the unwrapped coordinates; return the two largest squared displacements and the sum of all.
+    """Write unwrapped coordinates; return the two largest squared displacements and the sum of all squares.
 
-    The lattice vectors by which atoms were moved are counted in `home`.
+    The lattice vectors removed from each atom are counted in `home`.
     """
     most, second, total = 0.0, 0.0, 0.0
     for at in range(order.shape[0]):
@@ -425,7 +425,7 @@ def _follow(before, now, order, home, vectors, change, inverse, periodic, center
 
 @njit
 def _stays(boxes, around, drift):
-    """Return True if each box is inside the box around it, after this is reduced by the drift."""
+    """Return True if each cluster box is inside its enlarged box, reduced by `drift` on each side."""
     out = 0
     for k in range(boxes.shape[0]):
         for c in range(3):
@@ -435,7 +435,7 @@ def _stays(boxes, around, drift):
 
 @njit
 def _box(columns, boxes):
-    """Compute the box around each cluster, ignoring empty slots."""
+    """Compute the bounding box of each cluster, ignoring empty slots."""
     for k in range(columns.shape[0]):
         for c in range(3):
             low, high = np.float32(np.inf), np.float32(-np.inf)
@@ -447,7 +447,7 @@ def _box(columns, boxes):
 
 @njit
 def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count):
-    """Decide the pairs of tiles from `begin` on; return (next tile, flips, close, smallest |margin|)."""
+    """Decide the pairs of tiles from tile `begin` on; return (next tile, flips, close, smallest |margin|)."""
     close, smallest, room = 0, np.inf, flips.i.shape[0]
     first, second, vector, rows, inside = tiled.first, tiled.second, tiled.vector, tiled.rows, tiled.inside
     order, low, high, scratch = numbers.order, limits.low, limits.high, np.empty(4 * CLUSTER, np.float32)
@@ -500,7 +500,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
 
 @njit(inline="never")
 def _settled(inside, doubtful, i, slot, code, numbers, limits):
-    """Decide the doubtful pairs of a row; return (bits inside, number within bound, smallest |margin|)."""
+    """Decide the doubtful pairs of one atom; return (bits inside, number within bound, smallest |margin|)."""
     close, smallest, vectors, order = 0, np.inf, numbers.vectors, numbers.order
     n0, n1, n2 = np.intp(code // 9) - 1, np.intp(code // 3 % 3) - 1, np.intp(code % 3) - 1
     while doubtful != np.uintp(0):

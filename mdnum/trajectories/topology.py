@@ -1,17 +1,17 @@
-"""Atoms and boxes as MDAnalysis and ASE read them: names, elements, residues, and boxes as stored in files.
+"""Atoms and boxes from MDAnalysis and ASE: names, elements, residues, and boxes in their stored orientation.
 
-MDAnalysis keeps three lengths and three angles, and builds a box with its first vector along x and its second
-in the xy plane. Most programs orient their boxes in this way; if one does not, its coordinates are oriented
-differently too, and images would silently be put in wrong places:
+MDAnalysis stores three lengths and three angles of a box, and assumes the first vector along x and the second
+in the xy plane. Most programs use this orientation. For a box in another orientation, the periodic images
+computed from MDAnalysis's box are silently wrong:
 
-- CHARMM's boxes are symmetric matrices (since version 22, in dcd files, which do not say so: see dcd_boxes);
-- HOOMD's boxes have tilt factors, which MDAnalysis takes for the cosines of angles (in gsd files);
-- boxes of H5MD and of DL_POLY's HISTORY are vectors in any direction.
+- CHARMM's boxes are symmetric matrices in dcd files (since version 22, without a flag; see dcd_boxes).
+- HOOMD's boxes have tilt factors, which MDAnalysis interprets as cosines of angles (in gsd files).
+- Boxes in H5MD files and DL_POLY's HISTORY files have vectors in any direction.
 
-MDAnalysis loses the boxes of a PDB file with many models unless each model has one. Programs write CRYST1
-once in the header (OpenMM), before each model (GROMACS), or inside each model. MDAnalysis reads a model from
-its MODEL record on: a box before the first model is never read, and a box after a model is assigned to that
-model, although it belongs to the next one.
+In a PDB file with many models, MDAnalysis loses boxes outside the models. Programs write CRYST1 once in the
+header (OpenMM), before each model (GROMACS), or inside each model. MDAnalysis reads a model from its MODEL
+record to the next MODEL record. A box before the first model is therefore never read, and a box after a model
+is assigned to this model instead of the next one.
 """
 
 from __future__ import annotations
@@ -71,12 +71,12 @@ class AtomTable:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on the naming of atoms for readers of results."""
+        """Notes for the user on missing or guessed atom names."""
         return (_UNNAMED,) if not self.named else (_GUESSED,) if self.guessed else ()
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
-        """Names and numbers by column name, one entry per atom; columns without any value are left out."""
+        """Atom names, residue names and numbers, and segments by column name; empty columns are left out."""
         numbered = any(self.residue_names) or self.residues.any()
         every = {
             "atom_name": self.names if self.named else (), "residue_name": self.residue_names,
@@ -91,9 +91,9 @@ class AtomTable:
         """Build a table of atoms from their species.
 
         Args:
-            named: True if the file gives the species.
-            arrays: further columns of a file, by their names in ASE or other programs; names of atoms,
-                residues and segments and numbers of residues are kept.
+            named: True if the file contains the species.
+            arrays: further columns of a file, by their names in ASE or other programs; only names of atoms,
+                residues and segments, and residue numbers, are used.
         """
         words, none = np.array(species, dtype=object), np.zeros(len(species), np.int64)
 
@@ -112,7 +112,7 @@ class AtomTable:
 
     @classmethod
     def of(cls, atoms: Any) -> AtomTable:
-        """Build a table from an MDAnalysis AtomGroup."""
+        """Build an atom table from an MDAnalysis AtomGroup."""
 
         def column(name: str, otherwise: Any) -> np.ndarray:
             values = getattr(atoms, name, None)
@@ -160,20 +160,20 @@ class AtomTable:
         return universe
 
     def give_elements(self, universe: Any) -> None:
-        """Add guessed elements to a Universe, for selections by element."""
+        """Add guessed elements to an MDAnalysis Universe, for selections by element."""
         if self.guessed and not hasattr(universe.atoms, "elements"):
             universe.add_TopologyAttr("elements", self.species)
 
 
 @dataclass(frozen=True)
 class Topology:
-    """A file that identifies the atoms: a topology that MDAnalysis accepts, or any structure."""
+    """A file that identifies the atoms: any topology or structure that MDAnalysis or ASE can read."""
 
     path: Path
     otherwise: Callable[[Path], AtomTable]  # the atoms of a file that MDAnalysis does not read
 
     def read(self) -> tuple[AtomTable, Any]:
-        """Return the atoms of the file, and a Universe of them without coordinates.
+        """Return the atom table of the file, and an MDAnalysis Universe of the atoms without coordinates.
 
         Raises:
             InputError: no reader supports the file.
@@ -191,7 +191,7 @@ class Topology:
 
 
 def topology_universe(topology: str | Path) -> Any:
-    """Return a Universe of a topology, without coordinates, whose readers may write files next to it.
+    """Return a Universe of a topology; coordinates are not read, since readers may write files next to it.
 
     Raises:
         InputError: MDAnalysis cannot read the file.
@@ -205,7 +205,7 @@ def topology_universe(topology: str | Path) -> Any:
 
 
 def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
-    """Return the number of atoms in a trajectory, or None; some readers need the number in the topology."""
+    """Return the number of atoms in a trajectory, or None; some formats need the number in the topology."""
     from MDAnalysis.core._get_readers import get_reader_for
 
     for known in ({}, {"n_atoms": topology}):
@@ -222,22 +222,22 @@ def atoms_in(path: str | Path, topology: int | None = None, format: str | None =
 
 
 def formats_of(trajectory: Any) -> list[str]:
-    """Return MDAnalysis's names for the format of one of its readers."""
+    """Return the list of format names of an MDAnalysis reader."""
     return [trajectory.format] if isinstance(trajectory.format, str) else list(trajectory.format)
 
 
 def file_of(trajectory: Any) -> Path | None:
-    """Return the file that an MDAnalysis reader reads; None if there is no single file."""
+    """Return the path of the file behind an MDAnalysis reader; None if there is no single file."""
     path = getattr(trajectory, "filename", None)
     return Path(path) if isinstance(path, str | Path) else None
 
 
 class Boxes:
-    """Boxes of an MDAnalysis trajectory (its reader), oriented as its coordinates are.
+    """Boxes of an MDAnalysis reader, in the same orientation as the coordinates.
 
     Attributes:
-        notes: remarks for a user who relies on the boxes, in sentences.
-        own: True if boxes are read from the file itself, and may differ from MDAnalysis's.
+        notes: notes for the user on the interpretation of the boxes, in sentences.
+        own: True if boxes are read directly from the file, and may differ from MDAnalysis's boxes.
     """
 
     def __init__(self, trajectory: Any):
@@ -257,7 +257,7 @@ class Boxes:
         self.own = self._matrix is not None or bool(self._models)
 
     def other(self, ts: Any, number: int) -> tuple[str, Box] | None:
-        """Return another possible box, as `Trajectory.other_box` does, for the timestep of this frame."""
+        """Return another possible box of a frame and its timestep; see `Trajectory.other_box`."""
         instead = getattr(self._matrix, "instead", None)
         if instead is not None and (matrix := instead(number)) is not None:
             return "BOX_UNDECIDED", Box(matrix, np.ones(3, bool))
@@ -268,7 +268,7 @@ class Boxes:
         return ("BOX_NOT_MDANALYSIS", theirs) if differs else None
 
     def box(self, ts: Any, number: int) -> Box:
-        """Return the box of a timestep that is this frame of the file."""
+        """Return the box of the frame with this number, whose MDAnalysis timestep is given."""
         dimensions = ts.dimensions
         # transformations may have set another
         if self._models and (dimensions is None or not self._changed):
@@ -280,11 +280,12 @@ class Boxes:
 
 
 def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
-    """Return the box with these lengths, Å, and angles, degrees: a along x, b in xy, as in MDAnalysis.
+    """Return the box for given lengths, Å, and angles, degrees: a along x, b in xy, as in MDAnalysis.
 
-    None stands for no box; an axis of length 0 with right angles does not repeat.
+    `None` means no box; an axis of length 0 with right angles is not periodic.
 
-    Error: MDAnalysis keeps lengths and angles in float32: lattice vectors have a relative error of 1e-7.
+    Error: lattice vectors have a relative error of 1e-7, since MDAnalysis stores lengths and angles in
+        float32.
     """
     from MDAnalysis.lib.mdamath import triclinic_vectors
 
@@ -359,7 +360,7 @@ _MATRICES = {"DCD": _dcd, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
 
 @lru_cache(maxsize=4)
 def _models(path: str, size: int, changed: int) -> tuple[tuple[Dimensions, ...], int]:
-    """Return (lengths and angles of each model's box, number of records), cached until the file changes."""
+    """Return (lengths and angles of each model's box, number of CRYST1 records); results are cached."""
     from MDAnalysis.lib.util import anyopen
 
     found: list[Dimensions] = []

@@ -1,4 +1,4 @@
-"""Tracking of the neighbors that each atom gains and loses from frame to frame."""
+"""Tracking of the pairs that enter or leave a membership rule from frame to frame."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ HORIZON = 0.02
 
 
 def atoms_of(groups: Groups) -> AtomIndices:
-    """Return the atoms on either side of a pair; None for all."""
+    """Return the atoms in either of two groups; None for all atoms."""
     some = [one for one in groups if one is not None]
     return np.unique(np.concatenate(some)) if some else None
 
 
 @dataclass(frozen=True)
 class Moment(Placed):
-    """One frame of a trajectory with its decided neighbors."""
+    """Positions of one frame with the neighbors decided for it."""
 
     own: Int[np.ndarray, "species"]  # images of an atom itself that are inside, by species
     last_in: Float[np.ndarray, "limits"]  # thresholds of each atom, where the rule is directed
@@ -59,23 +59,23 @@ class Moment(Placed):
 
 
 class Tracker:
-    """Flips of a membership rule between consecutive frames.
+    """Tracker of the flips between consecutive frames, as defined by a membership rule.
 
-    A tracker remembers one frame, so its memory does not grow with the number of frames; it can be pickled.
+    A tracker can be pickled. It stores a single frame, so its memory does not grow with the number of frames.
 
     Args:
         rule: the membership rule that defines neighbors.
-        first: atoms of the file on one side; None for all. A directed rule searches for neighbors of these.
-        second: atoms on the other side; None for the same atoms as first. An atom may be on both sides.
+        first: indices of the first group of atoms, the centers of a directed rule; None for all atoms.
+        second: indices of the second group; None for the first group. An atom may be in both groups.
         species: species of each atom of the file; required by some rules.
-        bound: error bound of a margin, in length units, due to the resolution of the file. The rounding
-            error of float64 is added to it.
+        bound: error bound of a margin, in length units, due to the resolution of the file. The rounding error
+            of float64 is added to this bound.
 
     Attributes:
         pairs: number of pairs inside at the last frame.
-        near: number of pairs at the last frame with a |margin| of at most the bound, inside or not.
-        min_margin: smallest |margin| at the last frame, a length; inf if no pair is within `HORIZON` of
-            its radius. For nearest neighbors without a radius, there is no such limit.
+        near: number of pairs at the last frame, inside or outside, whose |margin| is at most the bound.
+        min_margin: smallest |margin| at the last frame, a length; inf if no pair is within `HORIZON` of its
+            radius. For nearest neighbors without a radius, the margin is not limited.
 
     Raises:
         InputError: indices are not integers from 0, or required species are missing.
@@ -112,10 +112,10 @@ class Tracker:
         self.min_margin = np.inf
 
     def step(self, frame: Frame, bound: float | None = None) -> FlipTable:
-        """Return the flips since the previous frame; none at the first frame.
+        """Process the next frame; return the flips since the previous frame, or no flips at the first frame.
 
         Args:
-            frame: the next frame; its own index does not matter.
+            frame: the next frame; `frame.index` is used only in error messages.
             bound: error bound of margins (length) from this frame on; None to keep the previous one.
 
         Raises:
@@ -164,10 +164,10 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return threshold distances of a directed rule at the last frame, by atom; nan if not a center.
+        """Return the threshold distances of each center of a directed rule at the last frame, otherwise nan.
 
         Returns:
-            (distance below which a neighbor stays one, distance below which another atom would become one).
+            (distance below which a neighbor stays one, distance below which another atom becomes a neighbor).
         """
         found = np.full((2, max(self._atoms, 0)), np.nan)
         if self._last is not None and self.rule.directed:
@@ -177,7 +177,7 @@ class Tracker:
     # ---- one frame
 
     def _moment(self, frame: Frame) -> Moment:
-        """Check a frame, and prepare it for decisions."""
+        """Check a frame, and prepare its data for decisions."""
         atoms = len(frame.positions)
         if self._atoms < 0:
             self._atoms = atoms
@@ -205,7 +205,7 @@ class Tracker:
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
     def _decided(self, now: Moment) -> Moment:
-        """Search for the neighbors at a frame, store their numbers, and return the frame with neighbors."""
+        """Find the neighbors at a frame, store the numbers of pairs, and return the frame with neighbors."""
         rule, bound, who = self.rule, self.bound + now.rounding, self._who
         if isinstance(rule, Nearest | Capped):
             reach = rule.reach if np.isfinite(rule.reach) else 0.0
@@ -228,11 +228,11 @@ class Tracker:
         return replace(now, found=found, own=own)
 
     def _rows(self, moment: Moment) -> NeighborRows:
-        """Return the neighbors at a frame; search for them if they are unknown."""
+        """Return the neighbors at a frame, from a new search if necessary."""
         return moment.rows or rows_of(moment.found or self._searched(moment), len(moment.positions))
 
     def _searched(self, moment: Moment) -> Found:
-        """Search for the pairs inside at a frame."""
+        """Search for the pairs inside the cutoff at a frame."""
         bound = self.bound + moment.rounding
         found = search(
             moment, self._who, INSIDE,
@@ -245,7 +245,7 @@ class Tracker:
     # ---- two frames
 
     def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
-        """Return the flips found with tiles; None if the tiles are not valid for this frame."""
+        """Return the flips found with the current tiles; None if tiles cannot be used for this frame."""
         who, bound, horizon = self._who, self.bound + now.rounding, HORIZON * self._who.radius
         clear = max(bound, horizon)
         if self._list is not None and not self._list.serve(before, now, who.radius, clear):
@@ -260,7 +260,7 @@ class Tracker:
         return self._table(before, now, changed)
 
     def _flips(self, before: Moment, now: Moment) -> FlipTable:
-        """Return the flips between two frames by comparing their neighbors."""
+        """Return the flips between two frames, by comparing complete sets of neighbors."""
         who = self._who
         parts = [compared(self._rows(before), self._rows(now), self.pairs // 2 + 4096)]
         for kind in np.flatnonzero(before.own != now.own):
@@ -272,7 +272,7 @@ class Tracker:
         return self._table(before, now, Changed._make(map(np.concatenate, zip(*parts, strict=True))))
 
     def _table(self, before: Moment, now: Moment, changed: Changed) -> FlipTable:
-        """Return the flips as a table, from indices among the participating atoms."""
+        """Return a table of flips from arrays that contain indices among the participating atoms."""
         directed, who, count = self.rule.directed, self._who, len(changed.i)
         i, j, images = who.labels[changed.i], who.labels[changed.j], int(changed.rank.max(initial=0)) + 1
         if not directed:
@@ -306,7 +306,7 @@ def _participants(
     species: np.ndarray | None,
     atoms: int,
 ) -> Participants:
-    """Number the atoms that take part in a rule, in the order of the file."""
+    """Number the atoms to which a rule applies, in the order of the file."""
     first = np.arange(atoms) if first is None else first
     second = first if second is None else second
     for name, chosen in (("first", first), ("second", second)):
@@ -329,7 +329,7 @@ def _participants(
 
 
 def _by_place(who: Participants, frame: Frame) -> Participants:
-    """Renumber participating atoms by position, so that atoms near in space are near in memory."""
+    """Renumber the participating atoms by position, so that atoms near in space are near in memory."""
     x, largest = _taken(frame.positions, who.labels)
     if not np.isfinite(largest) or not who.radius > 0:
         return who
@@ -342,7 +342,7 @@ def _by_place(who: Participants, frame: Frame) -> Participants:
 
 
 def _taken(positions: np.ndarray, labels: np.ndarray) -> tuple[Float[np.ndarray, "taken 3"], float]:
-    """Return a copy of the positions of some atoms, and the largest coordinate (not finite if one is not)."""
+    """Return the positions of the given atoms, and the largest |coordinate| (not finite if any is not)."""
     x = np.take(np.asarray(positions, np.float64), labels, axis=0)
     return x, furthest(x)
 

@@ -1,8 +1,8 @@
-"""Base class of all trajectory readers: the requested frames, in order, and the properties of the atoms.
+"""Base class of all trajectory readers, which provide the requested frames and properties of the atoms.
 
-Positions are those of the file: nothing is wrapped, unwrapped or centered. Readers differ in precision: those
-of ASE and of mdnum (gro, LAMMPS's text dumps) keep every digit, while those of MDAnalysis reduce every
-coordinate to float32 (`Trajectory.bits`).
+Positions are those of the file, without wrapping, unwrapping or centering. The readers of ASE and mdnum (gro,
+LAMMPS's text dumps) keep every digit; the readers of MDAnalysis reduce coordinates to float32
+(`Trajectory.bits`).
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ SAMPLE = 8
 
 
 class Trajectory(ABC):
-    """Frames of one file, read lazily and in order, any number of times.
+    """Frames of one file, which can be read in order any number of times; each frame is read when needed.
 
-    A subclass sets the number of atoms (`has_atoms`), finds frames (`raw_frames`) and decodes them
+    A subclass sets the number of atoms (`has_atoms`), reads raw frames (`raw_frames`) and decodes raw frames
     (`decoded`). An exception in these methods is reported as an unreadable frame.
 
     Args:
-        path: the file.
-        topology: the file that identifies the atoms, if it is another file.
+        path: the trajectory file.
+        topology: the file that identifies the atoms, if not the trajectory file.
         slice: the requested frames.
     """
 
@@ -66,7 +66,7 @@ class Trajectory(ABC):
         self.path, self.topology, self.slice = path, topology, slice
 
     def has_atoms(self, atoms: int, table: AtomTable | None = None) -> None:
-        """Set the table of atoms, from the topology if there is one."""
+        """Set the table of atoms, read from the topology if one was given."""
         check_claim(self.path, atoms)
         if self.topology is not None:
             table, _ = self.topology.read()
@@ -74,7 +74,7 @@ class Trajectory(ABC):
         self.table = AtomTable.plain(["X"] * atoms, named=False) if table is None else table
 
     def _belongs(self, topology: int, atoms: int) -> None:
-        """Reject a topology with another number of atoms."""
+        """Raise an error if the topology has another number of atoms than the trajectory."""
         if self.topology is not None and topology != atoms:
             seen = (
                 f"the topology {self.topology.path.name} has {topology:,} atoms and the trajectory {atoms:,}"
@@ -92,16 +92,16 @@ class Trajectory(ABC):
 
     @property
     def species(self) -> np.ndarray:
-        """Species of every atom, as words, shape (atoms,)."""
+        """Species of all atoms as strings, shape (atoms,)."""
         return self.table.species
 
     def other_box(self, number: int) -> tuple[str, Box] | None:
-        """Return (code of a finding, another box that the frame may have); None if there is no other box."""
+        """Return (code of a finding, another possible box of the frame); None if the box is unambiguous."""
         return None
 
     @property
     def in_file(self) -> int | None:
-        """Number of frames in the file; None if it is unknown without reading the file."""
+        """Number of frames in the file; None if unknown before the file has been read."""
         if self._count is None and any((end or 0) < 0 for end in (self.slice.start, self.slice.stop)):
             with self._opened() as get:
                 for number in chosen(slice(None), None):
@@ -113,15 +113,15 @@ class Trajectory(ABC):
 
     @property
     def count(self) -> int | None:
-        """Number of frames that `frames` yields; None if it is unknown without reading the file."""
+        """Number of frames that `frames` yields; None if unknown before the file has been read."""
         return None if self.in_file is None else len(range(*self.slice.indices(self.in_file)))
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the requested frames in order, one in memory at a time. Each call starts at the first frame.
+        """Yield the requested frames in order, from the first one at each call, with one frame in memory.
 
         Raises:
-            UnreadableFrame: a frame cannot be read; the frames before it have been yielded.
-            InputError: a frame has another number of atoms.
+            UnreadableFrame: a frame cannot be read; all earlier frames have been yielded.
+            InputError: a frame has a different number of atoms.
         """
         number = None
         with self._opened() as get:
@@ -143,10 +143,10 @@ class Trajectory(ABC):
                 raise self._unreadable(end, rest)
 
     def sample(self) -> list[Frame]:
-        """Return the first `SAMPLE` of the requested frames, or fewer if one of them cannot be read.
+        """Return the first `SAMPLE` of the requested frames, or only the frames before an unreadable frame.
 
         Raises:
-            InputError: there is no frame, or the first one cannot be read.
+            InputError: there is no frame, or the first frame cannot be read.
         """
         sample = []
         try:
@@ -161,7 +161,7 @@ class Trajectory(ABC):
 
     @property
     def slice_words(self) -> str:
-        """Requested frames as written after an @; empty for all frames."""
+        """Requested frames in the notation used after @ in a file name; empty for all frames."""
         if self.slice == slice(None):
             return ""
         start, stop, step = self.slice.start, self.slice.stop, self.slice.step
@@ -170,18 +170,18 @@ class Trajectory(ABC):
 
     @abstractmethod
     def raw_frames(self) -> AbstractContextManager[Callable[[int], Any]]:
-        """Open the file; provide a function that returns raw frames by ascending number, then None."""
+        """Open the file; provide a function that returns raw frames by ascending number, None at the end."""
 
     @abstractmethod
     def decoded(self, number: int, raw: Any) -> Frame:
-        """Decode a raw frame from `raw_frames`, in the units named by `length` and `time`."""
+        """Decode a raw frame returned by `raw_frames`, in the units named by `length` and `time`."""
 
     def _behind(self) -> str | None:
-        """Describe the data after the last frame of the file; return None if there are none."""
+        """Describe data after the last frame of the file; return None if the file ends there."""
         return None
 
     def _by_id(self, number: int, ids: np.ndarray) -> np.ndarray:
-        """Return the order of a frame's atoms by id; the ids must be those of the first frame."""
+        """Return the indices that sort the atoms of a frame by id; ids must be those of the first frame."""
         order = np.argsort(ids, kind="stable")
         known = self._ids = ids[order] if self._ids is None else self._ids
         if not np.array_equal(known, ids[order]):
@@ -202,7 +202,7 @@ class Trajectory(ABC):
         return reading(self.path, number, by=self.reader)
 
     def in_order(self, following: Callable[[], Any]) -> Callable[[int], Any]:
-        """Return a function that gives frames by number, for a reader that only reads forward."""
+        """Return a function that returns frames by ascending number, for a format without random access."""
         at = 0
 
         def get(number: int) -> Any:
@@ -220,7 +220,7 @@ class Trajectory(ABC):
         return get
 
     def first(self) -> Any:
-        """Return the first frame of the file in raw form, as `decoded` takes it."""
+        """Return the first frame of the file in the raw form that `decoded` accepts."""
         with self._opened() as get, self._reading(0):
             first = get(0)
         if first is None:
@@ -238,7 +238,7 @@ class Trajectory(ABC):
 
 
 def chosen(frames: slice, total: int | None) -> Iterator[int]:
-    """Return the frame numbers of a slice, ascending; endless if neither the slice nor the total ends."""
+    """Return the frame numbers of a slice, ascending; unlimited if the slice and `total` have no end."""
     if total is not None:
         return iter(range(*frames.indices(total)))
     return islice(count(), frames.start, frames.stop, frames.step)

@@ -1,7 +1,7 @@
-"""Motion of atoms across faces of the box, and frames that do not continue the previous frame.
+"""Unwrapping of atomic paths across box boundaries, and detection of discontinuities between frames.
 
-An atom that is wrapped into another cell has to jump by whole lattice vectors of the box at that frame;
-otherwise quantities computed from its path are wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153,
+Wrapping must move an atom by an integer combination of the lattice vectors at that frame; otherwise
+quantities computed from the path of the atom are wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153,
 021101, 2020). This module removes jumps by the lattice vectors of each frame, which preserves displacements
 (Bullerjahn, von Bülow, Heidari, Hénin and Hummer, J. Chem. Theory Comput. 19, 3406, 2023).
 """
@@ -33,7 +33,7 @@ _GROUPS = 8
 
 @dataclass
 class Unwrapping:
-    """Unwrapped paths of up to `_PAIRS` pairs of successive atoms, as long as the box is fully periodic."""
+    """Unwrapped paths of up to `_PAIRS` pairs of successive atoms, for frames with a fully periodic box."""
 
     atoms: AtomIndices
     _first: np.ndarray | None = None
@@ -42,7 +42,7 @@ class Unwrapping:
     _lengths: list[np.ndarray] = field(default_factory=list)  # distances in pairs at the first frames
 
     def see(self, frame: Frame) -> dict[str, Any] | None:
-        """Return the row of the motion table for the next frame; None without a box."""
+        """Return the motion table's row for the next frame; None unless the box is fully periodic."""
         x, cell = frame.positions if self.atoms is None else frame.positions[self.atoms], frame.box.matrix
         if not frame.box.pbc.all() or len(x) < 2:
             return None
@@ -68,7 +68,7 @@ class Unwrapping:
         }  # fmt: skip
 
     def _pairs(self, here: np.ndarray, there: np.ndarray, cell: np.ndarray) -> dict[str, Any]:
-        """Return the change of distance in stiff pairs, for pairs in two cells and for pairs in one cell."""
+        """Return the change of distance of stiff pairs, separately for pairs across and within a cell."""
         images = np.rint(there - here)
         split = images.any(axis=1) | (np.floor(here) != np.floor(there)).any(axis=1)
         lengths = np.linalg.norm((there - here - images) @ cell, axis=1)
@@ -84,7 +84,7 @@ class Unwrapping:
 
 
 def told(rows: Mapping[str, np.ndarray], atoms: int, timed: bool) -> dict[str, Any] | None:
-    """Summarize the motion table of the given number of atoms as plain values; None for few frames."""
+    """Summarize the motion table as plain values, for a given number of atoms; None for few frames."""
     if len(rows["frame"]) < 3:
         return None
     # before the first frame nothing moved
@@ -109,7 +109,7 @@ def told(rows: Mapping[str, np.ndarray], atoms: int, timed: bool) -> dict[str, A
 
 
 def _seams(number: np.ndarray, step: np.ndarray, jumps: np.ndarray, atoms: int) -> list[dict[str, Any]]:
-    """Return frames at which, unlike at the frames around them, all atoms move or many of them jump."""
+    """Return frames with a sudden displacement of all atoms, or with more jumps than adjacent frames."""
     found = []
     for k in range(len(step)):
         around = np.r_[max(k - _AROUND, 0) : k, k + 1 : min(k + _AROUND, len(step) - 1) + 1]
