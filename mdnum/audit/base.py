@@ -1,4 +1,4 @@
-"""Base classes of the calculator checks: limits on calls and time, findings, results, and `AuditCheck`."""
+"""Base classes shared by the calculator checks: limits on calls and time, findings, results, `AuditCheck`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def idle(done: int, total: int, info: dict[str, Any]) -> None:
 
 
 class CallsUp(TimeUp):
-    """Raised when a check or a search has made all calls allowed to it; the work in progress is abandoned."""
+    """Raised when a check or a search has used up its allowed calculator calls; the check is abandoned."""
 
     why = "the calls of this check were used up"
 
@@ -42,7 +42,7 @@ class CalculatorError(MdnumError):
     """The calculator raised an exception, or returned a number that is not finite.
 
     Args:
-        structure: file with the structure that failed; None when enough of them have been saved.
+        structure: file with the structure on which the calculator failed; None if it was not saved.
         cause: the exception of the calculator; None if the calculator returned a value.
     """
 
@@ -55,10 +55,10 @@ class CalculatorError(MdnumError):
 
 @dataclass
 class Meter:
-    """Number of calls made by all objects of a calculator, with limits on further calls and on time.
+    """Counts the calls to all instances of a calculator, and limits the number of further calls and the time.
 
-    The amount of evidence is set by the number of calls, independent of the load of the machine; only a
-    deadline cuts it short.
+    A check is limited by its number of calls, so that its results do not depend on the load of the machine;
+    only a deadline ends a check earlier.
     """
 
     calls: int = 0
@@ -68,10 +68,10 @@ class Meter:
     _limited: int = 0
 
     def count(self) -> None:
-        """Count a call.
+        """Count one call to the calculator.
 
         Raises:
-            TimeUp: inside `limited`, the deadline has passed or the calls are used up.
+            TimeUp: inside `limited`, the deadline has passed or all allowed calls were made.
         """
         if self._limited and (up := self.up):
             raise up
@@ -79,12 +79,12 @@ class Meter:
 
     @property
     def up(self) -> type[TimeUp] | None:
-        """The exception class for an exceeded limit on calls or time; None while both remain."""
+        """The exception class for an exceeded limit on calls or time; None if neither limit is exceeded."""
         return TimeUp if self.deadline.passed else CallsUp if self.calls >= self.most else None
 
     @contextmanager
     def apart(self, calls: int) -> Iterator[None]:
-        """Grant extra calls for a result that several checks share, beyond those of the check itself."""
+        """Allow further calls, beyond the limit of the check, for a result that several checks share."""
         most = self.most
         self.most = self.calls + calls
         try:
@@ -94,7 +94,7 @@ class Meter:
 
     @contextmanager
     def limited(self) -> Iterator[None]:
-        """Enforce the limits on calls and time in this block: a call beyond them raises `TimeUp`."""
+        """Limit calls and time inside this block: the first call beyond a limit raises `TimeUp`."""
         if up := self.up:
             raise up
         self._limited += 1
@@ -106,7 +106,7 @@ class Meter:
 
 @dataclass(frozen=True)
 class Observed:
-    """One finding of a check: a code, and values for its text in mdnum/verbs/audit.toml."""
+    """One finding of a check: its code, and the values inserted into its text in mdnum/verbs/audit.toml."""
 
     code: str  # short stable name
     severity: Severity  # info (nothing to do), warning (look at it), error (the numbers are wrong)
@@ -118,14 +118,13 @@ class Observed:
 def finding(
     code: str, severity: Severity, *variants: str | None, tests: Collection[str] = (), **values: Any
 ) -> Observed:
-    """Return a finding with those of its text variants that are not None.
+    """Return a finding with the given text variants; variants that are None are left out.
 
     Args:
-        tests: names in `causes.TESTS` of the tests that were made and that leave this cause possible.
+        tests: names (keys of `causes.TESTS`) of the tests that were made and that leave this cause possible.
 
     Raises:
-        ValueError: the cause was not separated from alternative causes; report the code of the symptom
-            instead.
+        ValueError: alternative causes were not excluded by tests; report the code of the symptom instead.
     """
     if left := [test for test in cause(code).tests if test not in tests]:
         raise ValueError(
@@ -137,7 +136,7 @@ def finding(
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart of labeled lines over a shared x axis, with labeled marks such as thresholds on this axis."""
+    """A chart of labeled lines over a common x axis; marks on this axis show, for example, thresholds."""
 
     title: str
     x_label: str
@@ -170,23 +169,23 @@ class CheckResult:
 
 
 class AuditCheck:
-    """Base class of a calculator check, defined in `mdnum.audit.checks` or by a plugin of another package.
+    """Base class of calculator checks; subclasses are in `mdnum.audit.checks` or in plugins of a package.
 
-    A subclass defines a name, a title, a one-line docstring and `ask`; the texts of its findings are in
-    mdnum/verbs/audit.toml, under their codes. To add a check, add the file `checks/NAME.py` with the class
-    `NameCheck`.
+    A subclass defines a name, a title, a one-line docstring and `ask`. The texts of its findings are in
+    mdnum/verbs/audit.toml, under the codes of the findings. To add a check, add the file `checks/NAME.py`
+    with the class `NameCheck`.
 
     Args:
         timestep: time step of a run, internal time; None for a fraction of the fastest vibration's period.
         steps: number of time steps of a run; None for the check's default.
 
     Attributes:
-        order: checks run in ascending order; those that reveal most per call come first.
-        basic: whether the check has a brief form of a few dozen calls. All brief forms run before any full
-            check; together they give a first answer.
-        calls: largest number of calls, not counting the unused calls of earlier checks.
+        order: checks run in ascending order of this number; those that find most defects per call come first.
+        basic: whether the check has a brief form, which makes a few dozen calls. The brief forms of all
+            checks run before any full check, and give a first answer.
+        calls: largest number of calculator calls, not counting the unused calls of earlier checks.
         brief: whether this object is the brief form of the check.
-        needed_to: questions that have no answer without this check, "run" or "differentiate".
+        needed_to: questions ("run", "differentiate") that cannot be answered without this check.
         seed: seed of all random numbers of the check.
         structures: structures that show a finding, by name; names of a pair end in -before and -after.
     """
@@ -208,13 +207,13 @@ class AuditCheck:
         """Run the check.
 
         Raises:
-            TimeUp: the time was up before the check had any result.
+            TimeUp: the time limit was reached before the check had any result.
             CalculatorError: the calculator failed and the check cannot continue.
         """
         raise NotImplementedError
 
     def __call__(self, subject: CalculatorSubject, progress: Progress | None = None) -> CheckResult:
-        """Run the check, and add its name, its title and the elapsed time to the result."""
+        """Run the check; return its result together with its name, its title and the elapsed time."""
         began, meter = perf_counter(), subject.meter
         meter.most = meter.calls + self.calls + (0 if self.brief else meter.spare)
         try:
@@ -227,7 +226,7 @@ class AuditCheck:
 
 
 def _above_limits(result: CheckResult) -> Iterator[Observed]:
-    """Yield a finding for each number that exceeds its limit and that no finding of the check reports."""
+    """Yield a finding for each number that exceeds its limit, unless the check has already reported it."""
     codes = {one.code for one in result.findings}
     for name, (limit, reports) in result.limits.items():
         value = result.numbers.get(name)
@@ -238,14 +237,14 @@ def _above_limits(result: CheckResult) -> Iterator[Observed]:
 
 @dataclass
 class Ways:
-    """Counts of test cases that a check examined, skipped, or could have examined."""
+    """Numbers of test cases that a check examined, skipped, or could have examined."""
 
     skipped: list[Skipped] = field(default_factory=list)
     asked: int = 0  # those on which the calculator failed included
     possible: int = 0
 
     def skip(self, what: str, why: str) -> None:
-        """Record what was skipped, and why."""
+        """Record a skipped test case, and the reason for skipping it."""
         self.skipped.append((what, why))
 
     def each(
@@ -264,17 +263,17 @@ class Ways:
         tolerant: bool = False,
         most: int | None = None,
     ) -> dict[int, T]:
-        """Call `ask` for each item and return the answers by index; items after the deadline are skipped.
+        """Call `ask` for each item and return results by item index; items after the deadline are skipped.
 
         Args:
             subject: calculator whose limits on calls and time apply.
-            name: returns the name of a skipped item.
+            name: function that returns the name of a skipped item.
             phase, unit: text for the progress report.
             spread: order the items so that a few answers cover the beginning, the middle and the end.
             required: raise `TimeUp` if no item could be examined.
-            failed: called when the calculator fails; without it the error is raised.
+            failed: function called when the calculator fails; if it is missing, the error is raised.
             tolerant: skip items on which the calculator fails.
-            most: largest number of items to examine; all items count as possible.
+            most: largest number of items to examine; all items count as possible test cases.
         """
         found: dict[int, T] = {}
         stride = 4 if spread else 1

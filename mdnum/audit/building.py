@@ -1,4 +1,4 @@
-"""Build a test structure for a calculator given without one, from elements it supports, within few calls."""
+"""Build a test structure, in a few calls, from elements that a calculator without own structure supports."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ _SAME = 1e-9  # of the energy: a second element that changes it by less is none 
 
 
 def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None) -> Atoms:
-    """Return a test structure for a calculator: the calculator's own, a crystal, or rigid water.
+    """Return a test structure for a calculator: the calculator's own structure, a crystal, or rigid water.
 
-    The crystal is that of an element that the calculator is meant for; half of its atoms are of a second
-    element if the calculator distinguishes the two. The lattice constant is at the calculator's own energy
-    minimum. The crystal is repeated until two cutoffs fit into the cell (at most 500 atoms, fewer for a slow
-    calculator), and its atoms are displaced slightly. `info["origin"]` describes the structure. If the
-    calculator fails on atoms without neighbors, a denser crystal is built: the failure is reported later and
+    The crystal consists of an element for which the calculator is intended; if the calculator distinguishes a
+    second element, half of the atoms are of that element. The lattice constant is at the energy minimum of
+    the calculator. The crystal is repeated until the cell is two cutoffs wide (at most 500 atoms, fewer for a
+    slow calculator), and its atoms are displaced slightly. `info["origin"]` describes the structure. If the
+    calculator fails on atoms without neighbors, a denser crystal is built; this failure is reported later and
     does not stop the audit.
 
     Args:
@@ -62,7 +62,7 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
             structure so far is returned.
 
     Raises:
-        InputError: the calculator supports no single element and no water; the failing water structure is
+        InputError: the calculator supports neither a single element nor water; the failing water structure is
             saved.
     """
     if loaded.atoms is not None:
@@ -92,13 +92,13 @@ class _Builder:
         self.likely = list(dict.fromkeys([*self.named, *_FIRST]))
 
     def about(self, atoms: Atoms) -> CalculatorSubject:
-        """Return the calculator together with a structure to evaluate."""
+        """Return an audit subject that consists of the calculator and the given structure."""
         subject = CalculatorSubject(self.name, lambda: self.calculator, atoms, kT=1.0)
         subject.meter = self.meter
         return subject
 
     def built(self) -> Atoms:
-        """Build and return the structure."""
+        """Build and return the test structure."""
         from ase.data import chemical_symbols
 
         others = [one for one in chemical_symbols[1:_LAST_ELEMENT] if one not in self.likely]
@@ -131,7 +131,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return the crystal of the first supported element; `paired` tests two atoms of an element first."""
+        """Return the crystal of the first supported element; `paired` first tests two atoms of an element."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():
@@ -141,7 +141,7 @@ class _Builder:
         return None
 
     def _mixed(self, made: Atoms) -> Atoms:
-        """Return the crystal with a second element, if the calculator distinguishes one from the first."""
+        """Return the crystal with a second element if the calculator distinguishes it, else unchanged."""
         from ase.data import atomic_numbers
 
         self.best, symbol = made, str(made.symbols[0])
@@ -185,7 +185,7 @@ class _Builder:
 
 
 def meant_for(calculator: Any, words: str) -> list[str]:
-    """Return the elements named by a calculator, its arguments, file or documentation, most likely first."""
+    """Return the elements named in a calculator, its arguments, file or documentation, most likely first."""
     from ase.data import atomic_names, atomic_numbers, chemical_symbols
 
     module = sys.modules.get(type(calculator).__module__)
@@ -207,7 +207,7 @@ def meant_for(calculator: Any, words: str) -> list[str]:
 
 
 def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]:
-    """Yield element symbols found in a value or its attributes; dictionary keys only if all are symbols."""
+    """Yield element symbols in a value or its attributes; dictionary keys count only if all are symbols."""
     from ase.data import chemical_symbols
 
     value = value.tolist() if hasattr(value, "tolist") else value
@@ -229,7 +229,7 @@ def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]
 
 
 def water(edge: int = 4) -> Atoms:
-    """Return rigid water on a cubic grid, in fixed random orientations; atoms in the order O, H, H."""
+    """Return rigid water molecules on a cubic grid, in fixed random orientations; atom order O, H, H."""
     from ase.calculators.tip3p import angleHOH, rOH
     from scipy.spatial.transform import Rotation
 
@@ -243,10 +243,10 @@ def water(edge: int = 4) -> Atoms:
 
 
 def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Return the processor time of an energy and force calculation in seconds, the smaller of two values.
+    """Return the processor time of an energy and force calculation, the smaller of two measurements, s.
 
-    The time of the calculator's child processes is included. Other programs are excluded, so the choice of
-    structure does not depend on the load of the machine.
+    The time of the calculator's child processes is included. The time of other programs is excluded, so that
+    the chosen structure does not depend on the load of the machine.
     """
 
     def clock() -> float:
@@ -264,9 +264,9 @@ def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """Estimate the cutoff of a pair interaction and the distance of its energy minimum (None if absent).
+    """Estimate the cutoff of a pair interaction, and the distance of minimum energy; None for a missing one.
 
-    If the calculator fails on atoms without neighbors, the cutoff is the distance where it starts to fail.
+    If the calculator fails on atoms without neighbors, the cutoff is the distance from which it fails.
     """
     curve, distances = pair.curve(subject), _DISTANCES.tolist()
     known: dict[float, tuple[float, float]] = {}
@@ -299,7 +299,7 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
 
 
 def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
-    """Return whether the atoms interact: a force is not zero, or the energy changes as they move."""
+    """Return whether the atoms interact: a force is not zero, or displacing the atoms changes the energy."""
     (energy, forces), moved = subject.both(atoms), atoms.copy()
     moved.rattle(_RATTLE * nearest_distance(atoms), seed=1)
     other = subject.try_both(moved)
@@ -338,7 +338,7 @@ def _tabulated(scale: float) -> str:
 
 
 def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, repeat: int = 2) -> Atoms:
-    """Return the crystal with its lattice scaled, repeated, and its atoms displaced slightly."""
+    """Scale the lattice of a unit cell, repeat the cell, displace the atoms slightly; return the crystal."""
     cell = modified(cell, cell=cell.cell.array * scale, scaled=True)
     atoms, nearest = cell.repeat(repeat), _least_distance(cell)
     atoms.rattle(_RATTLE * nearest, seed=0)
@@ -350,9 +350,9 @@ def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, r
 
 
 def _unit_cell(symbol: str, *others: str) -> tuple[Atoms, str]:
-    """Return a rectangular unit cell of the element (fcc, bcc or diamond; otherwise fcc of its size).
+    """Return a rectangular fcc, bcc or diamond unit cell of the element (fcc if its crystal is another).
 
-    If a second element is given, every second atom is of this element.
+    If a second element is given, every second atom is of that element.
     """
     from ase.build import bulk
     from ase.data import atomic_numbers, covalent_radii, reference_states
@@ -376,7 +376,7 @@ def _least_distance(cell: Atoms) -> float:
 def _least_energy(
     subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
 ) -> tuple[float, bool]:
-    """Find the lattice scale factor of least energy, from `start`, and whether a minimum exists."""
+    """Find the lattice scale factor of minimum energy, starting at `start`, and whether a minimum exists."""
 
     def energy(scale: float) -> float:
         try:
@@ -399,6 +399,6 @@ def _least_energy(
 
 
 def _small(cell: Atoms, scale: float) -> Atoms:
-    """Return a small crystal with its lattice scaled."""
+    """Return a small crystal whose lattice is scaled by a factor."""
     small = cell.repeat(max(int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))), 1))
     return modified(small, cell=small.cell.array * scale, scaled=True)

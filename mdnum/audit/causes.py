@@ -10,7 +10,7 @@ from mdnum.plain import beside
 
 @dataclass(frozen=True)
 class Cause:
-    """Known consequences, alternative causes and tests for the cause that one finding code reports."""
+    """Known consequences, alternative causes and tests of the cause that a finding code reports."""
 
     brings: tuple[str, ...] = ()  # codes of findings that it explains
     rivals: tuple[str, ...] = ()  # codes of other causes that show the same
@@ -42,19 +42,19 @@ _SEVERITIES = ("info", "warning", "error")
 
 
 def cause(code: str) -> Cause:
-    """Return the table row for a finding code; the row is empty for a code of another package."""
+    """Return the table row for a finding code; an empty row for codes defined by another package."""
     return CAUSES.get(code, Cause())
 
 
 def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
-    """Return the index of the finding under which each finding is listed (its own if listed separately).
+    """Return, for each finding, the index of the finding under which it is listed; its own index if separate.
 
-    A finding is listed under the deepest reported cause that explains it and is no less severe, or under the
-    first finding of the same code. A shared cause is likely but not proven: correct the upper finding, and
-    run the audit again.
+    A finding is listed under the reported cause that explains it and is at least as severe (the deepest such
+    cause), or under the first finding with the same code. A common cause is likely but not proven: correct
+    the upper finding, and repeat the audit.
 
     Args:
-        findings: code and severity of each, in the order in which they were found.
+        findings: code and severity of each finding, in the order in which the findings were made.
     """
     ranks = [_SEVERITIES.index(severity) for _, severity in findings]
     first: dict[str, int] = {}

@@ -21,7 +21,7 @@ def in_order(names: Sequence[str]) -> list[str]:
 
 
 def needed_to(question: str) -> set[str]:
-    """Return the checks that are required to answer a question ("run", "differentiate")."""
+    """Return the checks without which a question ("run" or "differentiate") cannot be answered."""
     return {name for name in CHECKS if question in CHECKS[name].needed_to}
 
 
@@ -45,12 +45,12 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
 
 
 def largely_unasked(result: CheckResult) -> bool:
-    """Return whether a check ran out of time before it had examined most of its cases."""
+    """Return whether a check reached its time limit before it had examined most of its test cases."""
     return result.asked < _NEARLY * result.possible
 
 
 def nothing_felt(results: Sequence[CheckResult]) -> bool:
-    """Return whether no atoms interact in the structure, which makes its results meaningless."""
+    """Return whether no atoms of the structure interact, so that the results of the audit are meaningless."""
     return any(result.numbers.get("nothing_felt") for result in results)
 
 
@@ -59,16 +59,16 @@ def _begun(results: Sequence[CheckResult]) -> set[str]:
 
 
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
-    """Return whether the audit has no verdict yet: no error was found, and a basic check has not run."""
+    """Return whether the audit has no verdict yet: no error was found, and a basic check is still to run."""
     begun, basic = _begun(results), {name for name in wanted if CHECKS[name].basic}
     return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
 
 
 def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
-    """Return text variants, by finding code, that depend on the results of several checks.
+    """Return the text variants, by finding code, that depend on the results of more than one check.
 
-    Incorrect forces that do no work around closed loops derive from another energy; forces that do work
-    derive from no energy.
+    If incorrect forces do no work around closed loops, they are the derivative of another energy; if they do
+    work, they are the derivative of no energy.
     """
     numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
     curl, forces = numbers.get("curl"), numbers.get("forces")

@@ -1,10 +1,10 @@
-"""Locate and measure jumps and kinks of a curve by scanning and zooming, down to neighboring doubles.
+"""Locate jumps and kinks of a curve to adjacent floating-point numbers by scanning and zooming; measure them.
 
-A curve is an energy and the force along one coordinate. Each value is predicted from the points on its left
-and, independently, from those on its right. Across a smooth stretch the mismatch of the two predictions falls
-with the fourth power of the spacing; across a kink the mismatch falls only with the first power, and across a
-jump not at all. The rate at which the mismatch falls on zooming therefore identifies the singularity,
-whatever the curve looks like elsewhere.
+A curve consists of an energy and the force along one coordinate. Each value is predicted from the points to
+its left and, independently, from the points to its right. Where the curve is smooth, the difference between
+the two predictions falls with the fourth power of the spacing. At a kink this difference falls only linearly,
+and at a jump it does not fall. The rate at which the difference falls on zooming in therefore identifies the
+kind of singularity, whatever the curve is like elsewhere.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ SMOOTH = 3  # order of a threshold at which neither energy, force nor curvature 
 
 
 class Curve:
-    """Energy and force along one coordinate, each point evaluated once.
+    """Energy and force along one coordinate; each point is evaluated only once.
 
     Args:
-        at: returns (energy, force = -dE/dx) at a coordinate.
+        at: function that returns (energy, force = -dE/dx) at a coordinate.
     """
 
     def __init__(self, at: Callable[[float], tuple[float, float]]):
@@ -58,12 +58,12 @@ class Curve:
         return self.known[x]
 
     def many(self, places: Sequence[float] | np.ndarray) -> Float[np.ndarray, "2 points"]:
-        """Return energies and forces at several points, as rows."""
+        """Return the energies (first row) and forces (second row) at several points."""
         return np.array([self(float(x)) for x in places]).T
 
 
 def bisect(question: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
-    """Find neighboring doubles between which a truth value changes; it must differ at low and high."""
+    """Find adjacent doubles between which a condition changes; its values at low and high must differ."""
     before = question(low)
     while True:
         middle = low + 0.5 * (high - low)
@@ -76,14 +76,14 @@ def bisect(question: Callable[[float], bool], low: float, high: float) -> tuple[
 
 
 def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
-    """Return the scan points of `find_jumps`."""
+    """Return the coordinates that `find_jumps` scans, at most `step` apart."""
     return np.linspace(low, high, max(int(np.ceil((high - low) / step)), 12) + 1)
 
 
 def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
-    """Estimate the rounding scatter of energy and force (columns), before low and after high (rows).
+    """Estimate the rounding noise of energy and force (columns) just below low and just above high (rows).
 
-    The largest estimate over several spacings is taken: a float32 calculator is constant over the smallest.
+    The largest estimate over several spacings is used: float32 values are constant over small spacings.
     """
     sides = []
     for start, sign in ((low, -1.0), (high, 1.0)):
@@ -99,7 +99,7 @@ def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndar
 
 
 def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> tuple[float, float]:
-    """Return the one-sided dF/dx at `start` and its error, for the spacing with the smallest error."""
+    """Return the one-sided derivative dF/dx at `start` and its error, for the spacing of smallest error."""
     best = (0.0, np.inf)
     for relative in _WIDTHS:
         width = max(abs(start), 1.0) * relative
@@ -114,7 +114,7 @@ def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> t
 
 
 def _bend(curve: Curve, start: float, sign: int, room: float) -> float:
-    """Estimate the magnitude of the force's second derivative on one side."""
+    """Estimate the magnitude of the second derivative of the force on one side of a coordinate."""
     width = min(1e-3 * max(abs(start), 1.0), room / 4)
     force = curve.many(start + sign * width * np.arange(3))[1]
     return abs(float(force[0] - 2 * force[1] + force[2])) / width**2
@@ -146,7 +146,7 @@ class Jump:
 
     @property
     def at(self) -> float:
-        """Coordinate of the jump."""
+        """Coordinate at which the curve or its derivative jumps."""
         return self.low if self.exact else 0.5 * (self.low + self.high)
 
 
@@ -159,22 +159,22 @@ def find_jumps(
     expected: Sequence[float] = (),
     calls: float = np.inf,
 ) -> tuple[list[Jump], int]:
-    """Find every jump of energy, force, curvature or third derivative that stands out of a scan.
+    """Find every jump of energy, force, curvature or third derivative that exceeds the scatter of a scan.
 
-    The detection limit depends on the curvature of the curve; for force steps, `smallest_steps` returns it.
-    At a spacing of 0.025 Å, 199 of 200 force steps of 1e-6 eV/Å at random places of five potentials are
-    found, and all larger ones; energy steps are found down to 3e-6 eV on a wall of ε = 1 eV, and to 1e-8 eV
-    on a soft one.
+    The smallest detectable jump depends on the curvature of the curve; `smallest_steps` returns it for the
+    force. At a spacing of 0.025 Å, 199 of 200 force steps of 1e-6 eV/Å at random distances in five potentials
+    are found, and all larger steps. Energy steps are found down to 3e-6 eV on a repulsive wall of ε = 1 eV,
+    and down to 1e-8 eV on a soft one.
 
     Args:
-        curve: must be defined slightly beyond both ends.
-        step: spacing of the scan. Two thresholds closer together than this may be taken for one.
-        most: largest number of places to zoom into, starting with the most prominent.
+        curve: energy and force, which must be defined slightly beyond both ends.
+        step: spacing of the scan. Two thresholds closer together than this spacing may be taken for one.
+        most: largest number of intervals to zoom into, starting with the most prominent.
         expected: coordinates of known jumps, which are left out.
-        calls: number of curve evaluations after which no further place is examined; the first always is.
+        calls: number of curve evaluations after which no further interval is examined; the first always is.
 
     Returns:
-        (jumps by coordinate, number of prominent places that were not examined).
+        (jumps in order of the coordinate, number of prominent intervals that were not examined).
     """
     suspects = [
         one
@@ -202,13 +202,13 @@ def find_jumps(
 def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
     """Measure the jumps between low and high, with bounds on the apparent jumps of a smooth curve.
 
-    Energy and force are taken at the last representable coordinates on either side (medians of four, so that
-    a single rounding error does not decide), the curvature from one-sided differences of the force.
+    Energy and force are medians of four values at the last representable coordinates on either side, which
+    excludes single rounding errors. The curvature is computed from one-sided differences of the force.
 
     Args:
-        room: usable length of the curve on either side, coordinate.
-        exact: whether low and high are neighboring doubles.
-        curved: whether the curvature is measured too; nan if not.
+        room: length, on either side, within which the curve may be evaluated.
+        exact: whether low and high are adjacent doubles.
+        curved: whether the curvature is measured too; if not, it is nan.
     """
     left, right = _close(curve, low, -np.inf), _close(curve, high, np.inf)
     values = np.median(right, axis=1) - np.median(left, axis=1)
@@ -231,10 +231,10 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
-    """Return the power with which the force vanishes toward the edge of its range; None where unclear.
+    """Return the power with which the force vanishes at the end of its range; None if no power is clear.
 
     Args:
-        edge: end of the interaction, approached from below; no other threshold lies within `room` of it.
+        edge: end of the interaction, approached from smaller distances; no other threshold is within `room`.
     """
     distances = room * 0.5 ** np.arange(2, 14)
     forces = np.abs(curve.many(edge - distances)[1])
@@ -252,14 +252,14 @@ def decay_power(curve: Curve, edge: float, room: float) -> float | None:
 def smallest_steps(
     curve: Curve, low: float, high: float, step: float
 ) -> tuple[Float[np.ndarray, "intervals"], Float[np.ndarray, "intervals"]]:
-    """Return the intervals scanned by `find_jumps` and the smallest force step detectable in each.
+    """Return the intervals scanned by `find_jumps`, and the smallest detectable force step in each interval.
 
     Returns:
-        (midpoints of the intervals that are compared with others, detection limit at each in eV/Å).
+        (midpoints of the intervals that are compared with neighbors, detection limit in each, eV/Å).
 
     Error:
-        all of 125 steps of this size, planted in five potentials, are found; half of the steps a third as
-        large.
+        all 125 steps of this size, added to five potentials, are found; of steps a third as large, half are
+        found.
     """
     places = grid(low, high, step)
     seen = _outliers(curve, places)[1]
@@ -270,11 +270,11 @@ def smallest_steps(
 def _outliers(
     curve: Curve, places: Float[np.ndarray, "points"]
 ) -> tuple[list[tuple[float, float, float]], Float[np.ndarray, "intervals"]]:
-    """Return the intervals with an unusually large mismatch of their two sides, and the detection limits.
+    """Return the intervals with unusually different predictions from both sides, and the detection limits.
 
     Returns:
-        (relative mismatch, left, right) of each outlier, the largest first; and the smallest detectable force
-        step of each interval: infinite near both ends, where there is nothing to compare with.
+        (relative difference, left, right) of each outlier, the largest first; and the smallest detectable
+        force step of each interval, infinite near both ends, where there are no intervals to compare with.
     """
     middle = places[len(places) // 2]
     noise = scatter(curve, middle, middle, places[-1] - places[0]).min(axis=0)
@@ -306,8 +306,8 @@ def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.nda
     """Mismatch across each interval: in energy, in force, and in energy change plus work of the force.
 
     The first two values are |prediction from the left minus prediction from the right| at the midpoint. The
-    third value is the energy change plus the work integral of the force (fifth power of the spacing where
-    smooth), which is far more sensitive to a jump of the energy alone.
+    third value falls with the fifth power of the spacing if the curve is smooth, and is much more sensitive
+    to a jump of the energy alone.
     """
     values = curve.many(places)
     windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
@@ -319,7 +319,7 @@ def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.nda
 
 
 def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
-    """Find the jumps between left and right, located to neighboring doubles if energy or force jumps."""
+    """Find the jumps between left and right; jumps of energy or force are located to adjacent doubles."""
     room = right - left
     left, right = left - 1.5 * room, right + 1.5 * room
     noise = np.maximum(scatter(curve, left, right, room).max(axis=0), 1e-300)
@@ -362,10 +362,10 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
 
 
 def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, float]:
-    """Bisect for the neighboring doubles between which a value jumps from its left to its right level.
+    """Bisect to the adjacent doubles between which energy or force jumps from its left to its right value.
 
     Args:
-        row: 0 for the energy (minus the work done on the way), 1 for the force.
+        row: 0 for the energy minus the work done since the left end, 1 for the force.
     """
     level = _level(curve, row, left, right)
     middle = 0.5 * (level(left) + level(right))
@@ -374,7 +374,7 @@ def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, fl
 
 
 def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float], float]:
-    """Return a function that is flat except for jumps: force minus a line, or energy minus the work."""
+    """Return a function that is constant except for jumps: force minus a line, or energy minus the work."""
     if row == 1:
         back = left - (right - left)
         slope_before = (curve(left)[1] - curve(back)[1]) / (left - back)
@@ -383,7 +383,7 @@ def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float
 
 
 def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
-    """Locate a kink of the force: the point where its continuations from both sides meet."""
+    """Locate a kink of the force: the intersection of its extrapolations from both sides."""
     width = min(room / 8, 1e-3)
     middle, reach = 0.5 * (left + right), max(0.5 * (right - left), width / 8)
     roots = np.roots(-_pieces(curve, middle, reach, width, 3))
@@ -396,16 +396,16 @@ def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
 
 
 def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int) -> np.ndarray:
-    """Difference of polynomials fitted to seven force values after and before a point."""
+    """Difference of the polynomials fitted to the force at seven points above and seven below a point."""
     steps = reach + width * np.arange(7)
     before = np.polyfit(-steps, curve.many(middle - steps)[1], degree)
     return np.polyfit(steps, curve.many(middle + steps)[1], degree) - before
 
 
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
-    """Locate a jump of the energy's third derivative, from the force's second derivative on both sides.
+    """Locate a jump of the energy's third derivative, using the force's second derivative on both sides.
 
-    Of several fit widths, the width with the best agreement between full and half width is used.
+    Of several fit widths, the width whose result agrees best with that of half the width is used.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

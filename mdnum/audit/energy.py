@@ -1,9 +1,9 @@
-"""Energy balance of a run: flips at thresholds, jumps elsewhere, work of the forces, drift.
+"""Energy balance of a run: jumps of the energy at thresholds and elsewhere, work of the forces, drift.
 
-The energy of every step is accounted for: ΔU plus the work of the forces along the straight line between two
-steps vanishes for a force that has this energy, whatever the integrator does. A remainder at a threshold is
-the energy jump of a flip; a remainder at another single point is due to a cap on neighbors or a selection of
-nearest neighbors; a distributed remainder means that the force is not the derivative of the energy.
+If the force is the derivative of the energy, ΔU plus the work of the forces along the straight line between
+two steps is zero for every integrator. A remainder at a threshold is the energy jump of a flip. A remainder
+at another single point is due to a limit on the number of neighbors or a selection of nearest neighbors. A
+distributed one means that the force is not the derivative of the energy.
 """
 
 from __future__ import annotations
@@ -51,29 +51,29 @@ class NveRun:
 
     @property
     def total(self) -> Float[np.ndarray, "steps"]:
-        """Total energy at every step, eV."""
+        """Total energy at every time step, eV."""
         return self.potential + self.kinetic
 
     @property
     def time(self) -> Float[np.ndarray, "steps"]:
-        """Internal time at every step."""
+        """Time at every step, in internal units."""
         return self.timestep * np.arange(len(self.potential))
 
     def at(self, positions: Float[np.ndarray, "atoms 3"]) -> Atoms:
-        """Return the structure with its atoms at other positions, without constraints."""
+        """Return the structure with the given positions and without constraints."""
         there = self.start.copy()
         there.set_constraint()
         there.positions = positions
         return there
 
     def way(self, step: int, share: float) -> Float[np.ndarray, "atoms 3"]:
-        """Return the positions at a fraction of the straight line between two time steps."""
+        """Return the positions at a given fraction of the straight line between two time steps."""
         return self.positions[step - 1] + share * (self.positions[step] - self.positions[step - 1])
 
 
 @dataclass(frozen=True)
 class RunCrossing:
-    """A pair of atoms that crossed a distance threshold between two time steps."""
+    """A pair of atoms whose distance crossed a threshold between two time steps."""
 
     step: int  # after it; the step before is one less
     # i, j, rank: the pair, and how many of its images inside are nearer
@@ -89,12 +89,12 @@ class RunCrossing:
 
     @property
     def sign(self) -> float:
-        """Direction of the crossing: 1 if the pair enters the threshold distance, -1 if it leaves."""
+        """Direction of the crossing: 1 if the distance falls below the threshold, -1 if it rises above."""
         return 1.0 if self.entered else -1.0
 
 
 def crossings(run: NveRun, thresholds: Sequence[PairThreshold]) -> list[RunCrossing]:
-    """Find all flips of a run at any number of thresholds, in the order in which they happen."""
+    """Find all flips of a run, for any number of distance thresholds, in order of time."""
     species, cell, found = set(run.start.get_chemical_symbols()), run.start.cell.array, []
     for threshold in (one for one in thresholds if set(one.species) <= species):
         radius, skin, reference = threshold.radius, 0.0, run.positions[0]
@@ -139,7 +139,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy and force along the straight line between two steps; `ends` uses the run's own end values."""
+    """Energy and force along the straight line between two steps; `ends` uses stored values at both ends."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:
@@ -155,20 +155,20 @@ def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = 
 def account(
     subject: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], smooth: int = 2
 ) -> tuple[list[float], float]:
-    """Compute the work of the forces along the straight line of a step, in pieces between its crossings.
+    """Compute the work of the forces along the straight line of a step, piecewise between its crossings.
 
     Args:
-        subject: a calculator object other than the run's, called three times per crossing and once more.
-        crossed: crossings of the step that ends with this number, by their fraction of the way.
-        smooth: threshold order from which crossings are ignored: 2, since Simpson's rule tolerates a kink in
-            the force's slope; or 1 if there are too many force kinks, symmetric about the middle.
+        subject: a calculator object separate from the run's; called three times per crossing, plus once.
+        crossed: crossings that happen in the step that ends with this number, ordered along the line.
+        smooth: crossings of thresholds of this order or higher are ignored: 2, since Simpson's rule tolerates
+            a kink in the force's slope; or 1 if there are too many force kinks, symmetric about the middle.
 
     Returns:
-        (jump of the energy at each crossing, 0 where it does not jump; change of the energy that neither a
-        jump nor the work of the forces explains), eV.
+        (jump of the energy at each crossing, 0 if there is none; energy change that neither the jumps nor the
+        work of the forces explain), eV.
 
     Error:
-        Simpson's rule over one step, fifth power of its length; the calculator's noise.
+        that of Simpson's rule over one step, fifth power of the step's length; the calculator's noise.
     """
     curve, left = along_step(subject, run, step, ends=True), 0.0
     jumps, rest = [], 0.0
@@ -189,7 +189,7 @@ def account(
 
 
 def _unexplained(curve: Curve, low: float, high: float) -> float:
-    """Energy change plus work of the force, by Simpson's rule; 0 if the force is the energy's derivative."""
+    """Energy change plus work of the force (Simpson's rule); 0 if the force is the energy's derivative."""
     if high <= low:
         return 0.0
     (before, first), (after, last) = curve(low), curve(high)
@@ -209,7 +209,7 @@ class HiddenJump:
 
 @dataclass(frozen=True)
 class HiddenJumps:
-    """Energy jumps found in those time steps of a run that have an unexplained energy change."""
+    """Energy jumps found in the time steps of a run that have an unexplained energy change."""
 
     jumps: tuple[HiddenJump, ...] = ()  # found in the steps that were searched
     steps: Mapping[int, float] = field(default_factory=dict)  # those, with what they left unexplained, eV
@@ -217,7 +217,7 @@ class HiddenJumps:
 
     @property
     def share(self) -> float:
-        """Fraction of the unexplained energy of the searched steps that is due to jumps."""
+        """Fraction of the unexplained energy change of the searched steps that is due to jumps."""
         whole = sum(abs(rest) for rest in self.steps.values())
         left = sum(abs(rest - self.brought(step)) for step, rest in self.steps.items())
         return max(1.0 - left / whole, 0.0) if whole else 0.0
@@ -227,7 +227,7 @@ class HiddenJumps:
         return sum(jump.energy for jump in self.jumps if jump.step == step)
 
     def energies(self, rest: Steps) -> Steps:
-        """Energy change by hidden jumps at each step, eV; estimated from `share` for steps not searched."""
+        """Energy change by hidden jumps at each step, eV; estimated from `share` at steps not searched."""
         found = np.zeros(len(rest))
         for step in self.candidates:
             found[step] = self.brought(step) if step in self.steps else self.share * rest[step]
@@ -235,12 +235,12 @@ class HiddenJumps:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Most frequent k whose k-th and (k+1)-th neighbors swap at a jump, and the number of jumps."""
+        """Most frequent k for which neighbors k, k+1 of an atom swap at a jump, and the number of jumps."""
         return _most_frequent(k for jump in self.jumps for k in {k for _, k in jump.ties})
 
     @property
     def radius(self) -> tuple[float, int]:
-        """Most frequent pair threshold that a pair passes at a jump, and the number of these jumps."""
+        """Pair threshold most frequently crossed at a jump, and the number of such jumps."""
         return _most_frequent(jump.radius for jump in self.jumps if jump.radius is not None)
 
 
@@ -255,12 +255,12 @@ def hidden_jumps(
     crossed: Mapping[int, Sequence[RunCrossing]],
     noise: float,
 ) -> HiddenJumps:
-    """Search the steps with the largest unexplained energy for jumps at single points.
+    """Search the steps with the largest unexplained energy change for jumps of the energy at single points.
 
     Args:
-        rest: unexplained energy of each step; nan where unknown.
-        crossed: flips by step; where the energy of two atoms jumps, a jump is not counted again.
-        noise: noise level of an energy, eV.
+        rest: unexplained energy change of each step, eV; nan where unknown.
+        crossed: flips by step; a jump at the crossing of an energy-jump threshold is not counted again.
+        noise: noise level of the energy, eV.
     """
     limit = max(noise, _SMALL * probe.kT)
     large = np.abs(np.nan_to_num(rest)) > limit
@@ -279,7 +279,7 @@ def hidden_jumps(
 def _within(
     probe: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], limit: float
 ) -> list[HiddenJump]:
-    """Find the energy jumps within one time step."""
+    """Find the jumps of the energy within one time step."""
     curve, parts = along_step(probe, run, step), [(0.0, 1.0)]
     first = _unexplained(curve, 0.0, 1.0)
     for level in range(_LEVELS):
@@ -314,25 +314,25 @@ class EnergyBalance:
 
     @property
     def elsewhere(self) -> Steps:
-        """Energy change by jumps away from pair thresholds, at each step, eV."""
+        """Energy change at each step due to jumps away from pair thresholds, eV."""
         return self.hidden.energies(self.rest)
 
     @property
     def filled(self) -> Steps:
-        """Unexplained energy change without hidden jumps at each step, eV; the mean at steps not measured."""
+        """Unexplained energy change at each step without hidden jumps, eV; the mean at steps not measured."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 
     @property
     def means(self) -> dict[PairThreshold, float]:
-        """Mean energy jump of a pair that enters the cutoff, for each threshold, eV."""
+        """Mean energy jump when a pair comes closer than a threshold distance, for each threshold, eV."""
         found: dict[PairThreshold, list[float]] = {}
         for place, jump in self.measured.items():
             found.setdefault(self.crossed[place].threshold, []).append(self.crossed[place].sign * jump)
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
 
     def by_means(self, crossed: Sequence[RunCrossing], steps: int) -> Steps:
-        """Estimate the energy change by another run's flips at each step from this run's mean jumps, eV."""
+        """Estimate the energy change at each step due to the flips of another run from the mean jumps, eV."""
         jumps, means = np.zeros(steps), self.means
         for one in crossed:
             jumps[one.step] += one.sign * means.get(one.threshold, 0.0)
@@ -349,9 +349,9 @@ def balance(
     """Compute the energy balance of a run.
 
     Args:
-        probe: a calculator object other than the run's.
-        rng: selects the steps at which flips are measured, if there are too many.
-        noise: noise level of an energy, eV.
+        probe: a calculator object separate from that of the run.
+        rng: random generator that selects the steps at which flips are measured, if there are too many flips.
+        noise: noise level of the energy, eV.
     """
     crossed = crossings(run, limits)
     by_step: dict[int, list[int]] = {}
@@ -398,7 +398,7 @@ class Drift:
 
     @property
     def significant(self) -> bool:
-        """Whether the drift differs from zero by more than four standard errors."""
+        """True if the drift differs from zero by more than four standard errors."""
         return abs(self.slope) > 4 * self.error
 
     def times(self, factor: float) -> Drift:
@@ -406,15 +406,15 @@ class Drift:
         return Drift(self.slope * factor, abs(factor) * self.error)
 
     def minus(self, other: Drift) -> Drift:
-        """Return the difference of two statistically independent drifts."""
+        """Return the difference between two statistically independent drifts."""
         return Drift(self.slope - other.slope, float(np.hypot(self.error, other.error)))
 
 
 def drift(time: Steps, values: Steps) -> Drift:
-    """Return the slope of a straight line through block means, with its standard error.
+    """Return the slope of a straight line fitted to block means, with its standard error.
 
-    Blocks are longer than the correlation time, so their means scatter independently if the run is long
-    enough; values at neighboring steps are correlated. At least 16 values are required.
+    Values at neighboring steps are correlated. Blocks are longer than the correlation time, so the block
+    means are independent if the run is long enough. At least 16 values are required.
     """
     blocks = np.array_split(np.arange(len(values)), _BLOCKS)
     x, y = ([float(row[block].mean()) for block in blocks] for row in (time, values))
@@ -425,11 +425,11 @@ def drift(time: Steps, values: Steps) -> Drift:
 def wandering(time: Steps, increments: Steps) -> Drift:
     """Return the drift of a quantity that changes by uncorrelated increments, such as energy jumps.
 
-    The residual of a straight line through a random walk is itself a random walk, so the error is taken from
-    the sums over blocks instead.
+    The deviation of a random walk from a fitted line is itself a random walk, so the standard error is
+    computed from the sums over blocks instead.
 
     Args:
-        increments: at least 16, each before its time.
+        increments: at least 16, each of the interval that ends at its time.
     """
     sums = [float(np.sum(block)) for block in np.array_split(increments, _BLOCKS)]
     whole = float(time[-1] - time[0])
@@ -438,10 +438,10 @@ def wandering(time: Steps, increments: Steps) -> Drift:
 
 
 def ratio(time: Steps, total: Steps, kinetic: Steps) -> float:
-    """Return the energy drift over the run, divided by the standard deviation of the kinetic energy.
+    """Return the energy drift over the whole run, divided by the standard deviation of the kinetic energy.
 
     Source:
-        the energy conservation score of the mlipaudit suite; meV/atom/ps is what lambench reports.
+        the energy conservation score of the mlipaudit suite; lambench reports meV/atom/ps instead.
     """
     slope = float(np.polyfit(time - time[0], total - total[0], 1)[0])
     scatter = float(np.std(kinetic))

@@ -1,7 +1,7 @@
-"""Check the smoothness of a user's pair function between close contact and cutoff, from its values alone.
+"""Check how smooth a user's pair function is between close contact and cutoff, using only its values.
 
 A run records the flips at its cutoff. If the pair function itself has a discontinuity, for example where two
-pieces do not join, no flip is recorded, and no derivative through the run includes the discontinuity.
+pieces do not join, a run records no flip there, and no derivative of the run includes the discontinuity.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
         the range count as one. `single`: whether a function rounds to float32 internally.
 
     Error:
-        a force step of 1e-6 of its scale is found, and a curvature step of 1e-4, if no other discontinuity is
-        within a 240th of the range.
+        a force step of 1e-6 of the force scale and a curvature step of 1e-4 of its scale are found, if no
+        other discontinuity is within 1/240 of the range.
     """
     if not simulation.pairwise:
         return None
@@ -83,7 +83,7 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
 
 
 def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
-    """Return a function for the energy and force of a pair, from its type's parameters and the distance."""
+    """Return a function of pair-type parameters and distance that computes the energy and force of a pair."""
 
     @jax.jit
     def evaluate(own, r):
@@ -97,7 +97,7 @@ def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
 
 
 def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
-    """Return a function for the cut energy and its first derivatives, evaluated just inside each distance."""
+    """Return a function that computes the cut energy and its first derivatives just below each distance."""
 
     @jax.jit
     def evaluate(own, r_cut, r_onset, r):
@@ -116,7 +116,7 @@ def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
 
 
 def _order(derivatives: np.ndarray) -> int:
-    """Return the number of energy derivatives that do not jump at the last distance."""
+    """Return the number of derivatives of the energy that are continuous at the last distance."""
     for order, row in enumerate(derivatives):
         usual = float(np.median(np.abs(row[np.isfinite(row)]))) if np.isfinite(row).any() else 0.0
         if not abs(row[-1]) <= _NOTHING[min(order, 1)] * usual:
@@ -125,7 +125,7 @@ def _order(derivatives: np.ndarray) -> int:
 
 
 def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float) -> list[dict[str, Any]]:
-    """Find the discontinuities and other defects of a pair curve between two distances, one row each."""
+    """Return the discontinuities and other defects of a pair curve between two distances, one per row."""
     step = (r_cut - low) / _INTERVALS
     curve, high = Curve(at), r_cut * (1 + _BEYOND)
     grid = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
@@ -172,7 +172,7 @@ def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float
 
 
 def _share(four: np.ndarray, width: float) -> np.ndarray:
-    """Relative difference between energy change and work of the force, by cubics through four points."""
+    """Relative difference between energy change and work of the force, from cubics through four points."""
     u, f = np.moveaxis(four, -1, 1)
     with np.errstate(invalid="ignore"):
         change, work = u[2] - u[1], (13 * (f[1] + f[2]) - f[0] - f[3]) * width / 24
@@ -180,7 +180,7 @@ def _share(four: np.ndarray, width: float) -> np.ndarray:
 
 
 def _poles(curve: Curve, grid: np.ndarray, force: np.ndarray) -> list[float]:
-    """Return the distances at which the force diverges on zooming in."""
+    """Return the distances at which the force diverges: it grows at every zoom."""
     inner = force[1:-1]
     peaks = 1 + np.flatnonzero((inner >= force[:-2]) & (inner >= force[2:]) & (inner > 0))
     found, usual = [], np.median(force[np.isfinite(force)])

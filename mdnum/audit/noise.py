@@ -1,4 +1,4 @@
-"""Measure the noise of a calculator's energies and forces, and the number of digits in these numbers."""
+"""Measure the numerical noise of a calculator's energies and forces, and the digits these numbers carry."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _FORMATS = ((8, "bfloat16"), (_HALF, "half precision"), (24, "single precision")
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """Noise level of energies and forces: differences of this size do not indicate an error."""
+    """Noise level of energies and forces: smaller differences do not indicate an error."""
 
     energy: float  # standard deviation, eV
     force: float  # standard deviation of a component, of the atom that scatters most, eV/Å
@@ -68,7 +68,7 @@ class NoiseFloor:
     freedom: float = math.inf  # independent values that the standard deviations were estimated from
 
     def louder(self, other: NoiseFloor) -> NoiseFloor:
-        """Return the larger noise level for each component, with the smaller number of degrees of freedom."""
+        """Return the larger noise of each quantity, and the smaller number of degrees of freedom."""
         return NoiseFloor(
             max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical),
             min(self.freedom, other.freedom),
@@ -76,10 +76,10 @@ class NoiseFloor:
 
     @property
     def allowed(self) -> NoiseFloor:
-        """Largest allowed difference of energies and forces; every comparison with noise uses these values.
+        """Largest allowed difference of energies and of forces, used in all comparisons limited by noise.
 
-        A standard deviation estimated from few values may be far too small by chance; the limit uses
-        Student's t distribution to account for this.
+        A standard deviation estimated from few values may be far too small by chance, so the limit is
+        computed with Student's t distribution.
         """
         student = math.sqrt(2) * float(-stdtrit(min(self.freedom, 1e9), _BY_CHANCE / 2))
         return replace(self, **{
@@ -90,7 +90,7 @@ class NoiseFloor:
 def along_a_line(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, points: int = _POINTS
 ) -> NoiseFloor:
-    """Estimate noise from high-order differences at equally spaced points, which cancel smooth functions.
+    """Estimate the noise from high-order differences at equally spaced points, where smooth functions cancel.
 
     Source:
         J. J. Moré and S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33, 1292 (2011).
@@ -117,7 +117,7 @@ def along_a_line(
 
 @dataclass(frozen=True)
 class Staircase:
-    """Size of discrete steps in energies and forces along a line."""
+    """Size of the discrete steps in energies and forces along a line in configuration space."""
 
     energy: float  # the size of a step, eV; 0 where there are none
     force: float  # of a force component, eV/Å
@@ -128,10 +128,10 @@ class Staircase:
 
 
 def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
-    """Detect steps in energies and forces: values that stay the same to the last bit and then change.
+    """Detect discrete steps in energies and forces: values that stay constant to the last bit, then change.
 
-    In single or double precision, any smooth value changes within 1e-4 Å. Points at which energy and all
-    forces are unchanged are ignored, since a cached answer looks the same.
+    In single or double precision, every smooth function changes within 1e-4 Å. Points at which the energy and
+    all forces are unchanged are ignored, since a cached result looks the same.
     """
     key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
     if key in subject.known:
@@ -165,7 +165,7 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
 
 
 def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
-    """Return the noise due to discrete steps and to the number of digits of energies and forces."""
+    """Return the noise caused by discrete steps and by the limited digits of energies and forces."""
     stairs = steps(subject, atoms)
     energies = stairs.energies
     grain = max(stairs.energy, digits(energies).grain(energies), _quantum(energies))
@@ -173,7 +173,7 @@ def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
 
 
 def _quantum(values: Float[np.ndarray, "points"]) -> float:
-    """Return a common divisor of all second differences, larger than rounding, or 0."""
+    """Return a divisor common to all second differences that exceed rounding; 0 if there is none."""
     sizes = np.abs(np.diff(values, n=2))
     sizes = sizes[sizes > np.spacing(largest(values)) / _ALIKE]
     for part in (1, 2, 3) if sizes.size else ():
@@ -184,7 +184,7 @@ def _quantum(values: Float[np.ndarray, "points"]) -> float:
 
 
 def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
-    """Standard deviation of the noise in each column, the median over difference orders 4, 5 and 6."""
+    """Standard deviation of the noise in each column: the median over differences of orders 4, 5 and 6."""
     found = []
     for order in (4, 5, 6):
         weight = math.factorial(order) ** 2 / math.factorial(2 * order)
@@ -195,11 +195,11 @@ def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "c
 def order_change(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, rng: np.random.Generator
 ) -> tuple[float, NoiseFloor]:
-    """Largest energy change on reordering the atoms, eV, and the noise floor if rounding explains it.
+    """Largest energy change when the atoms are reordered, eV, and the noise level if rounding explains it.
 
-    The noise floor is 0 if rounding does not explain the energy change, or if no change exceeds the noise
-    along a line. The rounding error of a sum varies randomly with its terms, while terms that are missing in
-    another order change smoothly along a line.
+    The noise level is 0 if rounding does not explain the energy change, or if no change exceeds the noise
+    along a line. The rounding error of a sum varies randomly along a line; the change varies smoothly if
+    terms are missing for another atom order.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
@@ -235,7 +235,7 @@ def order_change(
 
 
 def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
-    """Return the noise along a line, combined with the rounding noise from reordering the atoms."""
+    """Return the larger of the noise along a line and the rounding noise from reordering the atoms."""
     noise = along_a_line(subject, atoms, rng)
     return noise.louder(order_change(subject, atoms, noise, rng)[1])
 
@@ -243,7 +243,7 @@ def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator)
 def in_order(
     subject: CalculatorSubject, atoms: Atoms, order: Int[np.ndarray, "atoms"]
 ) -> tuple[float, Forces]:
-    """Compute energy and forces with the atoms reordered; the forces are returned in the original order."""
+    """Compute energy and forces for reordered atoms; the forces are returned in the original order."""
     there = atoms[order]
     assert isinstance(there, Atoms)
     energy, forces = subject.both(there)
@@ -253,7 +253,7 @@ def in_order(
 
 
 def _odd_one(values: Float[np.ndarray, "points"]) -> int:
-    """Return the index of the point without which the others are closest to a parabola."""
+    """Return the index of the point whose removal leaves the other points closest to a parabola."""
     at = np.arange(len(values)) - len(values) // 2
     # of values that are all large, what they have in common has no digits to spare
     values = values - np.median(values)
@@ -267,10 +267,10 @@ def _odd_one(values: Float[np.ndarray, "points"]) -> int:
 def under_jitter(
     subject: CalculatorSubject, atoms: Atoms, size: float, rng: np.random.Generator
 ) -> NoiseFloor:
-    """Largest change of energy and of a force component under random displacements of up to `size` Å.
+    """Largest change of the energy and of a force component under random displacements up to `size` Å.
 
-    Rounding the coordinates of a periodic image or of a rotated structure displaces atoms by an ulp of the
-    largest coordinate.
+    Rounding the coordinates of a periodic image or of a rotated structure displaces atoms by up to one unit
+    in the last place of the largest coordinate.
     """
     base, worst = subject.both(atoms), NoiseFloor(0.0, 0.0)
     for _ in range(_DRAWS):
@@ -287,15 +287,15 @@ def under_jitter(
 def settled(
     subject: CalculatorSubject, rng: np.random.Generator, at_least: int = FEW, brief: bool = False
 ) -> tuple[Atoms, NoiseFloor]:
-    """Return the structure with its atoms displaced slightly, away from any threshold, and its noise level.
+    """Return a slightly displaced structure without pairs at a threshold distance, and its noise level.
 
-    In a perfect crystal a whole neighbor shell can lie exactly on a cutoff, which would disturb checks that
-    are not about thresholds. An energy step within the line appears as noise, so the displacement with the
-    least noise of several random ones is used.
+    In a perfect crystal a whole neighbor shell can lie exactly at a cutoff, which would disturb checks that
+    do not concern thresholds. An energy step along the sampled line would appear as noise, so the
+    displacement with the least noise of several random displacements is used.
 
     Args:
         at_least: minimum number of atoms; a smaller periodic cell is repeated.
-        brief: use the first displacement, and skip the test of other atom orders.
+        brief: use the first random displacement, and skip the test of other atom orders.
     """
     given = roomy(subject.atoms, at_least)
     # several checks ask with the same seed: the answer to the first is known
@@ -340,13 +340,13 @@ def roomy(atoms: Atoms, at_least: int) -> Atoms:
 
 
 def direction(atoms: int, rng: np.random.Generator) -> Float[np.ndarray, "atoms 3"]:
-    """Return a random displacement of all atoms, with largest length 1."""
+    """Return random displacements of all atoms, scaled so that the longest has length 1."""
     drawn = rng.standard_normal((atoms, 3))
     return drawn / np.max(np.linalg.norm(drawn, axis=1))
 
 
 def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
-    """Return a copy of a structure with every atom displaced, Å."""
+    """Return a copy of a structure with every atom displaced by the given vectors, Å."""
     there = atoms.copy()
     there.positions += by
     return there
@@ -354,28 +354,28 @@ def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
 
 @dataclass(frozen=True)
 class Digits:
-    """Number of decimals and of significand bits that a set of numbers uses."""
+    """Number of decimals and of significand bits used by a set of numbers."""
 
     decimals: int | None  # they are rounded to; None where to none
     bits: int  # of their significands, at most; 53 for a double that is used in full
 
     @property
     def quantum(self) -> float:
-        """Spacing of numbers rounded to a fixed number of decimals; 0 for other numbers."""
+        """Spacing between numbers rounded to a fixed number of decimals; 0 for unrounded numbers."""
         return 0.0 if self.decimals is None else 10.0**-self.decimals
 
     def grain(self, values: np.ndarray) -> float:
-        """Return the spacing of numbers with these digits at the largest of some values."""
+        """Return the spacing, at the largest of the given values, between numbers with these digits."""
         return max(self.quantum, 2.0**-self.bits * largest(values))
 
     @property
     def format(self) -> str | None:
-        """Name of the narrow floating-point format into which the bits fit; None if there is none."""
+        """Name of the narrowest floating-point format that holds the bits; None if there is none."""
         return next((name for most, name in _FORMATS if self.bits <= most), None)
 
 
 def digits(values: np.ndarray) -> Digits:
-    """Return the number of decimals and bits that values use; full precision if too few are distinct."""
+    """Return the number of decimals and bits used by values; full precision if few values are distinct."""
     found = np.unique(np.asarray(values, dtype=np.float64))
     found = found[np.isfinite(found) & (found != 0.0)]
     if len(found) < _FEWEST:

@@ -1,4 +1,4 @@
-"""Detect errors tied to a position in the list of atoms: the first, the last, every eighth."""
+"""Detect errors tied to an index in the list of atoms: the first index, the last, or every eighth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PLACES, _CANDIDATES = 48, 4  # places that are tried, and of them for an ordina
 
 @dataclass(frozen=True)
 class WrongPlaces:
-    """Positions in the list of atoms at which energy or forces are wrong, whichever atom is there."""
+    """Indices in the list of atoms at which energy or forces are wrong, whichever atom has this index."""
 
     places: tuple[int, ...]
     count: int  # of atoms
@@ -27,28 +27,28 @@ class WrongPlaces:
 
     @property
     def pattern(self) -> str:
-        """Pattern of the wrong list positions: "first", "last", "every" (every nth) or "some"."""
+        """Pattern of the wrong atom indices: "first", "last", "every" (every nth) or "some"."""
         if len(self.places) == 1:
             return {0: "first", self.count - 1: "last"}.get(self.places[0], "some")
         return "every" if len(set(np.diff(self.places).tolist())) == 1 else "some"
 
     @property
     def values(self) -> dict[str, Any]:
-        """Values for the sentences of a finding about wrong positions in the list of atoms."""
+        """Values inserted into the text of a finding about wrong indices in the list of atoms."""
         shown = ", ".join(map(str, self.places[:8])) + (", …" if len(self.places) > 8 else "")
         every = int(np.diff(self.places)[0]) if self.pattern == "every" else 0
         return {"places": shown, "every": every, "wrong_places": len(self.places), "count": self.count}
 
 
 def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) -> WrongPlaces | None:
-    """Find wrong list positions by exchanging each atom with one of its species at a correct position.
+    """Find atom indices with wrong results by exchanging each atom with one of its species at a correct one.
 
-    Exchanging two atoms between two correct list positions changes nothing. An error tied to a list position
-    appears there for any order of the atoms; an error that depends on the whole order, such as dropped
-    neighbors, appears nearly everywhere, or at other positions for another order.
+    Exchanging two identical atoms between two correct indices changes nothing. An error tied to an index
+    appears at this index for any order of the atoms. An error that depends on the whole order, such as
+    neglected neighbors, appears at nearly all indices, or at other indices for another order.
 
     Returns:
-        None if no entry of the list deviates by more than is allowed, or if nearly all entries do.
+        None if the deviation is below the allowed limit at every index, or above it at nearly every index.
     """
     key = "places", atoms.positions.tobytes(), atoms.numbers.tobytes()
     if key not in subject.known:
@@ -75,10 +75,10 @@ def _wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor)
 def _at_places(
     subject: CalculatorSubject, atoms: Atoms, order: np.ndarray, places: Sequence[int], allowed: NoiseFloor
 ) -> dict[int, tuple[bool, bool]]:
-    """Test whether energy and forces change when an atom is exchanged with one at a correct position.
+    """Test whether energy and forces change when an atom is exchanged with one at a correct index.
 
     Returns:
-        for each tested position; an empty dict if most positions of a species are wrong.
+        for each tested index, whether energy and forces change; empty if most indices of a species are wrong.
     """
     numbers, found = atoms.numbers[order], {}
     base = in_order(subject.fresh(), atoms, order)

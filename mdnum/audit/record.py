@@ -1,4 +1,4 @@
-"""Load a calculator by name, store an audit, and write a script that reproduces its findings."""
+"""Load a calculator by name, save an audit to a folder, and write a script that reproduces its findings."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ STRUCTURES = "structures"  # where structures are kept that show a finding
 
 
 def load_calculator(words: str) -> LoadedCalculator:
-    """Find the named calculator, and construct it once so that errors appear immediately.
+    """Find the named calculator, and construct an instance once so that errors appear immediately.
 
-    A file is executed again for each calculator object, so that no two objects share a buffer.
+    A Python file is executed again for each calculator object, so that no two objects share an array.
 
     Args:
         words: `package.module:Class(argument=value)` with literals as arguments; a Python file in which
@@ -42,7 +42,7 @@ def load_calculator(words: str) -> LoadedCalculator:
 
     Raises:
         InputError: the name was not found, an argument is not a literal, or the constructor failed; the
-            message gives the correct form.
+            message shows the correct form.
     """
     text = words.strip()
     if not text:
@@ -111,7 +111,7 @@ def _of_system(text: str) -> LoadedCalculator:
 
 @dataclass
 class AuditState:
-    """State of an audit that may be unfinished."""
+    """State of an audit, finished or unfinished."""
 
     name: str  # of the calculator
     named: bool  # whether it was named in words, and is found again by them
@@ -134,18 +134,18 @@ class AuditState:
 
     @property
     def left(self) -> list[str]:
-        """Names of the checks that are not finished."""
+        """Names of the checks that have not finished."""
         done = {result.name for result in self.results}
         return [name for name in self.checks if name not in done]
 
     @property
     def shown(self) -> list[CheckResult]:
-        """All results so far: finished checks, brief forms, and checks that were cut short."""
+        """All results so far: of finished checks, of brief forms, and of interrupted checks."""
         return [*self.results, *(self.cut[name] for name in self.left if name in self.cut)]
 
     @property
     def atoms(self) -> Atoms:
-        """Structure for which the calculator is audited."""
+        """Structure on which the calculator is audited."""
         atoms: Any = decode(self.structure)
         expect(isinstance(atoms, Atoms) and len(atoms), "no structure")
         expect(np.isfinite(atoms.positions).all() and np.isfinite(atoms.cell.array).all(), "no coordinates")
@@ -156,7 +156,7 @@ def kept(folder: RunFolder) -> AuditState:
     """Load the audit stored in a folder.
 
     Raises:
-        FolderError: answers.json does not hold an audit.
+        FolderError: answers.json does not contain an audit.
     """
     if not (folder.path / NAME).exists():
         raise FolderError("the folder holds no audit", remedy="Start a new audit", where=str(folder.path))
@@ -172,7 +172,7 @@ def kept(folder: RunFolder) -> AuditState:
 
 
 def encoded(atoms: Atoms) -> str:
-    """Encode a structure as JSON, exact to the last bit; `info` is reduced to text and numbers."""
+    """Encode a structure as JSON without rounding; in `info`, only text and numbers are kept."""
     copy = atoms.copy()
     copy.info = {key: value for key, value in atoms.info.items() if isinstance(value, str | int | float)}
     copy.set_constraint()
@@ -180,11 +180,11 @@ def encoded(atoms: Atoms) -> str:
 
 
 def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
-    """Return a program that shows, with ASE alone, different energies or forces of equivalent structures.
+    """Return a script that uses ASE alone to show that equivalent structures differ in energy or forces.
 
     Args:
         words: the calculator as the user named it.
-        pairs: names of structures without "-before" and "-after".
+        pairs: names of pairs of structures, without the endings "-before" and "-after".
     """
     return _SCRIPT.format(
         making="\n".join(_making(words)), pairs=list(pairs), folder=STRUCTURES, energy=units.energy,
@@ -193,7 +193,7 @@ def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
 
 
 def _making(words: str) -> list[str]:
-    """Return the source lines that define make()."""
+    """Return the source lines that define the function make(), which creates the calculator."""
     spot = place(words)
     head = ["", "", "def make():"]
     if spot is None:

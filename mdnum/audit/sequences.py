@@ -1,4 +1,4 @@
-"""Sequences of structures for one calculator object, to reveal errors of the object's neighbor list."""
+"""Sequences of structures for one calculator object, to reveal errors of the neighbor list it keeps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked abou
 
 
 class SequenceStep(NamedTuple):
-    """A structure in a sequence, how it differs from the previous one, and whether energies are compared."""
+    """A structure in a sequence, its difference from the previous one, and whether energies are compared."""
 
     what: str
     atoms: Atoms
@@ -29,7 +29,7 @@ class SequenceStep(NamedTuple):
 
 
 def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[SequenceStep]]:
-    """Return all nonempty sequences that start from a structure, by name."""
+    """Return all nonempty sequences that can be made from a structure, by name."""
     sequences = {
         "sizes": _sizes(atoms, rng), "a slow drift": _slow_drift(atoms, rng),
         "two atoms head on": _head_on(atoms), "strain": _strain(atoms), "wrapping": _wrapping(atoms, rng),
@@ -39,7 +39,7 @@ def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[Sequ
 
 
 def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures with more or fewer atoms, more or fewer neighbors, other species and periodicity."""
+    """Yield structures with more or fewer atoms or neighbors, and with other species and periodicity."""
     yield "the structure", atoms
     if len(atoms) <= 64 and atoms.pbc.any():
         yield "the structure grew to its supercell", atoms.repeat(np.where(atoms.pbc, 2, 1))
@@ -67,7 +67,7 @@ def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]
 
 
 def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures in which every atom moves slightly in its own direction, until a skin is exceeded."""
+    """Yield structures in which all atoms move slightly in different directions, until they exceed a skin."""
     heading = rng.standard_normal((len(atoms), 3))
     heading /= np.linalg.norm(heading, axis=1)[:, None]
     yield "the structure", atoms
@@ -78,7 +78,7 @@ def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, A
 
 
 def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures in which one atom, then two, approach another, to test the half-skin criterion."""
+    """Yield structures in which one or two atoms approach another atom, to test the half-skin criterion."""
     if len(atoms) < 2:
         return
     distances = atoms.get_distances(0, range(1, len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
@@ -96,7 +96,7 @@ def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
 
 
 def _strain(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures whose cell is strained, with and without scaling the atoms."""
+    """Yield structures with a strained cell, with and without scaled atom positions."""
     if not atoms.pbc.any():
         return
     cell = atoms.cell.array
@@ -131,7 +131,7 @@ def _scaled(atoms: Atoms, factor: float) -> Atoms:
 
 
 def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
-    """Yield named sequences in which two particles come within the cutoff; each uses a new calculator object.
+    """Yield named sequences in which two particles come within the cutoff, each for a new calculator object.
 
     Args:
         radius: cutoff distance, beyond which the particles do not interact, Å.

@@ -1,4 +1,4 @@
-"""Structures used by an audit: a structure from a file, and two particles on a line."""
+"""Structures used by an audit: a structure read from a file, or two particles on a line."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _NEAREST = 0.3  # distances are walked from the first
 def read_structure(words: str | Path) -> Atoms:
     """Read a structure from any file that ASE reads; `file@5` is the sixth structure, the default the last.
 
-    The text after @ is passed to ASE and must select exactly one structure: a number, negative to count from
-    the end, or a database selection (`file.db@id=3`).
+    The text after @ is passed to ASE and must select exactly one structure: an index (negative indices count
+    from the end) or a database selection (`file.db@id=3`).
 
     Raises:
-        InputError: no such file, ASE cannot read it, no atoms, numbers that are not finite.
+        InputError: the file is missing, ASE cannot read it, it has no atoms, or a number is not finite.
     """
     expect_path(words, "Give ASE's Atoms or the path of a file that ASE reads")
     text = str(words)
@@ -72,7 +72,7 @@ def read_structure(words: str | Path) -> Atoms:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two particles, single atoms or whole molecules, that can be placed at any distance."""
+    """Two particles (single atoms or whole molecules) that can be placed at any distance from each other."""
 
     species: tuple[str, str]  # symbols of the two reference atoms; molecules by the heaviest of their atoms
     first: Atoms  # the particle that stays, its reference atom at the origin
@@ -84,7 +84,7 @@ class Pair:
     moves: Literal["atom", "molecule"] = "atom"
 
     def at(self, distance: float) -> Atoms:
-        """Return the pair with its reference atoms at a given distance, exact to the last bit."""
+        """Return the pair with its reference atoms at exactly the given distance, without rounding."""
         both = self._together.copy()
         both.positions[len(self.first) :, 0] += distance
         return both
@@ -94,7 +94,7 @@ class Pair:
         return self.surrounded(self.first + self.second)
 
     def surrounded(self, atoms: Atoms, middle: bool = False) -> Atoms:
-        """Put atoms into the cell of the pair, and center them if requested."""
+        """Put atoms into the cell of the pair; `middle` centers them."""
         if self.box:
             atoms.set_cell([self.box] * 3)
             if middle:
@@ -103,12 +103,12 @@ class Pair:
         return atoms
 
     def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
-        """Return the distances between atoms of the two particles, without that of the reference atoms."""
+        """Return all distances between atoms of the two particles except that of the reference atoms."""
         moved = self.second.positions[None] + [distance, 0.0, 0.0]
         return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
 
     def curve(self, subject: CalculatorSubject) -> Curve:
-        """Energy as a function of distance, and the repulsive force on the second particle."""
+        """Energy as a function of distance, and the force on the second particle, positive if repulsive."""
 
         def at(distance: float) -> tuple[float, float]:
             energy, forces = subject.both(self.at(distance))
@@ -121,11 +121,11 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
     """Return a pair of particles for every two species that the calculator supports, most frequent first.
 
     A pair consists of single atoms if the calculator supports them at the smallest distance of the structure.
-    Otherwise (a bond order may divide by the number of neighbors) each atom has two companion atoms; if the
-    calculator does not support this either (rigid water), the pair consists of molecules of the structure.
+    Otherwise each atom has two companion atoms, since a bond order may divide by the number of neighbors. If
+    this is not supported either (rigid water), the pair consists of molecules of the structure.
 
     Returns:
-        (pairs, what was left out and why).
+        (pairs, omitted pairs with the reason).
     """
     symbols = subject.atoms.get_chemical_symbols()
     species = sorted(set(symbols), key=lambda one: (-symbols.count(one), one))
@@ -150,7 +150,7 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
 
 
 def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
-    """Return a copy of a structure with new attribute values; a new cell scales the atoms if `scaled`."""
+    """Return a copy of a structure with new attribute values; `scaled` scales positions with a new cell."""
     there = atoms.copy()
     if "cell" in values:
         there.set_cell(values.pop("cell"), scale_atoms=scaled)
@@ -160,7 +160,7 @@ def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
 
 
 def exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
-    """Return (atom, k) for atoms whose k-th and (k+1)-th nearest neighbors have changed places."""
+    """Return (atom, k) for each atom whose k-th and (k+1)-th nearest neighbors have swapped."""
     orders = []
     for atoms in (before, after):
         distances = atoms.get_all_distances(mic=bool(atoms.pbc.any()))
@@ -183,13 +183,13 @@ def nearest_distance(atoms: Atoms) -> float:
 
 
 def trio(symbol: str, side: float, way: float) -> Atoms:
-    """Return an atom at the origin with two companions behind it."""
+    """Return an atom at the origin with two companion atoms beside each other behind it."""
     depth = way * side * np.sqrt(0.75)
     return Atoms([symbol] * 3, [(0, 0, 0), (depth, side / 2, 0), (depth, -side / 2, 0)])
 
 
 def molecules(atoms: Atoms) -> list[np.ndarray]:
-    """Return the atom indices of each molecule: atoms connected by bonds, by covalent radii."""
+    """Return the atom indices of each molecule; atoms are bonded if their covalent radii nearly touch."""
     from ase.neighborlist import natural_cutoffs, neighbor_list
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -202,7 +202,7 @@ def molecules(atoms: Atoms) -> list[np.ndarray]:
 
 
 def whole(atoms: Atoms, indices: np.ndarray) -> Atoms:
-    """Return one molecule unwrapped, with its heaviest atom at the origin and no cell."""
+    """Return one molecule, unwrapped and without a cell, with its heaviest atom at the origin."""
     part = _part(atoms, indices)
     lead = int(np.argmax(part.get_masses()))
     offsets = part.get_distances(lead, np.arange(len(part)), mic=bool(atoms.pbc.any()), vector=True)
@@ -216,7 +216,7 @@ def _part(atoms: Atoms, indices: np.ndarray) -> Atoms:
 
 
 def _molecules(subject: CalculatorSubject) -> list[Pair]:
-    """Return a pair of molecules of the structure, if there are several; identical ones if possible."""
+    """Return a pair of molecules of the structure, identical if possible; no pair for a single molecule."""
     atoms, groups = subject.atoms, molecules(subject.atoms)
     if not 2 <= len(groups) <= len(atoms) / 2:
         return []
@@ -231,7 +231,7 @@ def _molecules(subject: CalculatorSubject) -> list[Pair]:
 def _answered(
     subject: CalculatorSubject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
 ) -> tuple[Pair | None, str]:
-    """Return the pair in the simplest cell that the calculator supports, or None and the reason."""
+    """Return the pair in the simplest cell that the calculator supports, or None with the reason."""
     why = ""
     for cell, periodic in _SURROUNDINGS:
         name = "-".join(part.get_chemical_formula() for part in (first, second))
@@ -246,7 +246,7 @@ def _answered(
 
 
 def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
-    """Return the scan distances at which the calculator works, and the farthest of them."""
+    """Return the scan distances at which the calculator does not fail, and the largest scan distance."""
     places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
     first = len(places)
     for k in range(len(places) - 1, -1, -1):
@@ -264,8 +264,8 @@ def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndar
 def group(atoms: Atoms) -> int | None:
     """Return the number of atoms per molecule if a structure consists of identical molecules, else None.
 
-    A repeating sequence of species does not identify molecules, since a salt crystal has one too. The atoms
-    of a molecule must be bonded to one another, by their covalent radii, and to no others.
+    A repeating sequence of species does not imply molecules, since the atoms of a salt crystal repeat too.
+    The atoms of a molecule must be bonded to one another (by covalent radii) and to no other atoms.
     """
     numbers = atoms.numbers
     if len(set(numbers)) < 2:

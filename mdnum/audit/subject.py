@@ -1,4 +1,4 @@
-"""An ASE calculator wrapped for the checks: numbers or a clear error, never a stale cached answer."""
+"""Wrapper of an ASE calculator for the checks: returns numbers or a clear error, never outdated results."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ class RepeatCounts:
 
 
 class Repeats:
-    """Fingerprints of all energies and forces of a calculator, compared when a structure is evaluated again.
+    """Hashes of all structures with the calculator's energies and forces, to compare repeated evaluations.
 
     Attributes:
-        new: statistics of the first answers of new objects, which have no memory of other structures.
-        chance: statistics of suspicious answers that were recomputed with the same object: number that differ
-            by more than rounding, and the largest difference of a force component.
+        new: statistics of the first results of new calculator objects, which remember no other structure.
+        chance: statistics of suspicious results that were recomputed with the same object: the number that
+            differ by more than rounding, and the largest difference of a force component.
     """
 
     def __init__(self):
@@ -62,7 +62,7 @@ class Repeats:
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
-        """Record the first energy or force of a new calculator object, which has number `which`."""
+        """Record the first energy or force computed by the calculator object with number `which`."""
         before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
@@ -70,7 +70,7 @@ class Repeats:
             setattr(self.new, what, max(abs(value - before), getattr(self.new, what)))
 
     def findings(self, kT: float) -> list[Observed]:
-        """Return the finding that one structure gives two different results, if this is not rounding."""
+        """Return a finding if two evaluations of one structure differ by more than rounding."""
         for seen, who in ((self.chance, "same"), (self.new, "new")):
             if seen.differ:
                 told = not_repeatable(
@@ -91,7 +91,7 @@ def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) ->
 
 
 def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
-    """Return the absolute energy difference and the largest force component difference, or 0."""
+    """Return the absolute energy difference and the largest force component difference (0 without forces)."""
     forces = None if one[1] is None or other[1] is None else other[1] - one[1]
     return abs(other[0] - one[0]), 0.0 if forces is None else largest(forces)
 
@@ -99,11 +99,11 @@ def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
 def not_repeatable(
     how: str, energy: float, force: float, typical: float, kT: float, **values: Any
 ) -> Observed:
-    """Return the finding that one structure gives two different results; an error beyond rounding.
+    """Return the finding that two evaluations of one structure differ; an error if by more than rounding.
 
     Args:
-        how: how this was discovered, a variant of the sentences.
-        energy, force: difference of the answers, eV and eV/Å; typical: root mean square force, eV/Å.
+        how: how the difference was discovered, as the name of a text variant.
+        energy, force: differences of the evaluations, eV and eV/Å; typical: root mean square force, eV/Å.
     """
     values |= {"energy": energy, "force": force, "typical": typical}
     if force > _LARGE * typical or energy > _LARGE_ENERGY * kT:
@@ -113,7 +113,7 @@ def not_repeatable(
 
 @dataclass(frozen=True)
 class LoadedCalculator:
-    """A calculator found by name."""
+    """A calculator that was loaded by its name."""
 
     name: str  # what the person wrote
     stem: str  # a short word for a folder's name
@@ -125,30 +125,30 @@ class LoadedCalculator:
 
 
 class CalculatorSubject:
-    """An ASE calculator and the structure for which it is audited.
+    """An ASE calculator and the structure on which it is audited.
 
-    ASE returns its cached energy if no coordinate moved by more than 1e-15 Å, although near the origin such a
-    move changes several bits: if any bit differs, the cache is cleared first. If no bit differs, the cache is
-    used, so that energy and forces cost one calculation; `forget` forces the next calculation. The calculator
-    is attached to the atoms, as in a run, since some calculators require it. Each evaluation may raise a
-    `CalculatorError`: the calculator raised an exception or returned nan, and the structure was saved.
+    ASE returns its cached energy if no coordinate moved by more than 1e-15 Å, although such a move changes
+    bits near the origin; so any differing bit clears the cache. If no bit differs, the cache is used, so that
+    energy and forces need only one calculation; `forget` forces a new calculation. The calculator is attached
+    to the atoms, as in a run, since some calculators require this. An evaluation may raise a
+    `CalculatorError`: the calculator raised an exception or returned nan. The structure is then saved.
 
     Args:
         name: the calculator as the user named it.
         make: creates a calculator object without any memory.
-        atoms: the structure; constraints are removed, since they change forces but not energies.
-        kT: thermal energy with which a jump is compared, eV; 300 K by default.
-        folder: folder for structures on which the calculator fails; a new temporary folder if None.
+        atoms: the structure; its constraints are removed, since constraints change forces but not energies.
+        kT: thermal energy with which energy jumps are compared, eV; 300 K by default.
+        folder: folder for saving structures on which the calculator fails; a new temporary folder if None.
         units: units of length and energy; "eV" and "Å" below are ε and σ for a calculator in reduced units.
 
     Attributes:
         known: results about the calculator and its structure that all checks and objects share.
-        repeats: comparison of the answers of all objects.
-        meter: counts the calls of all objects.
-        forgets: clear the cache if a bit has changed and the calculator's own test reports no change.
-        renews: create a new object after an exception, since some objects are unusable afterwards.
-        copies: evaluate a copy of the atoms instead of the given object.
-        saving: save structures on which the calculator fails.
+        repeats: comparison of repeated evaluations by all objects.
+        meter: counts the calls of all objects of the calculator.
+        forgets: whether the cache is cleared if a bit has changed and the calculator detects no change.
+        renews: whether a new object is created after an exception, since some become unusable afterwards.
+        copies: whether a copy of the atoms is evaluated instead of the given object.
+        saving: whether structures on which the calculator fails are saved.
     """
 
     def __init__(
@@ -175,27 +175,27 @@ class CalculatorSubject:
 
     @property
     def calculator(self) -> Any:
-        """Calculator object, created at first use."""
+        """The current calculator object; it is created at first use."""
         if self._calculator is None:
             self._calculator = self._make()
             self._object, self._seen = next(_objects), 0
         return self._calculator
 
     def fresh(self) -> CalculatorSubject:
-        """Return a copy of the subject with a new calculator object without memory."""
+        """Return a copy of the subject with a new calculator object, which has no memory."""
         other = copy.copy(self)
         other.forgets = other.renews = other.copies = True
         other._calculator = other._last = None
         return other
 
     def used(self) -> CalculatorSubject:
-        """Return a fresh copy that tests the calculator's own change detection and recovery from errors."""
+        """Return a copy with a new calculator object, to test its change detection and error recovery."""
         other = self.fresh()
         other.forgets = other.renews = False
         return other
 
     def forget(self) -> None:
-        """Clear the cache, so that the next evaluation is a new calculation."""
+        """Clear the calculator's cache, so that the next evaluation is a new calculation."""
         reset = getattr(self.calculator, "reset", None)
         if callable(reset):
             reset()
@@ -205,11 +205,11 @@ class CalculatorSubject:
         self._seen += 1
 
     def energy(self, atoms: Atoms) -> float:
-        """Return the potential energy in eV: the one consistent with the forces if the calculator has two."""
+        """Return the potential energy in eV; of two energies, the one consistent with the forces."""
         return self.energies(atoms)[0]
 
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:
-        """Return (the energy consistent with the forces, the energy that a run logs), eV.
+        """Return (the energy consistent with the forces, the energy that a run writes to its log), eV.
 
         ASE calls the first energy `free_energy` and the second `energy`; the second is None if the calculator
         has only one.
@@ -223,7 +223,7 @@ class CalculatorSubject:
         return energy, other
 
     def forces(self, atoms: Atoms) -> Forces:
-        """Return forces in eV/Å; an array of the wrong shape raises an error as well."""
+        """Return the forces in eV/Å; an array of the wrong shape also raises an error."""
         asked = self._ask(atoms)
         forces = np.array(self._answer(asked.get_forces, asked, "forces"), dtype=np.float64)
         if forces.shape != (len(asked), 3):
@@ -241,11 +241,11 @@ class CalculatorSubject:
         return forces
 
     def both(self, atoms: Atoms) -> tuple[float, Forces]:
-        """Return energy and forces."""
+        """Return energy (eV) and forces (eV/Å) of a structure."""
         return self.energy(atoms), self.forces(atoms)
 
     def try_both(self, atoms: Atoms) -> Answered:
-        """Return energy and forces, or the error of the calculator; no structure is saved."""
+        """Return energy and forces, or the calculator's error; a failing structure is not saved."""
         try:
             with self.trying():
                 return self.both(atoms)
@@ -258,7 +258,7 @@ class CalculatorSubject:
 
     @contextmanager
     def trying(self) -> Iterator[None]:
-        """Save no failing structures in this block, in which calculator failures are expected."""
+        """Save no failing structures within this block, in which the calculator is expected to fail."""
         before, self.saving = self.saving, False
         try:
             yield
@@ -268,15 +268,15 @@ class CalculatorSubject:
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
         """Evaluate a structure again with the same object, and record the comparison in `repeats`.
 
-        Only an isolated deviation counts as random: if the repeated result also differs from that of a new
-        object, the history of this object may be the reason.
+        A deviation counts as random only if the second result agrees with that of a new object; otherwise the
+        earlier calls to this object may be the reason.
 
         Args:
-            energy: the earlier energy, eV; at least one of both is required.
+            energy: the earlier energy, eV; the energy or the forces are required.
             forces: the earlier forces, eV/Å.
 
         Returns:
-            Whether the answer differs by more than rounding.
+            Whether the two results differ randomly by more than rounding.
         """
         chance = self.repeats.chance
         if chance.times >= _MOST_AGAIN or chance.differ:
@@ -313,7 +313,7 @@ class CalculatorSubject:
         return asked
 
     def _nearly(self, atoms: Atoms) -> bool:
-        """Return whether ASE would treat a structure as unchanged although its bits changed."""
+        """Return whether ASE would treat a structure as unchanged although some bits differ."""
         check = getattr(self.calculator, "check_state", None)
         if not callable(check):
             return False
@@ -383,7 +383,7 @@ class CalculatorSubject:
 
 
 def exact_extxyz(atoms: Atoms) -> str:
-    """Return a structure as exact text: symbols, positions, initial charges and magnetic moments."""
+    """Return a structure as unrounded text: symbols, positions, initial charges and magnetic moments."""
     return to_extxyz(atoms, ("initial_charges", "initial_magmoms"))
 
 
@@ -398,17 +398,17 @@ def largest(values: np.ndarray) -> float:
 
 
 def rms(forces: np.ndarray) -> float:
-    """Root mean square of force components."""
+    """Root mean square of the force components."""
     return float(np.sqrt(np.mean(forces**2))) if forces.size else 0.0
 
 
 def bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
-    """Return copies of positions, atomic numbers, cell and periodicity, which later changes do not affect."""
+    """Return independent copies of a structure's positions, atomic numbers, cell and periodicity."""
     return atoms.positions.copy(), atoms.numbers.copy(), np.array(atoms.cell), atoms.pbc.copy()
 
 
 def _question(atoms: Atoms) -> bytes:
-    """Return a hash of all calculator input: the structure, charges, tags and info."""
+    """Return a hash of the complete calculator input: the structure, charges, tags and info."""
     parts = {**atoms.arrays, "cell": np.asarray(atoms.cell), "pbc": atoms.pbc}
     info = {key: value for key, value in atoms.info.items() if isinstance(value, _PLAIN)}
     text = b"|".join(name.encode() + parts[name].tobytes() for name in sorted(parts))
@@ -416,7 +416,7 @@ def _question(atoms: Atoms) -> bytes:
 
 
 def _bare(atoms: Atoms) -> Atoms:
-    """Return a copy of a structure without calculator and constraints, in float64."""
+    """Return a copy of a structure in float64 without calculator and constraints."""
     copy = atoms.copy()
     copy.calc = None
     copy.set_constraint()

@@ -1,11 +1,11 @@
-"""Search for discontinuities in many-atom environments: moves through a structure, and crowded atoms.
+"""Search many-atom environments for discontinuities: moves of atoms in a structure, and crowded atoms.
 
-Two atoms may interact differently among many atoms (an embedding, an angle), so a jump may change and a
-smooth threshold may jump there: triples, and atoms of the structure, are moved through the known pair
-thresholds and beyond. To detect a cap on neighbors, one more atom is moved past all neighbors of a crowded
-central atom: when it is as far as the k-th neighbor, a calculator that keeps k neighbors exchanges one for
-the other, and the energy or a force jumps. If the calculator keeps the first k in list order, a permutation
-of the atoms shows the cap.
+A pair of atoms may interact differently among many atoms (embedding energies, angles): a jump may have
+another size, and a threshold that is smooth for two atoms may jump. Therefore atoms and triples of atoms are
+moved through the known pair thresholds and beyond. To detect a limit on the number of neighbors, one more
+atom is moved past all neighbors of a crowded central atom. A calculator that keeps k neighbors exchanges the
+k-th neighbor for this atom when both are equally far away, and the energy or a force jumps. If the calculator
+keeps the first k neighbors in the order of the list, reordering the atoms reveals the limit.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 
 
 
 class RouteCrossing(NamedTuple):
-    """A point along a route at which the distance of the lead atom to another atom passes a threshold."""
+    """A point of a route at which the distance of the lead atom from another atom crosses a threshold."""
 
     at: float
     threshold: PairThreshold
@@ -57,7 +57,7 @@ class RouteCrossing(NamedTuple):
 
 @dataclass(frozen=True)
 class Route:
-    """A structure in which some atoms move along a straight line."""
+    """A structure in which one atom or several move along a straight line."""
 
     name: str
     atoms: Atoms  # the structure at 0
@@ -66,13 +66,13 @@ class Route:
     direction: Float[np.ndarray, "3"]  # unit vector
 
     def at(self, along: float) -> Atoms:
-        """Return the structure with the moving atoms displaced along the line."""
+        """Return the structure with the moving atoms displaced along the line by a given length."""
         atoms = self.atoms.copy()
         atoms.positions[self.moving] += along * self.direction
         return atoms
 
     def curve(self, subject: CalculatorSubject) -> Curve:
-        """Energy along the route, and the force on the moving atoms along the line."""
+        """Energy along the route, and the component along the line of the force on the moving atoms."""
 
         def at(along: float) -> tuple[float, float]:
             energy, forces = subject.both(self.at(along))
@@ -81,7 +81,7 @@ class Route:
         return Curve(at)
 
     def crossings(self, thresholds: Sequence[PairThreshold], low: float, high: float) -> list[RouteCrossing]:
-        """Return the points between low and high at which a distance of the lead atom passes a threshold.
+        """Return the points between low and high at which a distance of the lead atom crosses a threshold.
 
         The squared distance along a line is quadratic, so the points are roots of a quadratic equation.
         """
@@ -101,7 +101,7 @@ class Route:
         return sorted(found, key=lambda one: one.at)
 
     def ties(self, along: float) -> tuple[tuple[int, int], ...]:
-        """Return (atom, k) for atoms whose k-th and (k+1)-th neighbors swap at a point of the route."""
+        """Return (atom, k) for each atom whose k-th and (k+1)-th neighbors swap at a point of the route."""
         return exchanged(self.at(along - _TIED), self.at(along + _TIED))
 
 
@@ -119,7 +119,7 @@ class Event:
 
 @dataclass(frozen=True)
 class EnvironmentWalks:
-    """Jumps found by moving atoms through many-atom environments."""
+    """Jumps found when atoms were moved through many-atom environments."""
 
     events: tuple[Event, ...]  # places at which something jumps
     measured: int  # crossings of known thresholds that were measured
@@ -127,12 +127,12 @@ class EnvironmentWalks:
 
     @property
     def unexplained(self) -> list[Event]:
-        """Significant jumps that no pair threshold explains."""
+        """Significant jumps that are not explained by any pair threshold."""
         return [one for one in self.events if one.threshold is None and one.jump.order < SMOOTH]
 
     @property
     def lower(self) -> list[Event]:
-        """Events at a pair threshold at which a lower derivative jumps than for two isolated atoms."""
+        """Events at a pair threshold where a lower derivative jumps than for two isolated atoms."""
         return [one for one in self.events if one.threshold and one.jump.order < min(one.threshold.order, 2)]
 
 
@@ -143,10 +143,10 @@ def walk_surroundings(
     crossings: int = _CROSSINGS,
     routes: int = _ROUTES,
 ) -> EnvironmentWalks:
-    """Move triples and atoms of the structure through the known thresholds, and search for unknown ones.
+    """Move atoms and triples of atoms through the known pair thresholds, and search for unknown thresholds.
 
     Args:
-        crossings: number of known threshold crossings in the structure to measure.
+        crossings: number of crossings of known thresholds that are measured in the structure.
         routes: number of routes through the structure on which unknown thresholds are searched.
     """
     walks = walk_pairs(subject).walks
@@ -185,12 +185,12 @@ def walk_surroundings(
 
 
 def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
-    """Return the groups of atoms that move together: single atoms, or else whole molecules."""
+    """Return the groups of atoms that move together: single atoms if `single`, else whole molecules."""
     return [np.array([k]) for k in range(len(atoms))] if single else molecules(atoms)
 
 
 def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
-    """Return a cluster of the groups nearest to the first one, in their original order, in a pair's cell."""
+    """Return a cluster of the groups nearest to the first group, in their original order, in a pair's box."""
     center = _lead(atoms, groups[0])
     offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
@@ -210,7 +210,7 @@ def _lead(atoms: Atoms, group: np.ndarray) -> int:
 def _targeted(
     atoms: Atoms, thresholds: Sequence[PairThreshold], groups: Sequence[np.ndarray]
 ) -> list[tuple[Route, RouteCrossing]]:
-    """Return a few routes for each threshold that move a nearby pair of atoms through it."""
+    """Return, for each threshold, a few routes on which a nearby pair of atoms crosses the threshold."""
     of_lead = {_lead(atoms, group): group for group in groups}
     symbols = np.array(atoms.get_chemical_symbols())
     ranked: list[tuple[int, Route, RouteCrossing]] = []
@@ -237,7 +237,7 @@ def _targeted(
 
 
 def _at_crossing(subject: CalculatorSubject, route: Route, crossing: RouteCrossing) -> Event:
-    """Measure the jump at a known threshold, located to neighboring doubles if a value jumps."""
+    """Measure the jump at a known threshold; a jump of energy or force is located to adjacent doubles."""
     curve, side = route.curve(subject), max(_SIDE, 3 * crossing.threshold.located)
     # what is smooth for two may jump among others: the lowest derivative that does, whatever the threshold
     for row in range(2):
@@ -283,7 +283,7 @@ def _scanned(
 
 
 def _triples(subject: CalculatorSubject) -> list[tuple[Route, float, float]]:
-    """Return routes (route, from, to) on which a third atom approaches a bonded pair, beside its axis."""
+    """Return (route, start, end) for routes on which an atom approaches two bonded atoms from the side."""
     found: list[tuple[Route, float, float]] = []
     for walk in walk_pairs(subject).walks[:_MOST_TRIPLES]:
         bond = float(walk.distance[int(np.argmin(walk.energy))])
@@ -300,7 +300,7 @@ def _triples(subject: CalculatorSubject) -> list[tuple[Route, float, float]]:
 
 
 def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tuple[Route, float, float]]:
-    """Return routes on which randomly chosen atoms move in random directions."""
+    """Return (route, start, end) for randomly chosen atoms that move in random directions."""
     rng = np.random.default_rng(0)
     found: list[tuple[Route, float, float]] = []
     for k in rng.permutation(len(groups))[:count]:
@@ -313,7 +313,7 @@ def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tupl
 
 
 def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
-    """Return whether a jump is no more than a rounding step of energies and forces rounded to decimals."""
+    """Return whether a jump is no larger than a few rounding steps of the energies and forces."""
     if not any(quantum):
         return False
     small = abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]
@@ -324,7 +324,7 @@ def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
 
 
 class CrowdOrder(NamedTuple):
-    """Effect of the atom order in a crowded cluster on energy and forces."""
+    """Effect of the order of the atoms in a crowded cluster on energy and forces."""
 
     # number of neighbors at which it starts to matter, None if it never does
     start: int | None = None
@@ -336,7 +336,7 @@ class CrowdOrder(NamedTuple):
 
 @dataclass(frozen=True)
 class Crowd:
-    """A central atom with many neighbors at distinct distances, and the energy and force jumps found."""
+    """A central atom with many neighbors at different distances, and the energy and force jumps found."""
 
     species: str  # of all atoms
     radius: float  # cutoff that the crowd is inside of, length
@@ -351,13 +351,13 @@ class Crowd:
 
 
 def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int = _MOST) -> list[Crowd]:
-    """Surround one atom of each species with many neighbors to detect a cap on their number.
+    """Give one atom of each species many neighbors, to detect a limit on the number of neighbors.
 
     Args:
-        most: neighbors given to the center.
+        most: number of neighbors of the central atom.
 
     Returns:
-        one for each species of the structure; none for a calculator that does not support single atoms.
+        a result for each species of the structure; none for a calculator that does not support single atoms.
     """
     alike = [
         walk
@@ -379,11 +379,11 @@ def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int 
 
 
 def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndarray, "neighbors"]]:
-    """Return a central atom at the origin with `count` neighbors, and their distinct distances.
+    """Return a central atom at the origin with `count` neighbors at different distances, and these distances.
 
-    The neighbors fill the shell evenly (golden spiral in angle, equal volumes in distance), so that no two
-    are as close to each other as some of many random positions would be. The neighbors are sorted by distance
-    and follow the central atom.
+    The neighbors fill the shell evenly (golden spiral in angle, equal volumes in distance); random positions
+    would put some neighbors too close together. The central atom comes first, then the neighbors in order of
+    distance.
     """
     k = np.arange(count)
     share = (k + 0.5) / count
@@ -399,7 +399,7 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
 
 
 def gap(atoms: Atoms) -> Float[np.ndarray, "3"]:
-    """Return the direction from the central atom that is farthest from every neighbor."""
+    """Return the direction from the central atom that has the largest angle to the nearest neighbor."""
     tried = np.random.default_rng(1).normal(size=(2000, 3))
     tried /= np.linalg.norm(tried, axis=1)[:, None]
     offsets = atoms.positions[1:] - atoms.positions[0]
@@ -420,9 +420,9 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     side = _SIDE_OF_TIE * float(np.spacing(np.float32(max(np.abs(atoms.positions).max(), radius))))
 
     def change(place: float, without: int | None = None) -> tuple[float, Float[np.ndarray, "atoms"]]:
-        """Return the nonsmooth changes of energy and forces from place - side to place + side.
+        """Return the discontinuous changes of energy and forces between place - side and place + side.
 
-        (|change of the energy minus the force's work|, for each atom |change of its force minus the mean
+        (|energy change plus work of the force|, for each atom |change of the force on it minus the mean
         change over the adjacent intervals of the same length|).
         """
         first, before = subject.both(walker(place - side, without))
@@ -468,7 +468,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
 
 
 def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int) -> CrowdOrder:
-    """Find the number of neighbors above which the order of atoms matters, and how large its effect is."""
+    """Find the number of neighbors above which the order of atoms has an effect, and the effect's size."""
     low, high, changed = 1, None, (0.0, 0.0)
     larger = iter([*(count for count in (4, 16, 64) if count < most), most])
     while count := next(larger, None) if high is None else (low + high) // 2 * (high - low > 1):
@@ -489,9 +489,9 @@ def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int)
 def _permuted(
     subject: CalculatorSubject, walk: PairWalk, radius: float, count: int, aside: bool = False
 ) -> tuple[float, float] | None:
-    """Return the changes of energy and force on reordering the atoms; None if rounding explains them.
+    """Return the changes of energy and force when atoms are reordered; None if rounding explains them.
 
-    With `aside`, the last neighbor is moved out of reach of all others.
+    If `aside`, the last neighbor is first moved beyond the cutoff from all other atoms.
     """
     atoms, _ = cluster(walk.pair, radius, count)
     if aside:

@@ -1,7 +1,7 @@
-"""Locate thresholds of a calculator's pair interactions from energies and forces alone.
+"""Locate the distance thresholds of a calculator's pair interactions, using only energies and forces.
 
-Two atoms of each pair of species are moved from a large distance to one with an energy of 1000 kT. Thresholds
-that appear only among many atoms (an angle's own cutoff, a cap on neighbors) are searched in surroundings.py.
+The two atoms of each pair are moved from a large distance to an energy of 1000 kT. Thresholds that appear
+only among many atoms (cutoffs of angles, limits on neighbors) are searched in surroundings.py.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class PairThreshold:
 
 @dataclass(frozen=True)
 class Beyond:
-    """Thresholds found beyond the range of the scan."""
+    """Thresholds of a pair at distances beyond the range of the scan."""
 
     thresholds: tuple[PairThreshold, ...]  # changes and the end, by distance
     # (last distance at which the two feel one another, next one), None without an end
@@ -120,14 +120,14 @@ class PairWalks:
 
 
 def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
-    """Return all thresholds of the calculator's pair interactions, computed once per subject."""
+    """Return all distance thresholds of the calculator's pair interactions, computed once per subject."""
     if "thresholds" not in subject.known:  # a resumed audit knows them without a walk
         subject.known["thresholds"] = [one for walk in walk_pairs(subject).walks for one in walk.thresholds]
     return subject.known["thresholds"]
 
 
 def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWalks:
-    """Scan every pair of species over its distances; the result is computed once per subject."""
+    """Scan every pair of species over a range of distances; the result is computed once per subject."""
     if "walks" not in subject.known:
         with subject.meter.apart(WALKING_CALLS):
             subject.known["walks"] = _walked(subject, progress)
@@ -165,10 +165,10 @@ def _walked(subject: CalculatorSubject, progress: Progress) -> PairWalks:
 
 
 def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairWalk:
-    """Scan the energy and force of one pair over its distances.
+    """Scan the energy and force of one pair of particles over a range of distances.
 
     Args:
-        calls: number of calls after which only the most prominent place of the scan is examined.
+        calls: number of calls after which only the most prominent point of the scan is examined.
 
     Raises:
         CalculatorError: the calculator fails at distances at which it worked before.
@@ -247,10 +247,10 @@ def _seen(
     rounding: float,
     known: Sequence[float],
 ) -> tuple[float, float, float, float] | None:
-    """Return (from, to, force step detectable at half of the places, force step detectable at all places).
+    """Return (from, to, force step detectable at half of the distances, and at all distances).
 
-    Places close to a known threshold (which would hide another threshold) and places beyond the end of the
-    interaction are not counted.
+    Distances close to a known threshold (which would hide another threshold) and distances beyond the end of
+    the interaction are not counted.
     """
     felt = places < end
     for radius in known:
@@ -264,7 +264,7 @@ def _seen(
 
 
 def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThreshold | None:
-    """Return a threshold whose jump exceeds rounding; the end of an interaction is kept without its jump."""
+    """Return a threshold whose jump exceeds rounding; the end of an interaction is kept without a jump."""
     large = any(abs(jump) > STEPS * size for jump, size in zip(threshold.jumps[:2], quantum, strict=True))
     if threshold.order <= 1 and large:
         return threshold
@@ -272,7 +272,7 @@ def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThresh
 
 
 def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairThreshold]) -> bool:
-    """Return whether companion atoms of the pair cross another threshold at this distance."""
+    """Return whether the distance of companion atoms crosses another threshold at this pair distance."""
     others = pair.others(threshold.radius)
     radii = [one.radius for one in thresholds if one is not threshold]
     return len(others) > 0 and any(np.abs(others - radius).min() < 1e-5 for radius in radii)
@@ -284,10 +284,10 @@ def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairTh
 def _end_of(
     coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]
 ) -> tuple[float, float] | None:
-    """Return the last distance with an interaction and the next double; None if there is no interaction.
+    """Return the last distance with an interaction and the next double; None if the particles never interact.
 
-    A smooth switching function may vanish in rounding at some distances before it ends; any interaction found
-    farther out moves the search outward.
+    A smooth switching function may round to zero at some distances before its end, so the search continues
+    outward from any interaction found at a larger distance.
     """
     last = next((k for k in range(len(coarse) - 2, -1, -1) if alive(float(coarse[k]))), None)
     if last is None:
@@ -307,7 +307,7 @@ def _end_of(
 def _with_end(
     pair: Pair, curve: Curve, edge: tuple[float, float], found: list[PairThreshold], near: float
 ) -> list[PairThreshold]:
-    """Return the thresholds together with the measured end of the interaction."""
+    """Return the thresholds, including the measured end of the interaction."""
     inner = [one.radius for one in found if one.radius < edge[0] - 1e-3]
     room = min(edge[0] - max([near, *inner]), 0.5)
     jump = measure(curve, *edge, room, exact=True)
@@ -340,10 +340,10 @@ def _with_end(
 
 
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
-    """Extrapolate the end distance of an interaction, toward which the force falls with this power.
+    """Extrapolate the distance at which an interaction ends; the force falls to zero there with this power.
 
-    The last distance with a force is returned if it is within the error of the extrapolation: the power law
-    holds only in the limit, while this distance is known to the last bit unless the force was lost in
+    If the last distance with a nonzero force is within the error of the extrapolation, it is returned
+    instead: the power law holds only in the limit, while this distance is exact unless the force was lost in
     rounding.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])
@@ -364,10 +364,10 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
 def _beyond(
     subject: CalculatorSubject, pair: Pair, start: float, noise: Float[np.ndarray, "2"], calls: float
 ) -> Beyond | None:
-    """Search outward from a distance, as long as a cutoff farther out could still remove energy.
+    """Search larger distances as long as a cutoff there could still remove a relevant energy.
 
     None is returned if no distance could be evaluated: in a periodic cell, where images of the particles come
-    near, or if the calculator fails.
+    too near, or if the calculator fails.
     """
     if pair.periodic:
         return None
@@ -424,7 +424,7 @@ def _at(low: float, high: float) -> Float[np.ndarray, "nodes"]:
 def _rough(
     curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 ) -> Iterator[tuple[float, float]]:
-    """Yield narrow intervals in which the force is not smooth, or the energy change is not minus its work."""
+    """Yield narrow intervals where the force is not smooth or the energy change is not minus its work."""
     if high <= low or _smooth(curve, low, high, noise):
         return
     if high - low < _NARROW:
@@ -447,7 +447,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 
 
 def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
-    """Energy change from the last point to infinity for a power-law force; inf for slow decay."""
+    """Energy change from the last point to infinity if the force follows a power law; inf for slow decay."""
     first, last = abs(float(forces[0])), abs(float(forces[-1]))
     if not last or not first:
         return np.inf
@@ -456,7 +456,7 @@ def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"])
 
 
 def _expected(curve: Curve, place: float) -> float:
-    """Extrapolate the force at a distance by a power law fitted at slightly smaller distances."""
+    """Extrapolate the force to a distance by a power law fitted at slightly smaller distances."""
     near, far = place - 0.5, place - 0.25
     first, last = (abs(curve(one)[1]) for one in (near, far))
     if not first or not last:

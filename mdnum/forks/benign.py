@@ -1,14 +1,16 @@
-"""Test whether a fork is benign: whether two programs whose runs diverge still give the same measurements.
+"""Test whether a fork is benign: whether two programs whose runs diverge still give the same averages.
 
-B is compared with an ensemble of A at a step that is found by calibration. Too early, the runs differ by less
-than rounding errors can cause; too late, every run has forgotten its start, and a changed program gives the
-same scatter. The window between depends on the system. Therefore programs with planted changes are run, and
-the comparison takes place at a step at which all of them can be distinguished from rounding.
+Runs of B are compared with an ensemble of runs of A at a step that is found by calibration. At early steps
+the runs differ by less than rounding errors can cause; at late steps, runs of a changed program have the same
+scatter, because every run has forgotten its start. The interval between depends on the system. Therefore
+programs with deliberate changes are run too; the step of the comparison is one at which these changes are
+distinguishable from rounding.
 
-The rule is that of the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
-Features are standardized by the ensemble and projected onto its principal components. A run is an outlier if
-two of its components exceed a limit, and three runs fail if two of them are outliers. In other words, the
-median over the runs of the second largest component exceeds the limit.
+The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
+Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
+run is an outlier if at least two of its principal components exceed the limit; a program fails if two of its
+three runs are outliers. In other words, the median over its three runs of the second-largest component
+exceeds the limit.
 """
 
 from __future__ import annotations
@@ -73,7 +75,7 @@ _SEED = 1_000_003
 
 @dataclass(frozen=True)
 class Space:
-    """The principal components of an ensemble."""
+    """The principal components of the features of an ensemble of runs."""
 
     # mean, spread: of each feature over the ensemble; infinite spread leaves a feature out
     mean: Float[np.ndarray, "features"]
@@ -83,7 +85,7 @@ class Space:
 
     @classmethod
     def of(cls, features: Float[np.ndarray, "runs features"]) -> Space:
-        """Compute two to ten components that explain the variance, but at most a third of the runs."""
+        """Compute 2 to 10 components that explain the variance, but no more than a third of the run count."""
         mean, spread = features.mean(axis=0), features.std(axis=0, ddof=1)
         # nothing can be said of a feature that is constant, such as a distance that no pair has
         spread = np.where(spread > _ROUNDING * np.abs(mean), spread, np.inf)
@@ -98,17 +100,17 @@ class Space:
     def standardized(
         self, features: Float[np.ndarray, "*runs features"]
     ) -> Float[np.ndarray, "*runs features"]:
-        """Return features in standard deviations of the ensemble."""
+        """Return the features of runs in units of the standard deviations of the ensemble."""
         return (features - self.mean) / self.spread
 
     def scores(self, features: Float[np.ndarray, "runs features"]) -> Float[np.ndarray, "runs components"]:
-        """Return components in standard deviations of the ensemble; NaN for a run that blew up."""
+        """Return principal components in units of their standard deviations; NaN for a run that blew up."""
         return self.standardized(features) @ self.axes.T / self.sigma
 
     def second(self, features: Float[np.ndarray, "runs features"]) -> Float[np.ndarray, "runs"]:
-        """Return the second largest component of each run; a run is an outlier if this exceeds the limit.
+        """Return the second-largest component of each run; above the limit, the run is an outlier.
 
-        The value is infinite for a run that blew up, which is always an outlier.
+        A run that blew up has the value infinity and is always an outlier.
         """
         scores = np.abs(self.scores(features))
         return np.sort(np.where(np.isnan(scores), np.inf, scores), axis=1)[:, -2]
@@ -118,7 +120,7 @@ def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations beyond which a component counts as an outlier.
 
     The limit is two, or larger if needed for at most a tenth of the ensemble's own runs to be outliers. Each
-    run is judged by components of other runs, because a run stands out less in components that it influenced.
+    run is judged by components of other runs: it would stand out less in components that it influenced.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -128,7 +130,7 @@ def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
 
 
 def triples(seconds: Float[np.ndarray, "runs"]) -> Float[np.ndarray, "tries"]:
-    """Return the median of each group of three successive runs, which the rule compares with its limit."""
+    """Return the median of each group of three successive runs, which the test compares with its limit."""
     tries = len(seconds) // RUNS
     return np.median(seconds[: RUNS * tries].reshape(tries, RUNS), axis=1)
 
@@ -139,7 +141,7 @@ def two_of_three(rate: float) -> float:
 
 
 def bounds(count: int, of: int) -> tuple[float, float]:
-    """Compute the exact (Clopper-Pearson) 95 % interval of a rate from `count` events in `of` tries."""
+    """Compute the exact (Clopper-Pearson) 95 % confidence interval for a rate of `count` events in `of`."""
     tail = 0.025
     low = betaincinv(count, of - count + 1, tail) if count else 0.0
     high = betaincinv(count + 1, of - count, 1 - tail) if count < of else 1.0
@@ -151,7 +153,7 @@ def bounds(count: int, of: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Planted:
-    """Result of the test for one deliberately introduced change."""
+    """Result of the test for one program with a deliberate change."""
 
     change: str  # what it is
     must_fail: bool  # whether it is another model; else only other rounding
@@ -162,7 +164,7 @@ class Planted:
 
     @property
     def ok(self) -> bool:
-        """True if a change that must fail always failed, or another failed no more than by chance."""
+        """True if a change that must fail always failed, or if any other change failed only by chance."""
         if self.must_fail:
             return self.failures == self.tries
         return bounds(self.failures, self.tries)[0] <= ACCEPTED
@@ -170,7 +172,7 @@ class Planted:
 
 @dataclass(frozen=True)
 class Window:
-    """One step at which runs could be compared, with the components and the limit for it."""
+    """A step at which runs could be compared, with the principal components and the limit at this step."""
 
     step: int  # of the comparison
     space: Space  # components of the ensemble
@@ -179,18 +181,18 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest score, in limits, of all planted changes that must fail; infinity if there are none."""
+        """Smallest score, in limits, among the deliberate changes that must fail; infinity without any."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property
     def ok(self) -> bool:
-        """True if the rule gave the expected result for every planted change."""
+        """True if the test gave the expected result for every deliberate change."""
         return all(one.ok for one in self.table)
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """An ensemble with which runs can be compared."""
+    """An ensemble of runs with which other runs can be compared."""
 
     nodes: Float[np.ndarray, "nodes"]  # of the pair histogram that features are measured on
     window: Window  # the one that was chosen
@@ -201,7 +203,7 @@ class Calibration:
 
     @property
     def rate(self) -> float:
-        """Share of verdicts that are false positives, estimated from the outliers among the held-out runs."""
+        """Probability of a false positive, estimated from the outliers among runs outside the ensemble."""
         return two_of_three(self.alone / self.held_out) if self.held_out else float("nan")
 
     @property
@@ -222,21 +224,21 @@ def calibrate(
     changes: Sequence[Change] | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Run an ensemble, and choose the step at which planted changes are distinguished from rounding.
+    """Run an ensemble, and find the step at which deliberate changes are distinguishable from rounding.
 
     Args:
-        simulation: the program of the ensemble.
-        start: start of the ensemble; default the system's own start.
+        simulation: the simulation of which an ensemble is run.
+        start: start of the ensemble; default the simulation's own start.
         members: number of runs of the ensemble.
-        held_out: number of further runs, from which the rate of false positives is estimated.
-        tries: verdicts on each planted change, three runs each; only one on the slow other list search.
-        steps: step of the comparison; default the best step before two members split.
-        changes: planted changes; default all of `planted(simulation)`.
-        progress: called with the number of runs done, their total, and a dictionary of figures.
+        held_out: number of runs outside the ensemble, from which the rate of false positives is estimated.
+        tries: tests of each deliberate change, with three runs each; only one for the slower list search.
+        steps: step of the comparison; default the most suitable step before two members split.
+        changes: deliberate changes; default all of `planted(simulation)`.
+        progress: called with the number of runs done, their total, and a dictionary of current values.
 
     Raises:
-        InputError: there are too few runs, the program blows up, or planted changes cannot be distinguished
-            from rounding at any step.
+        InputError: there are too few runs, the program blows up, or deliberate changes cannot be
+            distinguished from rounding at any step.
 
     Error: statistical; the limit is a quantile over the members, see `Calibration.rate_bounds`.
     """
@@ -291,10 +293,10 @@ def calibrate(
 
 
 def choose(windows: Sequence[Window], name: str) -> Window:
-    """Choose the latest window in which every planted change is clear, or else the clearest window.
+    """Return the latest window in which every deliberate change is detected, or else the best window.
 
     Raises:
-        InputError: no window distinguishes the planted changes.
+        InputError: no window distinguishes the deliberate changes from rounding.
     """
     good = [window for window in windows if window.ok and window.power > 1]
     clear = [window for window in good if window.power >= _CLEAR]
@@ -330,7 +332,7 @@ def _windows(simulation: Simulation, start: Start | None) -> list[int]:
 
 @result
 class Benign:
-    """Whether B's runs are statistically consistent with the ensemble of A."""
+    """Whether runs of B are statistically consistent with the ensemble of runs of A."""
 
     passed: bool  # whether they do
     window: int  # step of the comparison
@@ -359,19 +361,19 @@ def benign(
     calibration: Calibration | None = None,
     progress: Progress | None = None,
 ) -> Benign:
-    """Compare three runs of B with an ensemble of A.
+    """Compare three runs of B with an ensemble of runs of A.
 
-    B fails if, in two of the three runs, two or more principal components of the features exceed the limit.
-    If B passes, the choice had no larger effect than the smallest perturbation of a start.
+    B fails if, in two of its three runs, at least two principal components of the features exceed the limit.
+    If B passes, the choice between A and B had no larger effect than the smallest perturbation of a start.
 
     Args:
-        twin: the programs. B's atom labels and axes do not matter, because no feature depends on them.
+        twin: the programs. Atom labels and axes of B do not matter, because no feature depends on them.
         steps: step of the comparison; default the step found by calibration.
-        calibration: an existing calibration of A's ensemble.
-        progress: called with the number of runs done, their total, and a dictionary of figures.
+        calibration: an existing calibration of the ensemble of A.
+        progress: called with the number of runs done, their total, and a dictionary of current values.
 
     Raises:
-        InputError: the programs cannot be compared, or planted changes are not distinguishable at any step.
+        InputError: the programs cannot be compared, or deliberate changes are detected at no step.
     """
     _check(twin)
     found = calibration or calibrate(twin.a.simulation, start=twin.a.begin, steps=steps, progress=progress)
@@ -388,7 +390,7 @@ def benign(
 
 
 def _check(twin: Twin) -> None:
-    """Raise an error if an ensemble of one program cannot be used to judge the other program."""
+    """Raise an error if an ensemble of one program cannot be used to test the other program."""
     twin.a.check(twin.b)
     keys = [one.simulation.integrator.random for one in (twin.a, twin.b)]
     a, b = (() if key is None else np.asarray(jax.random.key_data(key)) for key in keys)
@@ -401,7 +403,7 @@ def _check(twin: Twin) -> None:
 
 
 def _failing(calibration: Calibration, rows: np.ndarray, scores: np.ndarray) -> dict[str, float]:
-    """Return the features that contribute most to the components beyond the limit, largest share first."""
+    """Return the features that contribute most to the components beyond the limit, largest first."""
     space, limit = calibration.window.space, calibration.window.limit
     z = np.median(space.standardized(rows), axis=0)
     middle = np.median(scores, axis=0)

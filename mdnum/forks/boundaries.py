@@ -1,7 +1,7 @@
-"""Values of a number of a system at which the decisions of a run change, located to the last bit.
+"""Values of a system parameter at which the decisions of a run change, located to adjacent floats.
 
-Between two boundaries a run is one smooth function of the number. At a boundary, two adjacent floats lead to
-different decisions, and every later quantity may jump.
+Between two such boundaries, the result of a run is a smooth function of the parameter. At a boundary, two
+adjacent floats lead to different decisions, and every later quantity of the run may jump.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MOST, MOST_BALL = 24, 64
 
 @dataclass(frozen=True)
 class Side:
-    """The run on one side of a boundary."""
+    """The run for the parameter value on one side of a boundary."""
 
     at: float  # the number, as the float next to the boundary
     digest: str  # of its decisions
@@ -46,7 +46,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Boundary:
-    """Two adjacent floats whose runs make different decisions, and the first decision that differs."""
+    """Two adjacent parameter values whose runs make different decisions, and the first differing decision."""
 
     # below, above: the two sides; above.at is the float after below.at
     below: Side
@@ -64,13 +64,13 @@ class Boundary:
 
     @property
     def jump(self) -> float:
-        """Loss above the boundary minus loss below it."""
+        """Loss just above the boundary minus loss just below it."""
         return self.above.loss - self.below.loss
 
 
 @dataclass(frozen=True)
 class Interval:
-    """An interval of the number in which all computed runs make the same decisions."""
+    """An interval of the parameter in which all computed runs make the same decisions."""
 
     # low, high: its ends; both were run
     low: float
@@ -88,7 +88,7 @@ class Interval:
 
 @result
 class BoundaryMap:
-    """A run as a piecewise function of one number of its system."""
+    """A run as a piecewise smooth function of one parameter of its system."""
 
     # number, steps: that was varied, and the last step of every run
     number: Number
@@ -116,15 +116,15 @@ class BoundaryMap:
 
     @property
     def histories(self) -> int:
-        """Number of different sequences of decisions (histories) that were found."""
+        """Number of different histories (sequences of decisions) found."""
         return len({interval.digest for interval in self.intervals})
 
 
 class NumberLine:
-    """Runs of one system at different values of one number, addressed by the ordinal of a float.
+    """Runs of one system for different values of one parameter; a value is addressed by its float's ordinal.
 
     Args:
-        program: the program with the system's own value of the number.
+        program: the program with the system's own value of the parameter.
         loss: loss function of the final state, as accepted by the world's `history`.
     """
 
@@ -140,27 +140,27 @@ class NumberLine:
         return float(neighbor(np.zeros((), self.number.dtype), place, self.number.dtype))
 
     def places(self, values: Any) -> list[int]:
-        """Return the ordinals of some floats, ascending and without duplicates."""
+        """Return the ordinals of some floats in ascending order, without duplicates."""
         return sorted({int(place) for place in ordinal(np.asarray(values, self.number.dtype))})
 
     def at(self, place: int) -> Any:
-        """Return the program for the float with the given ordinal."""
+        """Return the program for the parameter value with the given ordinal."""
         return self.number.at(self.value(place))
 
     def run(self, place: int) -> DecisionHistory:
-        """Compute the history (all decisions) for the float with the given ordinal."""
+        """Compute the history (all decisions) for the parameter value with the given ordinal."""
         history = self.at(place).history(self.steps, self.loss)
         self.known[place] = replace(history, marks=history.marks[:0], x=history.x[:0])
         return history
 
     def digest(self, place: int) -> str:
-        """Return the digest of the decisions for the float with the given ordinal."""
+        """Return the digest of all decisions for the parameter value with the given ordinal."""
         if place not in self.known:
             self.run(place)
         return self.known[place].digest
 
     def bisect(self, a: int, b: int, pending: list[tuple[int, int]]) -> tuple[int, int]:
-        """Bisect to adjacent ordinals with different histories; push halves not followed onto `pending`."""
+        """Bisect to adjacent ordinals with different histories; append the other halves to `pending`."""
         while b - a > 1:
             middle = (a + b) // 2
             here = self.digest(middle)
@@ -173,7 +173,7 @@ class NumberLine:
         return a, b
 
     def boundary(self, below: int, above: int) -> Boundary | None:
-        """Compare the runs at two ordinals whose decisions differ; return None if a run fails first."""
+        """Compare the runs at two ordinals whose decisions differ; return None if a run fails earlier."""
         places = (below, above)
         runs = [self.run(place) for place in places]
         step = runs[0].first_difference(runs[1])
@@ -212,21 +212,21 @@ def boundaries(
     confirm: bool = True,
     progress: Progress | None = None,
 ) -> BoundaryMap:
-    """Find where the decisions of a run change along a number, within the resolution of a grid.
+    """Find the values of a parameter at which the decisions of a run change, within the resolution of a grid.
 
-    The system is run at every point of a grid. A cell whose ends have different histories is bisected until
-    its ends are adjacent floats. The other half, if it contains a change too, is searched later. The search
-    proceeds upward from the lowest float, so if there are more boundaries than requested, the rest lie above
-    all that were found. All runs use the program that a user runs (for the cutoff radius, a program that
-    takes the radius as an argument). A fresh process repeats the runs on both sides of every boundary.
+    The system is run at every grid point. A grid cell is bisected if the histories at its ends differ, until
+    the ends are adjacent floats. If the other half contains a change too, it is searched later. The search
+    proceeds upward from the lowest value, so if there are more boundaries than requested, the others are
+    above those found. All runs use the same program as a normal run; for the cutoff radius, with the radius
+    as an argument. A new process repeats the runs on both sides of every boundary.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.
-        cells: number of grid cells. If this is at least the number of floats, every float is run.
+        cells: number of grid cells. If there are no more floats than this, a run is made for every float.
         progress: called with the number of items done, their total, and a dictionary: the phase and the unit.
 
     Raises:
-        InputError: the number does not exist, the interval is empty, or a value is invalid.
+        InputError: the parameter does not exist, the interval is empty, or a value is invalid.
 
     Error: boundaries are exact: the two sides are adjacent floats whose runs made different decisions.
     """
@@ -260,10 +260,10 @@ def boundaries(
 
 
 def checked(program: Program, key: str, low: float, high: float) -> Number:
-    """Return the number of a key, after checking that an interval of its values is valid for this program.
+    """Return the parameter with this key, after checking that the program can use all values of an interval.
 
     Raises:
-        InputError: the number does not exist, or the interval is invalid (the message gives the reason).
+        InputError: the parameter does not exist, or the interval is invalid (the message gives the reason).
     """
     number = program.number(key)
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
@@ -278,7 +278,7 @@ def checked(program: Program, key: str, low: float, high: float) -> Number:
 
 
 def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
-    """Return the ordinals of the grid points: evenly spaced floats, or all floats of the interval."""
+    """Return the ordinals of the grid points: evenly spaced floats, or all floats in the interval."""
     first, final = line.places([low, high])[0], line.places([low, high])[-1]
     if final - first <= cells:
         return list(range(first, final + 1))
@@ -286,7 +286,7 @@ def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
 
 
 def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progress) -> list[Boundary]:
-    """Mark each boundary as confirmed or not, by repeating the runs on both sides in a fresh process."""
+    """Repeat the runs on both sides of each boundary in a new process, and record whether they agree."""
     sides = [side for boundary in found for side in (boundary.below, boundary.above)]
     digests = digests_elsewhere(
         system,
@@ -300,7 +300,7 @@ def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progr
 
 
 def _mapped(line: NumberLine, found: list[Boundary]) -> BoundaryMap:
-    """Assemble the boundary map from all runs, sorted by the value of the number."""
+    """Assemble the boundary map from all runs, in ascending order of the parameter."""
     places = sorted(line.known)
     values = [line.value(place) for place in places]
     points = [line.known[place] for place in places]

@@ -1,13 +1,13 @@
-"""Reliability of decisions: those of each run by itself, and those of one run relative to another run.
+"""Reliability of decisions: of each run by itself, and of one run relative to another run.
 
-There are three dates (steps). Up to the *certified horizon* of a run no decision was within its rounding
-bound: exact arithmetic, applied to the same states, would have given every decision the same result. Up to
-the end of *protection*, the pair closest to its cutoff was further from it than the separation of the runs
-can have moved the pair. As long as both conditions hold, no decision can differ. If one program is at least
-as precise in every role, the other program makes the same decisions up to the *shadow horizon*.
+Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound: exact arithmetic
+would give the same decisions for the same states. Up to the end of *protection*, the pair of atoms closest to
+its cutoff was further from the cutoff than the separation of the two runs can have moved this pair. Up to the
+earlier of these steps, all decisions of the two runs agree. If one program is at least as precise in every
+role of its arithmetic, the other makes the same decisions up to the *shadow horizon*.
 
-All dates refer to decisions given the state at their step. A decision that is correct for its state is
-correct for this run, which may have left the exact history long before (`forks.exact.certify` finds when).
+All these steps refer to decisions for the states of the run. A run whose decisions are all correct for its
+states may have left the exact history long before (`forks.exact.certify` finds when).
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Horizon:
 
 @dataclass(frozen=True)
 class Certified:
-    """The three dates of a pair of runs."""
+    """Certified horizons, end of protection and shadow horizon of a pair of runs."""
 
     # by run, "A" and "B"; nothing for many-body potentials, which decide inside their energy function,
     # without a rounding bound
@@ -70,7 +70,7 @@ class Certified:
 
 
 def certified(fork: Fork) -> Certified:
-    """Compute the three dates of a pair of runs."""
+    """Compute the certified horizons, the end of protection and the shadow horizon of a pair of runs."""
     twin, last = fork.twin, fork.steps
     if twin.a.imposable or twin.b.imposable:
         return Certified({}, None, None, None)
@@ -92,11 +92,11 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 
 
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """Return the distance of the nearest pair from its cutoff and the required distance (lengths), per step.
+    """Return, per step, the distance of the nearest pair from its cutoff and the required distance (lengths).
 
-    Each of two atoms may be displaced by the separation of the runs, so their distance may be wrong by twice
-    the separation. The margins are those of the run with the smaller rounding error, which is added to the
-    required distance.
+    Each of two atoms may be displaced by the separation of the runs, so their distance may change by twice
+    the separation. The margins are taken from the run with the smaller rounding error; this error is added to
+    the required distance.
     """
     deciders = {"A": fork.twin.a.simulation.decider, "B": fork.twin.b.simulation.decider}
     a, b = deciders.values()
@@ -107,15 +107,15 @@ def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray
 
 
 def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
-    """Return the thresholds of the decisions, in the program's dtype, as distances."""
+    """Return the decision thresholds as distances, in the dtype of the program."""
     values = np.array([threshold.value for threshold in decider.thresholds])
     return np.sqrt(values) if decider.space == "r2" else values
 
 
 def wider(twin: Twin) -> str | None:
-    """Return the program whose precision is higher in some role and lower in none; None if there is none.
+    """Return the program with higher precision in some role and lower precision in none, or None.
 
-    The programs must be identical otherwise: the effect of another time step, for example, is not rounding.
+    The programs must be identical otherwise: a different time step, for example, is not rounding.
     """
     a, b = twin.a.simulation, twin.b.simulation
     if twin.a.begin is not None or twin.b.begin is not None or _but_for_roles(a) != _but_for_roles(b):
@@ -131,7 +131,7 @@ def wider(twin: Twin) -> str | None:
 
 
 def _but_for_roles(run: Simulation) -> tuple[Any, ...]:
-    """Return the properties of a program that must be the same in its shadow."""
+    """Return the properties that must be the same in two programs that differ only in precision."""
     tables = program(run)
     tables["precision"] = {key: value for key, value in tables["precision"].items() if key not in ROLES["md"]}
     return tables, repr(run.reduction)
@@ -142,7 +142,7 @@ def _but_for_roles(run: Simulation) -> tuple[Any, ...]:
 
 @dataclass(frozen=True)
 class AmbiguousDecision:
-    """A decision closer to its threshold than its rounding bound."""
+    """A decision whose distance from the threshold is smaller than the rounding bound."""
 
     # step, i, j: which decision; i < j
     step: int
@@ -157,7 +157,7 @@ class AmbiguousDecision:
 
 @dataclass(frozen=True)
 class CertifiedHorizon:
-    """The certain decisions of one run, given the states of that run."""
+    """The steps for which all decisions of one run are certain, given the states of that run."""
 
     # first step with an ambiguous decision; every decision before it would have come out the same in exact
     # arithmetic from the same states. None where there is none
@@ -173,7 +173,7 @@ def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
     arithmetic.
 
     Raises:
-        InputError: the rebuild rule may miss pairs.
+        InputError: the rule for rebuilding neighbor lists may miss pairs.
     """
     if not simulation.rule.safe:
         raise InputError(
@@ -205,11 +205,11 @@ def exact_margin(
     end: Float[np.ndarray, "3"],
     kind: int = 0,
 ) -> tuple[Fraction, bool]:
-    """Compute the margin of a pair without rounding, and the decision that follows from it.
+    """Compute the margin of a pair without rounding, and the decision that follows from this margin.
 
-    Positions are the floats of the state. The threshold and the lattice vectors are the doubles of the
-    system, as in the exact program, whatever the dtype of the decision. In the space of r the margin is
-    accurate to 400 binary digits; the decision is exact.
+    The positions are the floating-point numbers of the state. The threshold and the lattice vectors are the
+    doubles of the system, as in the exact program, whatever the dtype of the decision. As a distance, the
+    margin is accurate to 400 binary digits; the decision is exact.
 
     Args:
         start, end: positions of the two atoms, length.

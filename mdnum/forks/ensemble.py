@@ -1,7 +1,7 @@
-"""Ensembles of runs of one program from slightly perturbed starts, measured at a few steps; planted changes.
+"""Runs from slightly perturbed starts, features measured at some steps, and programs with deliberate changes.
 
-Every feature is a continuous function of the positions, so small differences between the members of a short
-run remain small in the features. Therefore pairs are counted with hat functions and not in bins.
+Every feature is a continuous function of the positions, so that small differences between members remain
+small in the features of short runs. Pairs are therefore counted with hat functions and not in bins.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ _NUMBERS = (
 
 
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
-    """Return ascending distances at which the hats of the pair histogram peak, then its upper end.
+    """Return the distances of the peaks of the pair histogram's hat functions, ascending, then the upper end.
 
-    The distances range from that of the closest pairs of a start to the largest distance that is counted.
+    The distances extend from that of the closest pairs in a start to the largest distance that is counted.
     """
     simulation = simulation.in_row(start.state.cells[0])
     half = float(np.min(simulation.cell.widths)) / 2
@@ -55,16 +55,16 @@ def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]
 
 
 def feature_names(nodes: Float[np.ndarray, "nodes"]) -> tuple[str, ...]:
-    """Return the names of the features in the order in which `measure` returns their values."""
+    """Return the names of the features, in the order of the values returned by `measure`."""
     return (*_NUMBERS, *(f"pairs at distance {r:.3g}" for r in nodes[:-1]))
 
 
 def measure(
     simulation: Simulation, segment: Segment, nodes: Float[np.ndarray, "nodes"]
 ) -> Float[np.ndarray, "features"]:
-    """Compute the features at the last step of a segment, in the internal units of the system.
+    """Compute the features at the last step of a segment of a run, in the internal units of the system.
 
-    Energies, virial and forces are taken from the run; the pairs are counted with a separate neighbor list.
+    Energies, virial and forces are taken from the run; pairs are counted with a separate neighbor list.
     """
     potential, kinetic, virial = (
         float(segment.rows_of(name)[-1]) for name in ("potential", "kinetic", "virial")
@@ -105,10 +105,10 @@ def pair_distances(
 def hats(
     distances: Float[np.ndarray, "pairs"], nodes: Float[np.ndarray, "nodes"]
 ) -> Float[np.ndarray, "hats"]:
-    """Count distances in a histogram of hat functions: a distance between two nodes is shared between both.
+    """Count distances in a histogram of hat functions: each distance counts for the two nearest nodes.
 
-    Every node receives a share that grows linearly with proximity. Distances below the first node count for
-    the first node. The last node only ends the histogram, so a pair that moves out of range causes no jump.
+    The contribution to a node grows linearly with its proximity to the distance. Distances below the first
+    node count for this node. The last node only marks the end, so a pair moving out of range causes no jump.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)
@@ -122,7 +122,7 @@ def hats(
 
 
 def noise_size(simulation: Simulation) -> float:
-    """Return the displacement (length) of the furthest atom when a start is perturbed."""
+    """Return the displacement (length) of the most displaced atom in a perturbed start."""
     largest = np.abs(np.asarray(first_state(simulation).state.x)).max()
     return NOISE * float(np.spacing(np.float32(largest)))
 
@@ -134,7 +134,7 @@ def starts(simulation: Simulation, count: int, seed: int, start: Start | None = 
 
 
 def stretches(simulation: Simulation, start: Start, steps: Iterable[int]) -> Iterator[Segment]:
-    """Run to each of some ascending steps and yield the segment that ends there, until a blow-up."""
+    """Run to each of the ascending steps, and yield the run segment that ends there, until a run blows up."""
     for step in steps:
         for segment in Engine(simulation, step, start=start, record=False).segments():
             if segment.closes in FAILURES:
@@ -150,13 +150,13 @@ def ensemble(
     nodes: Float[np.ndarray, "nodes"],
     note: Callable[[], None] | None = None,
 ) -> Float[np.ndarray, "windows runs features"]:
-    """Measure the features of every run at every window; NaN from the window at which a run blew up.
+    """Measure the features of every run at every given step; NaN for steps after a run blew up.
 
     Args:
         begin: a start for each run.
-        windows: steps, ascending.
+        windows: steps at which features are measured, ascending.
         nodes: nodes of the pair histogram, see `nodes_of`.
-        note: called after each run.
+        note: function called after each run.
     """
     out = np.full((len(windows), len(begin), len(feature_names(nodes))), np.nan)
     slots = 0
@@ -172,9 +172,9 @@ def ensemble(
 
 
 def steps_to_diverge(simulation: Simulation, start: Start | None, separation: float, seed: int) -> int | None:
-    """Return the step at which two members of an ensemble are separated by a given length.
+    """Return the step at which the separation of two members of an ensemble reaches a given length.
 
-    The result is None if their separation is smaller for 20,000 steps, or if a run blows up.
+    The result is None if the separation remains smaller for 20,000 steps, or if a run blows up.
     """
     steps = range(_EVERY, _LONGEST + 1, _EVERY)
     pair = [stretches(simulation, one, steps) for one in starts(simulation, 2, seed, start)]
@@ -191,7 +191,7 @@ def steps_to_diverge(simulation: Simulation, start: Start | None, separation: fl
 
 @dataclass(frozen=True)
 class Change:
-    """A program with a deliberate change, to test whether the comparison detects it."""
+    """A program with a deliberate change, to test whether the comparison detects this change."""
 
     name: str  # of the change, for readers
     must_fail: bool  # whether it is another model; else only other rounding
@@ -200,11 +200,11 @@ class Change:
 
 
 def planted(a: Simulation) -> tuple[Change, ...]:
-    """Create the planted changes that apply to a simulation.
+    """Create the programs with deliberate changes that are possible for a simulation.
 
-    A longer time step and a shorter cutoff must fail. Forces in the other precision, pairs in another order
-    and lists built by the other search must pass. The cutoff and the precision of a many-body potential
-    cannot be changed, so these two changes are omitted for such a potential.
+    The programs with a longer time step and a shorter cutoff must fail the comparison. Forces in another
+    precision, pairs in another order and the other neighbor search must pass. The cutoff and the precision of
+    a many-body potential cannot be changed, so these two programs are omitted for such a potential.
     """
     longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
     search = next(name for name in BUILDERS if name != a.builder)

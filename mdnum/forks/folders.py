@@ -1,11 +1,10 @@
-"""Where two finished runs diverge, and how the runs differ, according to their folders.
+"""Find where two finished runs diverge, and how the runs differ, using only their folders.
 
-No run is repeated. The first differing bit and the fork are read from the tables of both folders. To compare
-positions, `twin_of` rebuilds both programs from the folders, and `mdnum.forks.fork` runs both again.
+Neither run is repeated. The first differing bit and the fork (first differing decision) are read from tables
+in both folders. For positions, `twin_of` rebuilds both programs, and `mdnum.forks.fork` repeats the runs.
 
-Two runs belong to different systems if their steps or subjects do not correspond: different atoms, another
-box, another potential or another contact. Any other difference, in a number or in a choice of the program, is
-allowed, however large.
+Steps or decisions of two runs do not correspond if the systems differ in their atoms, box, potential or
+contact. Any other difference, in a parameter or in a choice of the program, is allowed, however large.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ _SAME = 1e-6
 
 @dataclass(frozen=True)
 class StoredFlip:
-    """A stored flip that only one of two runs has."""
+    """A flip stored in the folder of only one of two runs."""
 
     # run, step: which run has it, "A" or "B", and when
     run: str
@@ -71,7 +70,7 @@ class StoredFlip:
 
 @dataclass(frozen=True)
 class FolderFork:
-    """The point at which two runs diverge, as read from their folders."""
+    """The point at which two runs diverge, read from their folders."""
 
     # world, a, b: "md" or "ball", and the folders
     world: str
@@ -93,16 +92,16 @@ class FolderFork:
 
 
 def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> FolderFork:
-    """Find where two runs diverge, using their folders.
+    """Find the point at which two runs diverge, from their folders.
 
     Args:
         a, b: run folders, both of molecular dynamics or both of a ball; or folders of `mdnum flips` and
-            `mdnum.Recorder`, whose steps are frames.
+            `mdnum.Recorder`, in which steps are frames.
 
     Raises:
-        InputError: the runs belong to different worlds or systems, so that their steps do not correspond (the
-            message names the difference); or a folder holds the result of a fork.
-        FolderError: a folder holds no run.
+        InputError: one run is of molecular dynamics and one of a ball, or the systems differ, so that steps
+            do not correspond (the message names the difference); or a folder holds the result of a fork.
+        FolderError: a folder does not contain a run.
     """
     first = a if isinstance(a, RunFolder) else RunFolder.open(a)
     second = b if isinstance(b, RunFolder) else RunFolder.open(b)
@@ -124,10 +123,10 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
 
 
 def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bool = True) -> Any:
-    """Load the simulation or the ball's system of a run folder.
+    """Load the simulation or the ball system from a run folder.
 
     Args:
-        objects: candidate simulations, one of which produced the run; needed if it was made from objects.
+        objects: simulations, one of which produced the run; required if the run was made from objects.
         built: False to leave a system file unbuilt, so that code named in the file is not executed.
 
     Raises:
@@ -148,7 +147,7 @@ def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bo
 
 
 def twin_of(found: FolderFork, objects: Sequence[Simulation] = ()) -> Twin:
-    """Rebuild the programs of two molecular-dynamics folders, to run them again (for `objects` see
+    """Rebuild the programs of two molecular-dynamics folders to repeat the runs (`objects`: see
     `simulation_in`).
 
     A replay agrees bit for bit with the stored run if versions and processor are the same.
@@ -195,7 +194,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
-    """Find where the decisions on the positions of two loops or files diverge."""
+    """Find where the decisions for the positions of two trajectories or simulation loops diverge."""
     summaries, names = (first.summary, second.summary), ("rule", "i", "j", "rank")
     rules, between = ([each[name] for each in summaries] for name in ("rules", "between"))
     names_of = [", ".join(one["rule"] for one in each) for each in rules]
@@ -226,8 +225,8 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """Return the choices that a set of differing keys stands for: all dtypes by role are one choice; a cutoff
-    with its numbers is one choice too.
+    """Return the choices to which differing keys of the system file belong: all dtypes of roles are one
+    choice; a cutoff with its parameters is one choice too.
     """
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}
@@ -248,7 +247,7 @@ def _different(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Differe
 def _alone(
     first: RunFolder, second: RunFolder, table: str, labels: tuple[str, ...], steps: int, clock: str = "step"
 ) -> tuple[int | None, list[StoredFlip]]:
-    """Return the first step at which only one of two tables has a flip, and the flips of that step."""
+    """Return the first step with a flip that only one of two tables contains, and these flips."""
     known = [folder.table(table, rows=1).column_names for folder in (first, second)]
     names = (clock, *labels, "entered", *["terms"] * all("terms" in one for one in known))
     further = ("distance", "ambiguous") if table == "flips" else ()
@@ -316,7 +315,7 @@ def _ball_dates(first: RunFolder, second: RunFolder) -> dict[str, Any]:
 
 
 def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], where: str) -> list[Difference]:
-    """List how the atoms of two runs differ at step 0."""
+    """List the differences between the atoms of two runs at step 0."""
     from ase import Atoms
     from ase.io import read
 
@@ -357,7 +356,7 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
 
 
 def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
-    """Compare two sets of atoms by property; yield whether each agrees, and a message if not."""
+    """Compare two sets of atoms property by property; yield whether they agree, and a message if not."""
     yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
     symbols = [each.get_chemical_symbols() for each in (one, other)]
     yield symbols[0] == symbols[1], "species or their order differ"

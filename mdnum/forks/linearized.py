@@ -1,15 +1,15 @@
 """The linearized run: how a small perturbation of the start grows, and which decisions it changes.
 
-The tangent is propagated along the states that the run recorded, so the linearized run is the recorded run,
-bit for bit, with the same neighbor lists. The growth rate of the tangent is the largest Lyapunov exponent.
-The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn 1980), so the tangent does not
-saturate, whereas the separation of two runs does.
+The tangent is propagated along the recorded states of the run, with the same neighbor lists, so the reference
+trajectory is the recorded run, bit for bit. The exponential growth rate of the tangent is the largest
+Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn 1980) and
+therefore does not saturate, whereas the separation of two runs does.
 
-Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation: to first
-order the decision flips at a = -m / (dm/da). The smallest of these amplitudes at each step covers all
-perturbations, as long as the perturbed run remains close to the run and makes the same decisions. If the
-force jumps at the cutoff, the first flip kicks the two atoms, and from then on the linearization describes
-another run: the forecast ends there. If the force is continuous, a flip changes nothing to first order.
+Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation: to first order
+the decision flips at a = -m / (dm/da). The smallest of these amplitudes at each step is a limit for all
+perturbations, as long as the perturbed run remains close to the reference run and makes the same decisions.
+If the force jumps at the cutoff, the first flip kicks the two atoms; the linearization then describes another
+run, and the forecast ends. If the force is continuous, a flip changes nothing to first order.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _ULPS = 8.0
 
 @dataclass(frozen=True)
 class StepTangents:
-    """The tangent of a run during the steps of one neighbor list."""
+    """The tangent of a run during the steps that use one neighbor list."""
 
     segment: Segment  # the steps
     # log of the length of the tangent (positions, and velocities times 30 time steps) at each step, relative
@@ -81,7 +81,7 @@ def tangents(
 
     Args:
         simulation: a simulation with a pair potential.
-        dx: perturbation of the positions per amplitude, length. dv: perturbation of the velocities.
+        dx: perturbation of the positions per amplitude, length. dv: that of the velocities.
         reach: whether to compute the amplitudes at which decisions flip.
 
     Raises:
@@ -141,7 +141,7 @@ def _length(tangent, clock: float) -> float:
 
 
 def _labels(segment: Segment, slot: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-    """Return the atom pairs in the given flat slots, or -1 for an empty slot."""
+    """Return the atom pairs in the given slots of the flattened neighbor list, or -1 for an empty slot."""
     order = segment.table.order
     row, column = np.divmod(slot, len(order))
     ends = np.stack([order[column], np.append(order, -1)[segment.table.index[row, column]]], axis=-1)
@@ -206,7 +206,7 @@ def _carry(
 
 @dataclass(frozen=True)
 class Lyapunov:
-    """Growth of the tangent along a run: the largest Lyapunov exponent."""
+    """Growth of the tangent along a run, with the largest Lyapunov exponent."""
 
     # steps, timestep: of the run; the time step in the units of the system's file
     steps: int
@@ -225,29 +225,29 @@ class Lyapunov:
 
     @property
     def rate_time(self) -> float:
-        """Lyapunov exponent per unit of time of the system's file."""
+        """Lyapunov exponent per unit of time, in the time unit of the system file."""
         return self.rate / self.timestep
 
     @property
     def error_time(self) -> float:
-        """Standard error of the exponent per unit of time."""
+        """Standard error of the Lyapunov exponent per unit of time."""
         return self.error / self.timestep
 
     def ratio(self, seen: Growth) -> float:
-        """Return the growth rate of two runs divided by the exponent; NaN if no growth was found.
+        """Return the ratio of two runs' growth rate to the Lyapunov exponent; NaN if no growth was found.
 
-        A ratio near 1 means that the dynamics separated the runs; a ratio well above 1, that flips did.
+        A ratio near 1 means that the dynamics separated the runs; a ratio well above 1 means that flips did.
         """
         return seen.rate / self.rate if self.chaotic else float("nan")
 
     def steps_to(self, start: float, end: float) -> float | None:
-        """Return the step at which a displacement of the start has grown from one size to another.
+        """Return the step at which a displacement of the start has grown from one length to another.
 
-        Growth is taken from the run, and extrapolated at the exponential rate beyond its end. The result is
-        None if the run is not chaotic and the displacement does not reach the final size.
+        The growth is taken from the run, and extrapolated exponentially beyond its end. The result is None if
+        the run is not chaotic and the displacement does not reach the final size.
 
         Args:
-            start: largest displacement of an atom at the start, length; an ulp, for example.
+            start: largest displacement of an atom at the start, length; for example one rounding unit.
             end: final size of the largest displacement, length.
         """
         wanted = float(np.log(end / start))
@@ -264,12 +264,12 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
 
     Args:
         simulation: a simulation with a pair potential.
-        seed: random seed of the initial perturbation, which consists of random displacements.
+        seed: random seed of the initial perturbation, which displaces all atoms randomly.
 
     Raises:
         InputError: the potential is a many-body potential, or the run is too short for an error estimate.
 
-    Error: statistical, see Lyapunov.error. Flips at a hard cutoff do not act on a tangent, so growth caused
+    Error: statistical, see Lyapunov.error. Flips at a hard cutoff do not change the tangent, so growth caused
         by flips alone is not included.
     """
     last = simulation.steps if steps is None else steps
@@ -293,7 +293,7 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
 
 @dataclass(frozen=True)
 class PredictedFlip:
-    """A decision that a perturbation is predicted to flip."""
+    """A decision that a perturbation of the start is predicted to flip."""
 
     # step, i, j: of the decision, i < j
     step: int
@@ -306,7 +306,7 @@ class PredictedFlip:
 
 
 class ForecastRange(NamedTuple):
-    """The last step at which a forecast for one amplitude is valid, and the reason why it ends there."""
+    """The last step for which a forecast for one amplitude is valid, and the reason why it ends there."""
 
     step: int  # the last one; -1 for none
     # why there: "end" of the run; "flip", the first one kicks its atoms; "close", whether a decision of the
@@ -317,10 +317,10 @@ class ForecastRange(NamedTuple):
 
 @result
 class Forecast:
-    """First-order prediction of the decisions that perturbations of the start along one direction will flip.
+    """First-order prediction of the decisions flipped by perturbations of the start along one direction.
 
-    Error: second order in the displacement, plus a few ulps; a decision whose flip is uncertain within this
-        error is not predicted. `good_until` returns the last step of a valid forecast.
+    Error: second order in the displacement, plus a few rounding units; flips that are uncertain within this
+        error are not predicted. `good_until` returns the last step for which the forecast is valid.
     """
 
     # simulation, steps: the run
@@ -346,11 +346,11 @@ class Forecast:
 
     @property
     def kicks(self) -> bool:
-        """True if the force jumps at a flip, so that the flip changes all later motion."""
+        """True if the force jumps at a flip, so that the flip changes all subsequent motion."""
         return self.simulation.cutoff.smoothness < 1
 
     def good_until(self, amplitude: float) -> ForecastRange:
-        """Return the last step at which the forecast for an amplitude is valid, and what ends it."""
+        """Return the last step for which the forecast at an amplitude is valid, and why it ends there."""
         listed = self._until(2 * abs(amplitude) * self.furthest > self.room)
         ends = ((self.steps, "end"), (self.linear_until(amplitude), "size"), (listed, "list"))
         last = min((ForecastRange(*end) for end in ends), key=lambda one: one.step)
@@ -365,7 +365,7 @@ class Forecast:
         return last
 
     def first(self, amplitude: float, count: int = 3) -> tuple[PredictedFlip, ...]:
-        """Predict the decisions that a perturbation flips first, by step, as far as the forecast is valid.
+        """Predict the first decisions that a perturbation flips, by step, while the forecast is valid.
 
         At most `KEPT` flips of a step are listed; a step with `KEPT` flips may have more.
 
@@ -382,10 +382,10 @@ class Forecast:
         return _each_pair_once(flips, count)
 
     def nearest(self, count: int = 10) -> tuple[PredictedFlip, ...]:
-        """Return the decisions that are flipped at the smallest amplitudes of either sign, each pair once.
+        """Return the decisions flipped at the smallest amplitudes of either sign, one for each atom pair.
 
-        A flip is included only if its forecast is valid up to its step: where flips kick the atoms, a flip
-        that follows another one cannot be predicted at any amplitude.
+        A flip is included only if the forecast is valid up to its step: if flips kick the atoms, a flip that
+        follows another flip cannot be predicted at any amplitude.
         """
         # where flips kick, only what flips sooner or at less than all before it can be the first
         least = np.minimum.accumulate(self.reach.min(axis=2), axis=1)
@@ -406,7 +406,7 @@ class Forecast:
         return int(beyond.argmax()) - 1 if beyond.any() else self.steps
 
     def _error(self, amplitude: float) -> Float[np.ndarray, "rows"]:
-        """Estimate the relative error of the predicted amplitude of a flip at each step."""
+        """Estimate the relative error of the predicted amplitude of a flip, for each step."""
         size = abs(amplitude)
         with np.errstate(divide="ignore", over="ignore"):
             return _SECOND_ORDER * size * self.furthest / self.simulation.r_cut + _ULPS * self.ulp / size
@@ -420,7 +420,7 @@ class Forecast:
 
 
 def _each_pair_once(flips: Iterable[PredictedFlip], count: int) -> tuple[PredictedFlip, ...]:
-    """Return the first `count` flips of different pairs."""
+    """Return the first `count` flips, no more than one for each pair of atoms."""
     found: dict[tuple[int, int], PredictedFlip] = {}
     for flip in flips:
         found.setdefault((flip.i, flip.j), flip)
@@ -441,7 +441,7 @@ def forecast(
 
     Args:
         simulation: a simulation with a pair potential.
-        dx, dv: the direction; default random displacements whose maximum is 1, so that an amplitude is the
+        dx, dv: the direction; default random displacements whose maximum is 1, so that the amplitude is the
             largest displacement.
         seed: random seed of a random direction.
 

@@ -1,4 +1,4 @@
-"""A pair of runs, followed until the runs split: steps of fork and split, deciding flip, and verdict."""
+"""Comparison of two runs until they split: steps of fork and split, the deciding flip, and the verdict."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ FLIPS_KEPT = 100_000
 
 @result
 class Fork:
-    """Result of tracking the distance between two runs.
+    """Result of comparing two runs step by step.
 
     Attributes:
         twin: the pair of programs.
         steps, asked: number of steps that were run, and number that was requested.
         tolerance: separation that counts as a split, length.
-        dates: first differing bit, fork and split. decision: the decision at the fork; None without a fork.
+        dates: steps of first differing bit, fork and split. decision: the decision at the fork, or None.
         series: columns of `PairRows` by step: "step"; separations from A: "B", "B|A", "A|B from A", "B 1",
             ... (repeats; those at the other displacement last; NaN once all have split); separations from B:
             "A|B" and "B|A from B"; "cross"; "overridden" and "furthest" of B|A; "energy A", ...; for
@@ -72,8 +72,8 @@ class Fork:
         verdict: verdict on the flips. repeats: splits of each repeat, free and under A's decisions, at the
             first displacement and at the other one. displacements: of the starts of the repeats that were
             run, length.
-        failed: runs that ended in "blow-up" or "runaway". If a free run fails, the comparison ends there; if
-            only one of them fails, the fork is at this step at the latest.
+        failed: runs that ended in "blow-up" or "runaway". If a run without imposed decisions fails, the
+            comparison ends there; if only one of the runs fails, the fork is at this step at the latest.
         runs: A, B and the counterfactual runs by name, if the world keeps whole runs.
     """
 
@@ -108,20 +108,20 @@ def fork(
     repeats: int | None = None,
     progress: Progress | None = None,
 ) -> Fork:
-    """Follow two runs until they have split, and judge how much the flips contributed to the split.
+    """Compare two runs step by step until they split, and measure how much the flips contribute to the split.
 
     Args:
         twin: the pair of programs.
-        steps: last step; default the system's own. Molecular dynamics ends at twice the step of the split at
-            the latest. If the split is near the last step, the runs continue to 1.2 times the split, to
-            distinguish a cause from a delay.
-        split: separation that counts as split, length; default 0.01 of the longest cutoff or start height.
+        steps: last step; default the last step of the system. A comparison of molecular-dynamics runs ends at
+            twice the step of the split at the latest. If the split is near the last step, the runs continue
+            to 1.2 times the step of the split, to distinguish a cause from a delay.
+        split: separation that counts as a split, length; default 0.01 of the longest cutoff or start height.
         counterfactual: whether to run B under A's decisions, which is impossible for many-body potentials.
         back: whether to run A under B's decisions too; default: only if B is run under A's decisions.
-        repeats: largest number of repeats of B, each free and under A's decisions; default 15. Their starts
-            are displaced at random by the initial separation of the runs (an ulp at least). If the runs split
-            either way, they are run until the verdict is clear, and then at a hundredth of the displacement.
-        progress: called with the step reached, the last step, and figures.
+        repeats: largest number of repeats of B, each run freely and under A's decisions; default 15. Their
+            starts are displaced randomly by the initial separation of the runs (at least an ulp). If the runs
+            split either way, repeats are made until the verdict is clear, then at 1/100 of the displacement.
+        progress: called with the step reached, the last step, and current values.
 
     Raises:
         InputError: steps is below 1, the programs cannot be compared, or requested counterfactual runs are
@@ -169,7 +169,7 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Return whether to run B under A's decisions and A under B's, and the largest number of repeats.
+    """Return whether to run B under A's decisions, whether to run A under B's, and the maximum of repeats.
 
     Raises:
         InputError: a requested counterfactual run or repeat is not possible.
@@ -208,16 +208,16 @@ def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such ru
 
 
 def _beyond(step: int) -> int:
-    """Return the step up to which a run must be followed for a split to be significant."""
+    """Return the step to which a run must be continued for the absence of a split to be significant."""
     return int(np.ceil(PATIENCE * step)) + 1
 
 
 def displacements(fork: Fork) -> tuple[float, float]:
-    """Return two displacements (lengths) for starts of repeats: the runs' initial separation, and less.
+    """Return two displacements (lengths) for starts of repeats: the initial separation of the runs, and less.
 
-    At a hundredth of the first displacement a repeat begins to have the pair's rounding errors; at much less,
-    the repeat equals the pair itself and proves nothing. If a hundredth is less than an ulp, the second
-    displacement may be larger than the first.
+    At a hundredth of the first displacement, a repeat begins to have the same rounding errors as the pair of
+    runs; at much smaller displacements, the repeat equals the pair and proves nothing. If a hundredth is less
+    than an ulp, the second displacement may be larger than the first.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]
@@ -323,7 +323,7 @@ def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
 
 @result
 class Screened:
-    """Effect of one choice within the steps that were run."""
+    """Effect of one numerical choice within the steps that were run."""
 
     choice: str  # its name
     difference: str  # one line; why it does not apply where it does not
@@ -338,7 +338,7 @@ class Screened:
 
     @property
     def held(self) -> bool | None:
-        """True if no bit differed in these steps; None if the choice was not run."""
+        """True if all bits agreed in these steps; None if the choice was not run."""
         return None if self.reason_unavailable is not None else self.first_bit is None
 
 
@@ -351,10 +351,10 @@ def screen(
     """Compare runs of a system for every choice, without counterfactual runs; earliest fork first.
 
     Args:
-        system: a loaded system.
+        system: a system that was loaded from a file.
         steps: last step of each run; default the system's own.
         choices: choices to test; default all built-in choices of the system's world.
-        progress: called with the number of choices done, their total, and the name of the next one.
+        progress: called with the number of choices done, their total, and the name of the next choice.
 
     Raises:
         InputError: no choice is given, or steps is below 1.

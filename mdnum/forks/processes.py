@@ -1,12 +1,12 @@
-"""Computations in separate processes: decisions computed again, and one system run by several programs.
+"""Separate processes that repeat decisions, or run one system in several differently compiled programs.
 
 Programs of one system (compiled or not, batched, inside a gradient, for other processors) compute the same
-formulas, but the compiler is free to round them differently. XLA's flags apply to a whole process, so each
-variant runs in its own process. Variants whose positions have equal hashes at every step are numerically one
-program; if the hashes differ, the pattern of agreement reveals the cause.
+formulas, but the compiler may round them differently. XLA flags apply to a whole process, so each variant of
+the program runs in its own process. Variants whose positions have equal hashes at every step are numerically
+the same program; if the hashes differ, the pattern of agreement between variants reveals the cause.
 
-`python -m mdnum.forks.processes FILE` answers the question in a JSON file. For `digests_elsewhere` the answer
-is one digest per line on standard output; for `variants`, a file with an array of positions.
+`python -m mdnum.forks.processes FILE` executes the task described in a JSON file. For `digests_elsewhere`,
+the result is one digest per line on standard output; for `variants`, a file with an array of positions.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _NO_FMA = ("--xla_cpu_max_isa=AVX",)
 
 @dataclass(frozen=True)
 class Variant:
-    """One of several ways to run the same steps."""
+    """One of several programs that run the same steps."""
 
     name: str  # what to call it
     # "scan" (one compiled loop), "rollout" (mdnum's own), "vmap" (the first of a batch of equal copies),
@@ -84,7 +84,7 @@ VARIANTS: tuple[Variant, ...] = (
 
 @dataclass(frozen=True)
 class Ran:
-    """Result of running a variant."""
+    """Result of running one variant of the program."""
 
     variant: Variant  # which
     hashes: tuple[str, ...]  # of the positions at steps 1, 2, ..., hexadecimal; empty where it failed
@@ -98,18 +98,18 @@ class Ran:
 
     @property
     def separation(self) -> float:
-        """Largest separation from the reference at the last common step; NaN if the variant failed."""
+        """Largest separation from the reference run at the last common step; NaN if the variant failed."""
         return float(self.separations[-1]) if len(self.separations) else float("nan")
 
     def agrees(self, other: Ran) -> bool:
-        """Return True if both variants have the same positions at all common steps."""
+        """Return True if two variants have the same positions at all common steps."""
         common = min(len(self.hashes), len(other.hashes))
         return common > 0 and self.hashes[:common] == other.hashes[:common]
 
 
 @result
 class Variants:
-    """Variants of one system, grouped by their results."""
+    """Variants of the program of one system, grouped by their results."""
 
     rows: tuple[Ran, ...]  # one a variant, in the order asked for
     reference: str  # name of the one that the others are compared with: the first that ran
@@ -130,17 +130,17 @@ def variants(
     which: Sequence[Variant] = VARIANTS,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Variants:
-    """Run a system in several programs, two processes at a time, and find which results agree.
+    """Run a system in several variants of its program, two processes at a time, and find which results agree.
 
-    All programs use a single neighbor list, with twice the skin if the box has room, and stop before motion
-    exceeds it. Another machine may give other clusters: some processors have no fused multiply-add.
+    All variants use a single neighbor list, with twice the skin if the box is large enough, and stop before
+    motion exceeds this skin. Other machines may give other clusters: some processors lack fused multiply-add.
 
     Args:
         system: a system that was loaded from a file and has a pair potential.
-        steps: steps of each program; the eager program runs only twelve.
-        which: variants; the first one that succeeds is the reference for the others. The row of a variant
+        steps: steps of each variant; the variant without compiler runs only twelve.
+        which: variants; the first variant that succeeds is the reference for the others. The row of a variant
             that fails or takes too long contains the reason.
-        progress: called with the number of finished variants, their total, and the name of the last one.
+        progress: called with the number of finished variants, their total, and the name of the last variant.
 
     Raises:
         InputError: the potential is a many-body potential, or there are no steps or no variants.
@@ -212,7 +212,7 @@ def _ran(variant: Variant, question: Mapping[str, Any], file: Path) -> tuple[Ran
 
 
 def clustered(rows: Sequence[Ran]) -> list[Ran]:
-    """Add cluster numbers to the rows; the cluster of the reference, the first variant that ran, is 0."""
+    """Add cluster numbers to the rows; the first variant that succeeded, the reference, is in cluster 0."""
     reference = next((row for row in rows if not row.failed), None)
     # the longest of each cluster stands for it, so that a short run joins whom it agrees with
     heads: list[Ran] = []
@@ -226,11 +226,11 @@ def clustered(rows: Sequence[Ran]) -> list[Ran]:
 
 
 def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
-    """Derive causes from the pattern of agreement, by code; variants that were not run give no cause.
+    """Derive causes, as codes, from the pattern of agreement; variants that were not run give no cause.
 
     Codes: "fused", "others" and "not_fused" for programs without fused operations; "eager_..." for the
     program without a compiler; "same", "fuses", "orders" and "leaves" for other programs, named in "program";
-    "reversed". If a program departs from the reference, "step" is the first differing step.
+    "reversed". If a variant departs from the reference, "step" is the first differing step.
     """
     by_name = {row.variant.name: row for row in rows if not row.failed}
     reference = next(iter(by_name.values()))
@@ -271,9 +271,9 @@ def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
 def positions_of(
     simulation: Simulation, steps: int, program: ProgramName
 ) -> Float[np.ndarray, "steps 3 atoms"]:
-    """Compute wrapped positions at steps 1, 2, ... with one program in this process, in the user's order.
+    """Compute wrapped positions at steps 1, 2, ... with one program, in this process and the user's order.
 
-    The result ends before an atom has moved by half the skin of the only list.
+    The result ends before an atom has moved by half the skin of the only neighbor list.
     """
     from mdnum.md.cell import displacement
     from mdnum.rollout.engine import Engine, first_state
@@ -350,7 +350,7 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
 
 
 def digests(system: Simulation | BallSystem, key: str, steps: int, values: Sequence[float]) -> list[str]:
-    """Compute digests of all decisions of a run, for some values of a number, one after another."""
+    """Compute digests of all decisions of a run for several values of a parameter, one after another."""
     number = program_of(system, steps).number(key)
     return [number.at(value).history(steps).digest for value in values]
 
@@ -362,10 +362,10 @@ def digests_elsewhere(
     values: Sequence[float],
     progress: Callable[[int], None] | None = None,
 ) -> list[str]:
-    """Compute the digests of decisions in a fresh process, to confirm boundaries independently.
+    """Compute the digests of decisions in a new process, to confirm boundaries independently.
 
-    The system is written to a folder and read there again, bit for bit, and its program is compiled again
-    under the same environment.
+    The system is written to a folder and read from there without rounding, and its program is compiled again
+    in the same environment.
 
     Args:
         progress: called with the number of known digests, at the start and after each one.
@@ -395,7 +395,7 @@ def digests_elsewhere(
 
 
 def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
-    """Return the system in a form that another process can read and recreate, bit for bit.
+    """Return the system in a form from which another process can recreate it, bit for bit.
 
     Raises:
         InputError: the system was made from objects, which exist only in this process.
@@ -414,7 +414,7 @@ def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
 
 
 def _question(system: Simulation | BallSystem, steps: int, folder: Path) -> dict[str, Any]:
-    """Assemble the input of a process: the system, written into a folder, and the last step."""
+    """Assemble the input of a process: the system, written to a folder, and the last step."""
     path = in_a_file(system).write(folder / "system")
     return {"path": str(path), "steps": steps, "code": is_allowed()}
 
@@ -426,7 +426,7 @@ def _ask(
     timeout: float | None = None,
     settings: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
-    """Run a process that answers a question; return the reason if the process fails, and "" otherwise.
+    """Run a process that executes a task; return the reason if the process fails, and "" otherwise.
 
     `heard` is called with each line that the process prints; `settings` are environment variables.
     """
@@ -464,7 +464,7 @@ def _ask(
 
 
 def main() -> None:
-    """Answer the question in the file named by the last command-line argument."""
+    """Execute the task described in the file named by the last command-line argument."""
     question: dict[str, Any] = json.loads(Path(sys.argv[-1]).read_text())
     with allow_code(question["code"]):
         system = opened(question["path"])

@@ -1,16 +1,16 @@
-"""Simulations whose neighbor lists hold the same pairs in another order: in the order of a jax-md format, or
+"""Simulations whose neighbor lists hold the same pairs in another order: that of a jax-md format, or
 shuffled.
 
-The forces of a pair on its two atoms are exactly opposite, so a format changes only the order of sums. Dense
-and sparse lists hold each pair twice, and half its force is added each time. A sparse list adds the halves
-from an atom's own row in one sum, the halves from rows that contain the atom in another sum, and then both
-sums; with sorted rows this is one loop by label. A dense list scatters the second half onto the sum of the
-first. An ordered-sparse list holds each pair once: an atom's terms with later atoms form one sum, those with
-earlier atoms another.
+The forces of a pair on its two atoms are exactly opposite, so that a list format changes only the order of
+the sums. Dense and sparse lists contain each pair twice, and each entry contributes half of the pair force.
+For a sparse list, the halves from an atom's own row form one sum, those from rows that contain the atom as a
+neighbor another, and both sums are added; with sorted rows this is one loop over atom labels. For a dense
+list, the second halves are added one by one to the sum of the first halves. An ordered-sparse list contains
+each pair once: the terms of an atom with later atoms form one sum, those with earlier atoms another sum.
 
 Source: jax_md.smap.pair_neighbor_list and the transpose of its gathers, whose forces have these orders bit
-for bit (tests/forks/test_choices.py, jax-md 0.2.29). One detail of XLA is not reproduced: a row with more
-than 32 slots is added in windows of 32.
+for bit (tests/forks/test_choices.py, jax-md 0.2.29). One detail of XLA is not reproduced: rows with more than
+32 slots are summed in blocks of 32.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _SUMS: Mapping[str, Reduction] = {"dense": Twice(), "sparse": Sequential(), "ord
 
 @dataclass(frozen=True)
 class ReorderedSimulation(Simulation):
-    """A simulation whose lists hold their pairs in another order."""
+    """A simulation whose neighbor lists hold their pairs in another order."""
 
     order: str | int = 0  # a format, or the seed of a shuffle
 
     @classmethod
     def of(cls, simulation: Simulation, order: str | int) -> ReorderedSimulation:
-        """Create a simulation with reordered lists and, for sums that depend on order, a format's sums."""
+        """Create a simulation with reordered lists and, if sums depend on order, a list format's sums."""
         same = _fields(Simulation, simulation)
         if isinstance(order, str) and simulation.reduction == Sequential():
             same["reduction"] = _SUMS[order]
@@ -45,11 +45,11 @@ class ReorderedSimulation(Simulation):
 
     @property
     def lists(self):
-        """Properties that identify the lists; a different order makes different lists."""
+        """Properties that identify the neighbor lists; lists in another order are different lists."""
         return (*super().lists, self.order)
 
     def verlet_list(self, skin: float | None = None) -> VerletList:
-        """Create the simulation's own Verlet list with the pairs in the other order."""
+        """Create the simulation's own Verlet list, with the pairs in the other order."""
         made = super().verlet_list(skin)
         if isinstance(self.order, str):
             return FormattedList(**_fields(VerletList, made), format=self.order)
@@ -63,7 +63,7 @@ def _fields(kind: type, value: object) -> dict:
 
 @dataclass
 class FormattedList(VerletList):
-    """A neighbor list whose slots are in the order in which a jax-md format adds the pair terms."""
+    """A neighbor list whose slots are in the order in which a jax-md list format adds the pair terms."""
 
     # "dense" or "sparse" (by label), or "ordered-sparse" (later atoms in the first half of the slots, earlier
     # ones in the second, both by label)
@@ -71,7 +71,7 @@ class FormattedList(VerletList):
     half: int = 0  # slots of one half; grows with what it must hold
 
     def build(self, positions, cell) -> PairTable:
-        """Build the pair table of the search, with the pairs in the order of the format."""
+        """Build the pair table of the neighbor search, with the pairs in the order of the list format."""
         table = super().build(positions, cell)
         atoms = len(table.order)
         labels = np.append(table.order, atoms)[table.index]
@@ -113,11 +113,11 @@ class ShuffledBuilder:
 
     @property
     def name(self) -> str:
-        """Name of the inner search."""
+        """Name of the neighbor search whose result is shuffled."""
         return self.inner.name
 
     def build(self, positions, cell, r_list, slots):
-        """Build the inner search's table with each atom's neighbors shuffled and the padding at the end."""
+        """Build the pair table, with the neighbors of each atom shuffled and the padding at the end."""
         table, order, most = self.inner.build(positions, cell, r_list, slots)
         table, atoms = np.asarray(table), table.shape[1]
         keys = np.random.default_rng(self.seed).random(table.shape)

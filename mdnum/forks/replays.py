@@ -1,9 +1,8 @@
-"""Molecular-dynamics runs repeated around a fork: the atoms near it, overridden decisions, and minimal
-causes.
+"""Molecular-dynamics runs repeated around a fork: nearby atoms, overridden decisions, and minimal causes.
 
-A decision is overridden by imposing A's decision on B; B makes all other decisions itself. The smallest set
-of pairs that keeps B with A is found by bisection and delta debugging, as Verrou finds the instructions that
-cause an error.
+To override a decision, the decision of run A is imposed on run B; B makes all other decisions itself. The
+smallest set of pairs whose overridden decisions keep B with A is found by bisection and delta debugging, the
+method by which Verrou finds the instructions that cause an error.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ _SAMPLES = 400
 
 @dataclass(frozen=True)
 class Neighborhood:
-    """The atoms around the deciding pair at the fork."""
+    """The atoms around the pair whose decision differs first, at the step of the fork."""
 
     # labels of A; the pair first, the others by their distance from its middle, shape (near,)
     atoms: Int[np.ndarray, "near"]
@@ -50,7 +49,7 @@ class Neighborhood:
 
 
 def neighborhood(fork: Fork) -> Neighborhood | None:
-    """Repeat both runs and return the atoms around the pair at the fork; None without a pair."""
+    """Repeat both runs and return the atoms around the pair at the fork; None if the fork has no pair."""
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
@@ -90,7 +89,7 @@ def neighborhood(fork: Fork) -> Neighborhood | None:
 
 @dataclass(frozen=True)
 class Pinned:
-    """Result of a run of B in which some decisions were overridden by A's."""
+    """Result of a run of B in which some decisions were replaced by those of A."""
 
     pairs: tuple[tuple[int, int], ...]  # whose decisions were
     # first, last: steps of the window in which they were
@@ -109,12 +108,12 @@ def pinned(
     last: int | None = None,
     steps: int | None = None,
 ) -> Pinned:
-    """Run B again with A's decisions about some pairs imposed, and compute B's separation from A.
+    """Run B again with A's decisions on some pairs imposed, and compute the separation of B from A.
 
     Args:
         fork: a pair of runs with the same atom labels.
-        pairs: pairs (i, j); default the pair at the fork, during the first interval in which the runs
-            disagree about it.
+        pairs: pairs (i, j) of atoms; default the pair at the fork, during the first interval in which its
+            decisions differ.
         first, last: first and last step of the window; default the whole run if pairs are given.
         steps: last step; default the last step of the fork's runs.
 
@@ -153,10 +152,10 @@ def _check_pair(pair: tuple[int, int], atoms: int) -> None:
 
 
 def parse_pin(text: str, atoms: int) -> dict[str, Any]:
-    """Parse the text of a pin, "fork", "3-75" or "3-75:600..700", into arguments of `pinned`.
+    """Parse the text of a pin (imposed decision), "fork", "3-75" or "3-75:600..700", for `pinned`.
 
     Raises:
-        InputError: the text has none of these forms, or the pair does not exist.
+        InputError: the text has none of these forms, or the pair of atoms does not exist.
     """
     if text.strip() == "fork":
         return {}
@@ -197,9 +196,9 @@ def check_pins(fork: Fork) -> None:
 
 
 def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
-    """Return intervals (first step, end step or None) in which two runs differ in the decision on a pair.
+    """Return intervals (first step, end step or None) in which the decisions of two runs on a pair differ.
 
-    Only the cross-run flips that were kept are used.
+    Only the stored differences between the decisions of the two runs are used.
     """
     spells: list[tuple[int, int | None]] = []
     for flip in fork.flips:
@@ -217,7 +216,7 @@ def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
 
 @dataclass(frozen=True)
 class Minimal:
-    """A smallest set of pairs that restores agreement."""
+    """A smallest set of pairs; imposing A's decisions on these pairs keeps B with A."""
 
     # pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A; None where
     # no set does
@@ -231,19 +230,19 @@ class Minimal:
 
     @property
     def proven(self) -> bool:
-        """True if each of the pairs was shown to be necessary."""
+        """True if each of these pairs was shown to be necessary."""
         return self.code in ("alone", "proven")
 
 
 def minimal_cause(
     fork: Fork, *, tests: int = 80, progress: Callable[[int, int], None] | None = None
 ) -> Minimal:
-    """Find a 1-minimal set of pairs whose pinning to A's decisions removes a split.
+    """Find a 1-minimal set of pairs such that imposing A's decisions on them removes a split.
 
     Args:
         fork: a pair of runs with the same atom labels that has forked and split.
         tests: largest number of runs of B.
-        progress: called with the number of tests done and the number allowed.
+        progress: called with the number of runs made and the largest number allowed.
 
     Raises:
         InputError: the runs did not split, have different atom labels or axes, or a many-body potential.
@@ -272,7 +271,7 @@ def minimal_cause(
 
 
 class _Search:
-    """Runs of B with some pairs pinned to A's decisions, and whether B remained with A."""
+    """Runs of B with A's decisions imposed on some pairs, and whether B remained with A."""
 
     def __init__(
         self,
@@ -290,18 +289,18 @@ class _Search:
         self._tape = taped(fork.twin.a, horizon, self._keep)
 
     def spent(self) -> bool:
-        """Return True if no more runs are allowed."""
+        """Return True if the allowed number of runs is used up."""
         return self.made >= self.allowed
 
     def _keep(self, segment: Segment) -> None:
-        """Store A's positions at regular intervals."""
+        """Store the positions of A at regular intervals."""
         for row in range(segment.rows):
             if (segment.first + row) % self._every == 0:
                 x = segment.unsorted("x", row).astype(np.float64)
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Test whether B remains with A if some pairs are pinned; return False after the last allowed run."""
+        """Test whether B remains with A under A's decisions on some pairs; False if no run is allowed."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():
@@ -330,10 +329,10 @@ class _Search:
 
 
 def _required(keys: list[int], search: _Search, until: int) -> list[int]:
-    """Find a sufficient set of pairs by bisecting for one required pair after another (QuickXplain).
+    """Find a sufficient set of pairs by bisecting for one necessary pair after another (QuickXplain).
 
-    Each pair takes about log2(n) runs; delta debugging takes as many runs as the number of pairs squared. The
-    method assumes that additional pins never do harm, and stops after `until` runs.
+    Each pair takes about log2(n) runs; with delta debugging, runs are quadratic in the number of pairs. The
+    method assumes that imposing further decisions does no harm; it stops after `until` runs.
 
     Source: Junker, QuickXplain, AAAI 2004.
     """

@@ -18,7 +18,7 @@ from mdnum.rollout.program import MdProgram
 
 @dataclass(frozen=True)
 class DecisionTape:
-    """All pair decisions of a run from step 0: the pairs inside at the start, and all later changes."""
+    """All pair decisions of a run from step 0: the pairs inside the cutoff at the start, and all changes."""
 
     atoms: int  # number of atoms
     steps: int  # the last step that was decided
@@ -30,19 +30,19 @@ class DecisionTape:
 
     @property
     def flips(self) -> int:
-        """Number of flips on the tape."""
+        """Number of flips stored on the tape."""
         return len(self.step)
 
     @cached_property
     def changes(self) -> dict[int, tuple[int, ...]]:
-        """Steps at which each pair flips, ascending, by the key of the pair."""
+        """Steps at which each pair flips, ascending, in a dictionary by the pair's integer key."""
         order = np.argsort(self.key, kind="stable")
         keys, begins = np.unique(self.key[order], return_index=True)
         steps = np.split(self.step[order], begins[1:])
         return {key: tuple(own.tolist()) for key, own in zip(keys.tolist(), steps, strict=True)}
 
     def pins(self, keys: Iterable[int], first: int, last: int) -> Pins:
-        """Return the decisions about some pairs as pins that impose them over a window of steps."""
+        """Return the decisions on some pairs in a form that imposes them over an interval of steps."""
         begins = set(self.first.tolist())
         return Pins(
             [
@@ -52,20 +52,20 @@ class DecisionTape:
         )
 
     def inside(self, step: int) -> Int[np.ndarray, "pairs"]:
-        """Return the sorted keys of the pairs that are inside at a step."""
+        """Return the sorted integer keys of the pairs that are inside the cutoff at a step."""
         members = set(self.first.tolist())
         for _, key, entered in self.rows(step):
             (members.add if entered else members.discard)(key)
         return np.array(sorted(members), np.int64)
 
     def rows(self, last: int) -> list[tuple[int, int, bool]]:
-        """Return step, key and direction of all flips up to a step."""
+        """Return the step, the pair key and the direction of every flip up to a last step."""
         columns = (column[self.step <= last].tolist() for column in (self.step, self.key, self.entered))
         return list(zip(*columns, strict=True))
 
 
 def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
-    """Find the first step at which two tapes hold different decisions on a pair; None if all steps agree.
+    """Find the first step at which the decisions on two tapes differ; None if all decisions agree.
 
     Raises:
         ValueError: the tapes have different numbers of atoms.

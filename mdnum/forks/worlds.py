@@ -1,7 +1,7 @@
-"""The program, the numbers and the variations of a system, of molecular dynamics or of a ball.
+"""The program, the parameters and the variations of a system of molecular dynamics or of a ball.
 
-The functions import the modules of molecular dynamics when they are called, because those modules import
-jax_md, which a ball does not need.
+Modules of molecular dynamics are imported inside the functions, because those modules import jax_md, which a
+ball does not need.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _BALL_ELSEWHERE = ("loss", "gradient", "variants", "precision", "fork")
 
 
 def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Program:
-    """Return the program of a simulation or of a ball's system.
+    """Return the program that runs a simulation or a ball system.
 
     Args:
-        steps: number of steps of a ball's run; default the number in its file.
+        steps: number of time steps of a ball's run; default the number in its file.
     """
     if isinstance(system, BallSystem):
         from mdnum.ball.program import BallProgram
@@ -45,11 +45,11 @@ def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Pro
 
 
 def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> Any:
-    """Return the system with other values of some keys, validated like those of a system file.
+    """Return a copy of the system with other values of some keys, validated like the keys of a system file.
 
     Args:
         system: a simulation, or the system of a ball.
-        values: dotted key to value. A new value of a structure key creates the atoms of a file again.
+        values: new value for each dotted key. For a key of the structure, the atoms are created again.
         name: name of the choice, for error messages about a ball.
 
     Raises:
@@ -67,15 +67,15 @@ def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> A
 
 
 def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> Twin:
-    """Pair the program of a system with its program for other values of some keys."""
+    """Make a pair of programs, for a system and for the same system with other values of some keys."""
     other = varied(system, values, name)
     a, b = map(program_of, alike(system, other))
     return Twin(a, b, difference, changes(system, other))
 
 
 def alike(a: Any, b: Any) -> tuple[Any, Any]:
-    """Return two systems whose pairs have the same decisions: one decision for each term if only one system
-    shares decisions between terms.
+    """Return two systems whose pair decisions correspond: if only one system shares decisions between terms,
+    both get one decision for each term.
     """
     if isinstance(a, BallSystem) or not (a.pairwise and b.pairwise):
         return a, b
@@ -102,7 +102,7 @@ def changes(a: Any, b: Any) -> dict[str, list[Any]]:
 
 
 def floats(system: Any) -> dict[str, float]:
-    """Return the floating-point numbers of a system that enter a step, by dotted key."""
+    """Return the floating-point parameters of a system that affect a time step, by dotted key."""
     if isinstance(system, BallSystem):
         data = system.spec.model_dump(mode="python", exclude_none=True, exclude=set(_BALL_ELSEWHERE))
         return {key: value for key, value in flat(data).items() if isinstance(value, float)}
@@ -112,7 +112,7 @@ def floats(system: Any) -> dict[str, float]:
 
 
 def as_used(system: Any, key: str) -> tuple[float, Any]:
-    """Return a number of the file as the program stores it, and the dtype in which the number is used."""
+    """Return a parameter of the system file as stored in the program, and the dtype in which it is used."""
     value = floats(system)[key]
     if not isinstance(system, BallSystem):
         return value, "float64"

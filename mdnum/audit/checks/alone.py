@@ -1,4 +1,4 @@
-"""Check that isolated atoms feel no force, and that energies of distant fragments add up."""
+"""Check that the force on isolated atoms is zero, and that the energies of distant fragments add up."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ _EPS = np.finfo(float).eps
 
 
 class AloneCheck(AuditCheck):
-    """Do atoms without neighbors feel no force, and do the energies of distant fragments add up?
+    """Is the force on atoms without neighbors zero, and do the energies of distant fragments add up?
 
     Attributes:
-        rows: a row for each structure that the calculator supports.
-        refused: structures on which the calculator failed, and why.
-        takes_atoms: whether the calculator supports anything other than whole molecules.
+        rows: results, a row for each structure that the calculator supports.
+        refused: structures on which the calculator failed, with the reason.
+        takes_atoms: whether the calculator supports structures other than whole molecules.
     """
 
     name, title, order, calls = "alone", "Atoms alone", 48, 240
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Evaluate single atoms, and an atom far from a cluster."""
+        """Evaluate single atoms, and an atom far away from a cluster."""
         with subject.meter.limited():
             self.look(subject, *settled(subject.fresh(), np.random.default_rng(self.seed)))
         found = list(self.findings())
@@ -54,7 +54,7 @@ class AloneCheck(AuditCheck):
         )
 
     def look(self, subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> None:
-        """Evaluate atoms and fragments of a structure, or else whole molecules, with new objects."""
+        """Evaluate atoms and fragments of a structure, or whole molecules, with new calculator objects."""
         self.rows: list[dict[str, Any]] = []
         self.floor = noise.allowed
         self.refused: list[tuple[str, CalculatorError]] = []
@@ -120,7 +120,7 @@ class AloneCheck(AuditCheck):
             energy(f"two {name} {_AWAY} apart", _apart(one, one), total(alone, alone), size=size)
 
     def findings(self) -> Iterator[Observed]:
-        """Yield findings about isolated atoms."""
+        """Yield findings about the energies and forces of isolated atoms."""
         for what, why in [one for one in self.refused if one[1].cause is None][:1]:
             yield finding("LONELY_NOT_FINITE", "error", what=what, why=why.message)
         for what, why in [one for one in self.refused if one[1].cause is not None and self.takes_atoms][:1]:
@@ -136,14 +136,14 @@ class AloneCheck(AuditCheck):
 
 
 def _boxed(part: Atoms) -> Atoms:
-    """Return a fragment in a cell that is not periodic."""
+    """Return a fragment of the structure in a nonperiodic cell."""
     there = Atoms(part.numbers, part.positions - part.positions.min(axis=0) + [1.0, 2.0, 3.0])
     there.set_cell([_BOX + float(np.ptp(there.positions, axis=0).max())] * 3)
     return there
 
 
 def _apart(part: Atoms, other: Atoms) -> Atoms:
-    """Return a fragment together with a second fragment beyond the cutoff."""
+    """Return a structure of two fragments that are farther apart than the cutoff."""
     there = other.copy()
     there.positions += [part.positions[:, 0].max() + _FAR - there.positions[:, 0].min(), 2.0, 3.0]
     return part + there

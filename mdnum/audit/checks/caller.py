@@ -1,4 +1,4 @@
-"""Check that a calculator notices in-place changes and does not modify its caller's data."""
+"""Check that a calculator detects in-place changes of its input and leaves its caller's data unmodified."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _INFO = {"charge": 1, "spin": 2, "total_charge": 1, "multiplicity": 2}
 
 
 class CallerCheck(AuditCheck):
-    """Does a calculator notice what its caller changes, and leave the caller's data unchanged?
+    """Does a calculator detect in-place changes of its input, and leave its caller's data unmodified?
 
-    The check uses an `Atoms` object that is edited in place, as in dynamics, the arrays that the calculator
-    returned, and the global random number generators.
+    The check examines an `Atoms` object that is edited in place, as in dynamics, the arrays that the
+    calculator returned, and the global random number generators.
     """
 
     name, title, order, calls = "caller", "Caller", 30, 280
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Run every test of the check with a new calculator object."""
+        """Run every test of the check, each with a new calculator object."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
             atoms, noise = settled(subject.fresh(), rng)
@@ -63,7 +63,7 @@ class CallerCheck(AuditCheck):
 
 
 def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Callable[[Atoms], Any]]]:
-    """Yield (name of the changed quantity, function that changes it in an `Atoms` object)."""
+    """Yield (name of a quantity, function that changes this quantity in an `Atoms` object)."""
     moves = 0.02 * rng.uniform(-1, 1, (len(atoms), 3))
     yield "positions", lambda there: np.add(there.positions, moves, out=there.positions)
     if len(set(atoms.numbers)) > 1:
@@ -81,7 +81,7 @@ def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Call
 def _edited(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, what: str, change: Callable[[Atoms], Any]
 ) -> Iterator[Observed]:
-    """Test whether a calculator notices an in-place change of its `Atoms` object, against a new object."""
+    """Compare a calculator whose `Atoms` object is changed in place with a new calculator object."""
 
     def asked() -> tuple[tuple[float, Forces], tuple[float, Forces]]:
         used, there = subject.used(), atoms.copy()
@@ -105,7 +105,7 @@ def _edited(
 
 
 def _buffers(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """Test that returned arrays do not change, and that writing to them does not change later answers."""
+    """Test that returned arrays stay unchanged, and that writing to them does not change later results."""
     used, there = subject.fresh(), atoms.copy()
     used.copies = False
     used.both(there)
@@ -130,7 +130,7 @@ def _buffers(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
 
 
 def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """Test whether a call draws from, or reseeds, the global random number generators of the process."""
+    """Test whether a calculator call uses or reseeds the global random number generators of the process."""
     generators: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], Callable[[int], Any]]] = {
         "numpy.random": (np.random.get_state, np.random.set_state, np.random.seed),
         "random": (random.getstate, random.setstate, random.seed),
@@ -167,7 +167,7 @@ def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
 
 
 def _written(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """Test whether the calculator modifies its `Atoms` argument; many calculators wrap positions."""
+    """Test whether the calculator modifies its `Atoms` argument, for example by wrapping positions."""
     outside = displaced(atoms, np.tile((atoms.pbc * 1.0) @ atoms.cell.array, (len(atoms), 1)))
     for given, what in ((atoms, "the structure"), (outside, "the structure one cell further")):
         other, there = subject.fresh(), given.copy()

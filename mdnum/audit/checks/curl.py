@@ -1,4 +1,4 @@
-"""Check the work around small closed loops: the work is zero if the forces derive from an energy."""
+"""Check the work around small closed loops, which is zero if the forces are the gradient of an energy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Displacement = Float[np.ndarray, "atoms 3"]
 
 @dataclass(frozen=True)
 class Loop:
-    """Work of a force around a circle in the space of all coordinates."""
+    """Work done by the forces around a circle in the space of all atomic coordinates."""
 
     plane: str  # in words
     radius: float  # Å, of the displacement of all atoms together
@@ -36,12 +36,12 @@ class Loop:
 
     @property
     def conservative(self) -> bool:
-        """Whether the curl is zero within its error."""
+        """True if the curl of the forces is zero within its error."""
         return abs(self.curl) <= _SIGNIFICANT * self.error
 
     @property
     def share(self) -> float:
-        """Antisymmetric part of the force derivative divided by the symmetric part."""
+        """Antisymmetric part of the derivative of the forces, divided by the symmetric part."""
         return abs(self.curl) / self.stiffness if self.stiffness else (float("inf") if self.curl else 0.0)
 
 
@@ -52,7 +52,7 @@ class CurlCheck(AuditCheck):
     needed_to = ("differentiate",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compute the circulation of the forces in several planes of coordinate space."""
+        """Compute the circulation of the forces around circles in several planes of coordinate space."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
         radii, ways = _RADII[:1] if self.brief else _RADII, Ways()
@@ -98,7 +98,7 @@ class CurlCheck(AuditCheck):
 
 
 def agreed(tried: Sequence[Loop]) -> Loop:
-    """Return the loop with the smallest error; the error is increased if a loop of another radius disagrees.
+    """Return the loop with the smallest error; the error is larger if loops of other radii disagree.
 
     The curl is the same for every small circle, while the work due to a jump of the forces depends on the
     radius.
@@ -112,7 +112,7 @@ def agreed(tried: Sequence[Loop]) -> Loop:
 def _planes(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator
 ) -> Iterator[tuple[str, Displacement, Displacement]]:
-    """Yield planes of two orthonormal displacements: of all atoms, of one atom, of two interacting atoms."""
+    """Yield planes of two orthonormal displacements of all atoms, of one atom, or of two that interact."""
     count = len(atoms)
     if count > 1:
         for number in range(3):
@@ -151,10 +151,10 @@ def around(
     noise: NoiseFloor,
     plane: str = "",
 ) -> Loop:
-    """Compute the work of the forces around x + radius (u cos t + v sin t), for orthogonal unit vectors.
+    """Compute the work of the forces around x + radius (u cos t + v sin t), for orthogonal unit vectors u, v.
 
     Error:
-        the spread over subsets of the points, and the noise of the forces.
+        the spread of the result over subsets of the points, and the noise of the forces.
     """
     angles = 2 * np.pi * np.arange(_POINTS) / _POINTS
     forces = [

@@ -1,6 +1,6 @@
-"""Check the energy drift of a short run at constant energy, and find its sources.
+"""Check the energy drift of a short run at constant energy, and find the causes of the drift.
 
-Runs use ASE's velocity Verlet; molecules of rigid models keep their shape.
+Runs use ASE's velocity Verlet algorithm; molecules of rigid models keep their shape.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ _SOURCES = ("integrator", "flips", "elsewhere", "rest")
 
 
 class DynamicsCheck(AuditCheck):
-    """Does a short run at constant energy conserve its energy, and if not, why?
+    """Is the energy conserved in a short run at constant energy, and if not, why?
 
-    The check reports the energy drift with a block error, separated into integrator, flips and the rest. The
-    drift that remains after subtracting flips and the work of the forces is due to the integrator. It must
-    fall to a quarter at half the time step; a second run tests this.
+    The check reports the energy drift with a block error, and the contributions of the integrator, the flips
+    and the rest. The drift that remains after subtracting flips and the work of the forces is due to the
+    integrator. It must fall to a quarter when the time step is halved; a second run tests this.
     """
 
     name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Run with the full and with half the time step, and compute the energy balance."""
+        """Run the dynamics with the full and with half the time step, and compute the energy balance."""
         with subject.meter.limited():
             return self._ask(subject, progress)
 
@@ -132,7 +132,7 @@ def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult
 
 
 def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
-    """Return the pair thresholds, or the reason why none are known."""
+    """Return the pair thresholds of the calculator, or the reason why no thresholds are known."""
     try:
         # one at which no more than a third derivative jumps leaves no trace in a run
         found = [one for one in find_thresholds(subject) if one.order < SMOOTH or one.dies]
@@ -143,7 +143,7 @@ def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
 
 @dataclass(frozen=True)
 class TwoRuns:
-    """Two runs, with full and half the time step, and their energy balance."""
+    """Two runs, with the full and with half the time step, and their energy balance."""
 
     subject: CalculatorSubject
     # whole, half: the run, and the one with half its time step
@@ -158,7 +158,7 @@ class TwoRuns:
     period: float  # of the fastest vibration, internal time
 
     def shares(self) -> dict[str, Drift]:
-        """Energy drift in total, by flips, by the rest, and by the integrator (two methods), meV/atom/ps."""
+        """Energy drift: total, by flips, by the rest, and by the integrator (two methods), meV/atom/ps."""
         one, other = self.whole, self.half
         rest, elsewhere = self.balance.filled, self.balance.elsewhere
         flips = wandering(one.time, self.balance.jumps)
@@ -187,7 +187,7 @@ class TwoRuns:
         return {name: share.times(factor) for name, share in found.items()}
 
     def outcome(self, unknown: str) -> CheckResult:
-        """Return the result of the check; `unknown` is the reason why no threshold is known."""
+        """Return the result of the check; `unknown` is the reason if no thresholds are known."""
         shares = self.shares()
         numbers = self._numbers(shares)
         crossed, measured = len(self.balance.crossed), len(self.balance.measured)
@@ -325,7 +325,7 @@ class TwoRuns:
         return Chart(title, f"time ({units.time})", f"change (m{ENERGY}/atom)", time.tolist(), curves)
 
     def energy_rows(self) -> dict[str, list[Any]]:
-        """Return the columns of energies.parquet."""
+        """Return the columns of the table energies.parquet."""
         jumps, elsewhere = self.balance.jumps, self.balance.elsewhere
         unknown = np.full(len(self.half.potential), np.nan)
         parts: list[dict[str, Any]] = []
@@ -345,7 +345,7 @@ class TwoRuns:
         return {name: np.concatenate([part[name] for part in parts]).tolist() for name in parts[0]}
 
     def crossing_rows(self) -> dict[str, list[Any]]:
-        """Return the columns of crossings.parquet."""
+        """Return the columns of the table crossings.parquet."""
         crossed, measured = self.balance.crossed, self.balance.measured
         names = ("step", "i", "j", "rank", "entered", "distance", "margin")
         return {
@@ -360,7 +360,7 @@ class TwoRuns:
 
 
 class _Bridge(Calculator):
-    """An ASE calculator that wraps the audited calculator and saves structures on which the latter fails."""
+    """An ASE calculator around the audited calculator that saves structures on which the latter fails."""
 
     implemented_properties = ["energy", "forces"]  # noqa: RUF012
 
@@ -381,7 +381,7 @@ def prepared(
     period: float,
     rng: np.random.Generator,
 ) -> Atoms:
-    """Return a structure with thermal velocities; `period` is of its fastest vibration, internal time."""
+    """Return a structure with thermal velocities; `period` is that of its fastest mode, internal time."""
     from ase import units
 
     # atoms at rest in their places take half of the kinetic energy into vibrations
@@ -400,7 +400,7 @@ def prepared(
 def fitting_timestep(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, iterations: int = _POWER_ITERATIONS
 ) -> tuple[float, float]:
-    """Estimate a suitable time step and the period of the fastest vibration (inf for none), internal time."""
+    """Estimate a time step and the period of the fastest vibration (inf if none), in internal time."""
     roots = np.sqrt(atoms.get_masses())[:, None]
     mode = direction(len(atoms), rng)
     mode /= np.linalg.norm(mode)
@@ -431,10 +431,10 @@ def run(
 
     Args:
         start: structure with velocities and constraints; not modified.
-        timestep: internal time.
+        timestep: time step, internal time.
 
     Returns:
-        the run, and the structure with velocities at its end.
+        the run, and the final structure with velocities.
     """
     atoms = start.copy()
     atoms.set_constraint(start.constraints)
@@ -462,10 +462,10 @@ def run(
 
 @dataclass
 class RigidGroups:
-    """ASE constraint that keeps all distances within equal groups of atoms fixed.
+    """ASE constraint that fixes all distances within each of several groups of equally many atoms.
 
-    ASE's FixBondLengths treats one bond at a time in Python; this class treats one bond of every group at
-    once, which is a hundred times faster for water.
+    The class FixBondLengths of ASE treats one bond at a time in Python; this class treats one bond of every
+    group at once, which is a hundred times faster for water.
 
     Source:
         H. C. Andersen, Rattle: a velocity version of the Shake algorithm, J. Comput. Phys. 52, 24 (1983).
@@ -495,7 +495,7 @@ class RigidGroups:
         self._sweep(settled)
 
     def adjust_momenta(self, atoms: Atoms, momenta: Float[np.ndarray, "atoms 3"]) -> None:
-        """Remove the momentum components that would change a bond length."""
+        """Remove the components of the momenta that would change a bond length."""
         share = 1 / atoms.get_masses()
         size = float(np.max(np.abs(momenta), initial=0.0)) * float(np.max(share))
 
@@ -518,15 +518,15 @@ class RigidGroups:
                 return
 
     def adjust_forces(self, atoms: Atoms, forces: Float[np.ndarray, "atoms 3"]) -> None:
-        """Leave the forces unchanged; a run adjusts momenta instead."""
+        """Leave the forces unchanged; in a run, the momenta are adjusted instead."""
 
     def todict(self) -> dict[str, Any]:
-        """Return the constraint as a dictionary, in the form of ASE's own constraints."""
+        """Return the constraint as a dictionary, in the form of the constraints of ASE."""
         return {"name": "RigidGroups", "kwargs": {}}
 
 
 def rigid(atoms: Atoms) -> RigidGroups | None:
-    """Return a constraint on all distances within molecules; None for a structure without molecules."""
+    """Return a constraint on all distances within each molecule; None for a structure without molecules."""
     size = group(atoms)
     if size is None:
         return None

@@ -1,4 +1,4 @@
-"""Compare forces with finite differences of the energy, with a step chosen from the calculator's noise."""
+"""Compare forces with finite differences of the energy; the step is chosen from the calculator's noise."""
 
 from __future__ import annotations
 
@@ -67,28 +67,28 @@ class Slope:
 
     @property
     def gap(self) -> float:
-        """Deviation |difference - force|, eV/Å."""
+        """Absolute deviation between finite difference and force, eV/Å."""
         return abs(self.difference - self.force)
 
     @property
     def agrees(self) -> bool:
-        """Whether force and finite difference agree within the error of the difference."""
+        """True if force and finite difference agree within the error of the finite difference."""
         return self.gap <= _SIGNIFICANT * self.error
 
 
 class ForcesCheck(AuditCheck):
     """Are the forces minus the gradient of the energy, and of which energy?
 
-    The error of a finite difference is |D(h) - D(h/4)| after extrapolation plus the measured noise over the
-    step; of nine steps h, the one with the smallest error is used. A deviation from the force that grows like
-    1/h is reported as a jump of the energy, not as a wrong force.
+    The error of a finite difference is |D(h) - D(h/4)| after extrapolation, plus the measured noise divided
+    by the step; of nine steps h, the step with the smallest error is used. A deviation from the force that
+    grows like 1/h is reported as a jump of the energy, not as a wrong force.
     """
 
     name, title, order, basic, calls = "forces", "Forces", 10, True, 500
     needed_to = ("run", "differentiate")
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compare forces with extrapolated central differences, and compute sums that must vanish."""
+        """Compare forces with extrapolated central differences, and compute force sums that must be zero."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
         ways = Ways()
@@ -185,7 +185,7 @@ class ForcesCheck(AuditCheck):
 
 
 def _fewer(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> tuple[Atoms, NoiseFloor]:
-    """Return a nonperiodic cluster of the atoms nearest to the first one, and its noise level."""
+    """Return a nonperiodic cluster of the atoms nearest to the first atom, and its noise level."""
     away = atoms.get_distances(0, range(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.sort(np.argsort(np.linalg.norm(away, axis=1))[:_CLUSTER])
     there = Atoms(atoms.numbers[nearest], away[nearest])
@@ -199,7 +199,7 @@ def _worst(slopes: list[Slope]) -> Slope:
 
 
 def _directions(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Displacement]]:
-    """Yield displacement directions: of all atoms at random, and of a few single atoms along each axis."""
+    """Yield displacement directions: random for all atoms, and along each axis for a few single atoms."""
     for number in range(_DIRECTIONS):
         yield f"all atoms at random, {number + 1}", direction(len(atoms), rng)
     for who in sorted(rng.permutation(len(atoms))[:_ATOMS]):
@@ -217,11 +217,11 @@ def slope(
     noise: NoiseFloor,
     what: str = "",
 ) -> Slope:
-    """Derivative of the energy along a line by finite differences, with its error, and by the forces.
+    """Derivative of the energy along a line: from finite differences, with its error, and from the forces.
 
     Args:
-        line: displacement per Å of step; `what` names it.
-        forces: forces of the calculator at `atoms`; `noise` is the noise of the energy there.
+        line: displacement of the atoms per Å of step; `what` is the name of the line.
+        forces: forces of the calculator at `atoms`; `noise` is the noise of the energy at `atoms`.
     """
     plus, minus = (
         np.array([subject.energy(displaced(atoms, sign * step * line)) for step in _LADDER])
@@ -257,15 +257,15 @@ def slope(
 def _best(
     gaps: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
 ) -> tuple[int, float]:
-    """Return the index and error of the finite-difference step of smallest error, if others agree with it.
+    """Return the index and error of the most accurate finite-difference step, if other steps agree with it.
 
     If the energy jumps at flips, two finite-difference steps may include the same jumps by chance, and agree
-    on a wrong slope. A wrong force deviates equally at every step that resolves the deviation, in particular
-    at the shorter ones.
+    on a wrong slope. A wrong force, in contrast, gives the same deviation at every step that resolves it, in
+    particular at the shorter steps.
 
     Args:
-        gaps: difference minus force at each step, the longest first.
-        error: estimated error of the differences; rounding: the contribution of noise to it.
+        gaps: finite difference minus force for each step, from the longest step to the shortest.
+        error: estimated error of each difference; rounding: the contribution of noise to this error.
     """
     best = int(np.argmin(error))
     wrong = abs(gaps[best])
@@ -281,7 +281,7 @@ def _best(
 
 
 def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dict[str, Any]]:
-    """Net force, and net torque of a nonperiodic structure; both are zero by symmetry of space."""
+    """Net force, and net torque of a nonperiodic structure; both must be zero by symmetry of space."""
     size = float(np.sum(np.abs(forces)))
     allowed = noise.allowed.force * np.sqrt(len(atoms)) + 40 * np.finfo(float).eps * size
     net = float(np.linalg.norm(forces.sum(axis=0)))
@@ -296,7 +296,7 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
 def _drowned(
     worker: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, known: float, scale: float
 ) -> list[Observed]:
-    """Return a finding if noise larger than rounding errors hides forces or energy differences."""
+    """Return a finding if noise that is larger than rounding hides the forces or the energy differences."""
     stairs = steps(worker, atoms)  # which are another finding
     size = max(noise.force, 0.0 if stairs.energy else known)
     if size <= max(_DROWNED * scale, stairs.force):
@@ -342,7 +342,7 @@ def _row(one: Slope) -> dict[str, Any]:
 
 
 def _chart(slopes: list[Slope]) -> Chart:
-    """Chart of the force deviation against step: a valley for correct forces, a plateau for wrong ones."""
+    """Chart of force deviation against step length: a valley if forces are correct, a plateau if not."""
     shown = slopes[:_DIRECTIONS]
     shown += [one for one in [_worst(slopes)] if one not in shown]
     lines = {one.direction: one.gaps[::-1].tolist() for one in shown}
@@ -359,8 +359,8 @@ def _two_energies(
 ) -> Iterator[Observed]:
     """Yield a finding if `energy` and `free_energy` differ by more than a constant.
 
-    All other checks examine `free_energy`, whose negative gradient the forces are by ASE's definition; if the
-    two energies differ by at most a constant, the findings hold for both.
+    By ASE's definition, the forces are minus the gradient of `free_energy`, which all other checks examine.
+    If the two energies differ by at most a constant, the findings hold for both energies.
     """
     free, logged = subject.energies(atoms)
     if logged is None:

@@ -1,4 +1,4 @@
-"""Check whether energy and forces depend on how a structure is represented."""
+"""Check whether energy and forces change when the same structure is represented in another way."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Same:
 
 
 def _same(code: str, base: Atoms, what: str, there: Atoms, factor: float = 1.0, **more) -> Same:
-    """Return a representation with the atoms in the original order."""
+    """Return a representation of the structure in which the atoms keep their order."""
     return Same(what, code, there, np.arange(len(there)), **{"rounding": factor * ulp(there, base), **more})
 
 
@@ -88,9 +88,9 @@ class _Difference:
 class InvarianceCheck(AuditCheck):
     """Do energy and forces of a structure depend on its representation?
 
-    Allowed differences are measured: the calculator's noise along a line, and the largest change under random
-    displacements of the size of coordinate rounding. A transformation that the calculator does not support is
-    skipped. `structures` holds both representations if their energies or forces differ.
+    The allowed differences are measured: the calculator's noise along a line, and the largest change under
+    random displacements of the size of coordinate rounding. A transformation that the calculator does not
+    support is skipped. `structures` contains both representations if their energies or forces differ.
     """
 
     name, title, order, calls = "invariance", "Invariance", 40, 450
@@ -184,7 +184,7 @@ class InvarianceCheck(AuditCheck):
     def _without_topology(
         self, wrong: dict[str, list[_Difference]], judge: _Judge
     ) -> dict[str, list[_Difference]]:
-        """Return the differences that are not explained by a molecular topology made from the atom order."""
+        """Return the differences not caused by a calculator that derives molecules from the atom order."""
         rng = np.random.default_rng(self.seed + 1)
         grouped = by_molecule(judge.atoms, rng)
         try:
@@ -253,7 +253,7 @@ class _Judge:
         ), answer
 
     def reference(self, base: Atoms, rounding: float) -> tuple[float, Forces, NoiseFloor]:
-        """Return energy and forces of a structure, and the differences allowed for rounding of this size."""
+        """Return energy and forces of a structure, and the differences allowed for this size of rounding."""
         power = int(np.ceil(np.log2(rounding))) if rounding > 0 else -9999
         key = id(base), power
         if key not in self._known:
@@ -286,7 +286,7 @@ def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]
 
 
 def _in_turns(ways: Iterable[Same]) -> list[Same]:
-    """Order representations so that one of each kind comes first, then a second of each kind."""
+    """Order representations so that the first of each kind come first, then the second of each kind."""
     seen: dict[str, int] = {}
     turns = []
     for same in ways:
@@ -299,11 +299,11 @@ def _in_turns(ways: Iterable[Same]) -> list[Same]:
 
 
 def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield every representation that applies to a structure.
+    """Yield all representations of a structure that can be made from it.
 
     Args:
-        atoms: a structure without distances exactly on a threshold.
-        given: the structure as the user gave it, possibly with such distances.
+        atoms: a structure in which no distance is exactly at a threshold.
+        given: the structure as the user gave it, in which distances may be exactly at a threshold.
     """
     yield from translated(atoms, rng)
     yield from imaged(atoms, rng)
@@ -350,7 +350,7 @@ def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield structures with one atom on a face of the cell, slightly outside, and on the opposite face."""
+    """Yield structures with one atom on a cell face, just outside the cell, and on the opposite face."""
     if not atoms.pbc.any():
         return
     axes, cell = np.flatnonzero(atoms.pbc), atoms.cell.array
@@ -375,7 +375,7 @@ def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield the structure with its atoms in another order."""
+    """Yield structures with the atoms in a different order."""
     if len(atoms) < 2:
         return
     for _ in range(2):
@@ -390,7 +390,7 @@ def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | None:
-    """Return whole molecules reordered, and in other periodic images; None without molecules."""
+    """Return structures with molecules reordered, and in other images; None if there are no molecules."""
     size = group(atoms)
     if size is None:
         return None
@@ -405,7 +405,7 @@ def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | N
 
 
 def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
-    """Yield structures whose cell is one ulp larger or smaller, with the atoms in place."""
+    """Yield structures whose cell is one rounding unit larger or smaller, with unchanged atom positions."""
     if not atoms.pbc.any():
         return
     for what, base in (("", atoms), (", of the structure as it was given", given)):
@@ -420,7 +420,7 @@ def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
 
 
 def repeated(atoms: Atoms) -> Iterator[Same]:
-    """Yield supercells of a structure."""
+    """Yield supercells of the structure."""
     wanted = [tuple(2 if n == axis else 1 for n in range(3)) for axis in np.flatnonzero(atoms.pbc)]
     if len(wanted) > 1 and len(atoms) <= 64:
         wanted.append(tuple(2 if repeats else 1 for repeats in atoms.pbc))
@@ -433,11 +433,11 @@ def repeated(atoms: Atoms) -> Iterator[Same]:
 
 
 def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield the supercell of a dense four-atom cell, for comparison with the cell itself.
+    """Yield the supercell of a dense four-atom cell, to compare it with the cell itself.
 
-    In a structure at least two cutoffs wide, no pair has a second image within the cutoff. Only structures of
-    one or two species are tested, in equal numbers as in a salt; with more species the result would be
-    ambiguous.
+    In a structure at least two cutoffs wide, no atom interacts with two images of another atom. Only
+    structures of one species, or of two in equal numbers as in a salt, are tested; with more species the
+    result would be ambiguous.
     """
     species = list(dict.fromkeys(atoms.symbols))
     nearest = nearest_distance(atoms)
@@ -454,7 +454,7 @@ def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def skewed(atoms: Atoms) -> Iterator[Same]:
-    """Yield the same lattice with other lattice vectors, some of them left-handed."""
+    """Yield the same lattice with other lattice vectors, also with left-handed sets of vectors."""
     if not atoms.pbc.all():
         return
     for what, matrix in (
@@ -470,7 +470,7 @@ def skewed(atoms: Atoms) -> Iterator[Same]:
 
 
 def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield the structure rotated with its cell, by arbitrary angles and by exchanging axes, and mirrored."""
+    """Yield the structure and its cell mirrored, rotated by arbitrary angles, and with exchanged axes."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     anyhow = q * np.sign(np.diag(r))
     anyhow *= np.sign(np.linalg.det(anyhow))
@@ -489,7 +489,7 @@ def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def without_periods(atoms: Atoms) -> Iterator[Same]:
-    """Yield a cluster in several nonperiodic cells, which must not change energy and forces."""
+    """Yield a cluster in different nonperiodic cells, which must not change energy and forces."""
     base = modified(atoms, cell=np.zeros((3, 3)), pbc=False)
     span = np.ptp(base.positions, axis=0).max() + 30.0
     for what, cell in (
@@ -508,7 +508,7 @@ def _wrapped(atoms: Atoms) -> Atoms:
 
 
 def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
-    """Return a unit vector along the nonperiodic axes, perpendicular to the periodic ones."""
+    """Return a unit vector along the nonperiodic axes, perpendicular to the periodic axes."""
     if free.all():
         return np.array([1.0, -0.7, 0.4]) / np.linalg.norm([1.0, -0.7, 0.4])
     if not atoms.cell.array[~free].any():
@@ -519,6 +519,6 @@ def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
 
 
 def ulp(*structures: Atoms) -> float:
-    """Return one ulp of the largest coordinate or cell entry of some structures, Å."""
+    """Return the unit in the last place of the largest coordinate or cell entry of some structures, Å."""
     parts = (part for one in structures for part in (one.positions, one.cell.array))
     return float(np.spacing(max(map(largest, parts))))

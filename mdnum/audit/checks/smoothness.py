@@ -36,7 +36,7 @@ _FORCE = ("FORCE_JUMP", "NEIGHBOR_CAP_BY_ORDER", "ORDER")
 
 
 class SmoothnessCheck(AuditCheck):
-    """Is the energy smooth wherever atoms can go, and if not, where, to what order and by how much?"""
+    """Is the energy smooth at all distances that atoms reach, and if not, which derivative jumps where?"""
 
     name, title, order, calls = "smoothness", "Smoothness", 50, 2100
     needed_to = ("differentiate",)
@@ -87,7 +87,7 @@ _energy, _length = partial(Measured, unit="energy"), partial(Measured, unit="len
 
 
 def place(threshold: PairThreshold) -> Measured:
-    """Return the distance of a threshold with its error."""
+    """Return the distance of a threshold with its error, as text."""
     return _length(threshold.radius, floor=threshold.located)
 
 
@@ -99,7 +99,7 @@ def _two(threshold: PairThreshold) -> str:
 def figures(
     walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
 ) -> tuple[tuple[list[str], dict[str, Any]], dict[str, Any]]:
-    """Return the sentences, their values, and the numbers of the summary."""
+    """Return sentences about thresholds, the values in these sentences, and the numbers of the summary."""
     # (lowest derivative that jumps, jump of the energy, of the force) wherever something does
     seen = [(one.order, *one.jumps[:2]) for one in _all(walks)]
     seen += [(one.jump.order, one.jump.energy, one.force) for one in around.events]
@@ -157,7 +157,7 @@ def _rounded_up(value: float) -> float:
 
 
 def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield findings about pair thresholds, by the lowest derivative that jumps."""
+    """Yield findings about pair thresholds, grouped by the lowest derivative that jumps."""
     for order, code in enumerate(("ENERGY_JUMP", "FORCE_JUMP", "CURVATURE_JUMP")):
         same = [one for one in _all(walks) if one.order == order]
         if not same:
@@ -186,7 +186,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
 
 
 def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield a finding if a lower derivative jumps at a pair threshold among many atoms than for two."""
+    """Yield a finding if a lower derivative jumps at a pair threshold among many atoms than for two atoms."""
     if not around.lower:
         return
     worst = min(
@@ -243,7 +243,7 @@ def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) 
 
 
 def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
-    """Yield findings about atoms with many neighbors: a cap on their number, or another jump."""
+    """Yield findings about atoms with many neighbors: a limit on the number of neighbors, or another jump."""
     values: dict[str, Any] = {"species": one.species, "radius": one.radius}
     if one.kept:
         values |= {"kept": one.kept, "distance": one.distance, "force": one.force}
@@ -265,7 +265,7 @@ def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
 
 
 def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
-    """Yield findings about one pair interaction: no cutoff, a steep switch, places that were not examined."""
+    """Yield findings about a pair interaction: no cutoff, a steep switch, or distances not examined."""
     further = walk.further
     if walk.cutoff is None and np.abs(walk.energy).max() > 0:
         # what was searched for an end, and no more
@@ -285,7 +285,7 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
 
 
 def _steepness(walk: PairWalk) -> tuple[float, float] | None:
-    """Return the largest curvature beyond the well, relative to the bottom, and its distance; or None."""
+    """Return the largest |curvature| beyond the minimum / that at the minimum, and its distance; or None."""
     curvature = -np.gradient(walk.force, walk.distance)
     bottom = int(np.argmin(walk.energy))
     if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:
@@ -385,7 +385,7 @@ def _energies(walk: PairWalk, kT: float) -> Chart:
 
 
 def _close_up(walk: PairWalk, threshold: PairThreshold, subject: CalculatorSubject) -> Chart:
-    """Chart of energy or force at the representable distances on both sides of a jump."""
+    """Chart of energy or force at the floating-point distances on both sides of a jump."""
     below, above = [threshold.inside], [threshold.outside]
     for _ in range(_ULPS - 1):
         below.append(float(np.nextafter(below[-1], -np.inf)))

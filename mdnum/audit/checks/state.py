@@ -1,4 +1,4 @@
-"""Check that energies and forces from a calculator object do not depend on earlier structures."""
+"""Check that energies and forces of a calculator object do not depend on previously evaluated structures."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _EPS = np.finfo(float).eps
 class StateCheck(AuditCheck):
     """Do energy and forces depend on the structures that the calculator object evaluated before?
 
-    The check repeats calls, and compares one object with new ones on structures that grow, shrink, move and
-    strain.
+    The check repeats calls, and compares a used calculator object with new objects while structures grow,
+    shrink, move and are strained.
     """
 
     name, title, order, basic, calls = "state", "Memory", 60, True, 500
@@ -106,7 +106,7 @@ class StateCheck(AuditCheck):
         )
 
     def _brief(self, subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> CheckResult:
-        """Test repeated calls only."""
+        """Run only the test that repeats identical calls."""
         repeats = _repeated(subject, atoms, brief=True)
         return CheckResult(
             says=([_how(repeats)], {}),
@@ -154,7 +154,7 @@ class Comparison:
 
     @property
     def refused(self) -> CalculatorError | None:
-        """Error of the new calculator object, or else of the used one; None if both succeeded."""
+        """Error of the new calculator object, or else of the used object; None if both succeeded."""
         return next((one for one in (self.new, self.old) if isinstance(one, CalculatorError)), None)
 
     @property
@@ -170,7 +170,7 @@ class Comparison:
 
 
 def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
-    """Return sequences of two atoms at the cutoff, and what was skipped."""
+    """Return sequences in which two atoms approach each other at the cutoff, and the skipped sequences."""
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)
@@ -237,14 +237,14 @@ def _again(
 
 
 def _how(repeats: Mapping[str, Any]) -> str:
-    """Return the name of the sentence about repeated calls."""
+    """Return the name of the text variant about repeated calls."""
     if not repeats["bit-identical"]:
         return "state_not_repeated"
     return "state_repeated" if repeats["bit-identical between objects"] else "state_not_between"
 
 
 def _repeated(subject: CalculatorSubject, atoms: Atoms, brief: bool = False) -> dict[str, Any]:
-    """Evaluate one structure repeatedly: with one object, after another structure, with new objects."""
+    """Evaluate one structure repeatedly: with one object, after another structure, and with new objects."""
     used = subject.fresh()
     aside = displaced(atoms, np.full((len(atoms), 3), 0.011))
     at_once, between, new = (2, 1, 2) if brief else (_AT_ONCE, _BETWEEN, _NEW)
@@ -294,9 +294,9 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
 
 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Return the largest move of an atom or cell edge that leaves energy and forces unchanged, Å, or 0.
+    """Return the longest move of an atom or cell edge, Å, that leaves energy and forces unchanged; or 0.
 
-    Only moves that should change many of the last digits count; the expected change is proportional to the
+    Only moves that should change several of the last digits count; the expected change is proportional to the
     length of the move.
     """
     # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate
@@ -311,7 +311,7 @@ def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _kept_within(subject: CalculatorSubject, sizes: np.ndarray, at: Callable[[float], Atoms]) -> float:
-    """Return the longest of several successive moves after which one object repeats its last result."""
+    """Return the longest of several successive moves after which one object still returns its last result."""
     used = subject.fresh()
     used.forgets = False
     places = np.array([0.0, *np.cumsum(sizes)])

@@ -1,4 +1,4 @@
-"""Numerical choices that can be varied one at a time, for molecular dynamics and for the ball."""
+"""Numerical choices, of which two runs differ in one, for molecular dynamics and for the bouncing ball."""
 
 from __future__ import annotations
 

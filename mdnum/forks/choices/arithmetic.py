@@ -1,8 +1,8 @@
-"""Choices of arithmetic: the float format of each role, and the order of sums.
+"""Choices of arithmetic: the floating-point format of each role, and the order in which sums are computed.
 
-The order of a sum is set by a reduction, or by the order of pairs in lists, which depends on how and when
-lists are built. These choices do not change which pairs interact if every list is rebuilt before motion
-exceeds its skin. The choices must have no effect on sums that do not depend on order.
+The order of a sum is given by a reduction, or by the order of pairs in neighbor lists, which depends on how
+and when the lists are built. These choices do not change which pairs interact if every list is rebuilt before
+the motion of the atoms exceeds the skin. If the sums do not depend on order, the choices must have no effect.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ FORMATS = ("dense", "sparse", "ordered-sparse")
 class PrecisionChoice(Choice):
     """Another floating-point format in one role, or in several.
 
-    In molecular dynamics, 16-bit floats are allowed only for pair forces: in any other role they change the
-    model and not only the rounding (`mdnum.numerics.roles.check_role` gives the reason).
+    In molecular dynamics, 16-bit floats are allowed only for pair forces: in any other role they would change
+    the model, not only the rounding (`mdnum.numerics.roles.check_role` gives the reason).
     """
 
     screened: ClassVar = {
@@ -76,7 +76,7 @@ class PrecisionChoice(Choice):
 
     @property
     def name(self) -> str:
-        """Text of the choice, such as "precision" or "precision.force=float64"."""
+        """Text form of the choice, such as "precision" or "precision.force=float64"."""
         base = self.family if self.role is None else f"{self.family}.{self.role}"
         return base if self.dtype == "float32" else f"{base}={self.dtype}"
 
@@ -237,7 +237,7 @@ class Order(Summed):
 
 @choice("format")
 class FormatChoice(Summed):
-    """The neighbors of each atom in the order in which another list format adds them."""
+    """The neighbors of each atom in the order in which another neighbor-list format adds their forces."""
 
     screened = "format=dense format=sparse format=ordered-sparse format=ordered-sparse@exact"
     shown = True
@@ -264,7 +264,7 @@ class FormatChoice(Summed):
 
 @choice("builder")
 class Builder(Summed):
-    """Lists built by another neighbor search."""
+    """Neighbor lists built by another neighbor search."""
 
     screened = "builder builder@exact"
     word: str | None = None  # "host" or "jax-md"; None for the one that the system does not use
@@ -288,7 +288,7 @@ class Builder(Summed):
 
 @choice("skin")
 class Skin(Summed):
-    """Another skin: the lists hold more or fewer noninteracting pairs, and are rebuilt at other steps."""
+    """Another skin: neighbor lists hold more or fewer distant pairs, and are rebuilt at other steps."""
 
     screened = "skin skin@exact"
     # of the skin; None for half as much again, or three quarters where the box has no room
@@ -311,7 +311,7 @@ class Skin(Summed):
 
 @choice("rebuild")
 class RebuildChoice(Summed):
-    """Another rule for when a list is rebuilt."""
+    """Another rule for when a neighbor list is rebuilt."""
 
     screened = "rebuild=every:1 rebuild=every:10 rebuild=half-skin rebuild=every:1@exact"
     # rebuild blindly every so many steps; None: when an atom has moved by half the skin
@@ -328,7 +328,7 @@ class RebuildChoice(Summed):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """True if sums do not depend on order and lists are rebuilt in time; else pairs may be lost."""
+        """True if sums do not depend on order and lists are rebuilt in time; else pairs may be missed."""
         return super().must_hold and self.every in (1, None)
 
     @classmethod

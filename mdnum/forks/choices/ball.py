@@ -1,4 +1,4 @@
-"""Choices that exist only for a ball: the stopping rule of its solver, and single inverted decisions."""
+"""Choices only for a ball: the stopping rule of its iterative solver, and single inverted decisions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RULES = {
 
 @choice("stop")
 class Stopping(Choice):
-    """Another stopping rule of the solver, with the same tolerance."""
+    """Another stopping rule of the iterative solver, with the same tolerance."""
 
     worlds = ("ball",)
     screened = " ".join(f"stop={rule}" for rule in RULES)
@@ -51,7 +51,7 @@ class Stopping(Choice):
 
 @choice("max_iter")
 class Cap(Choice):
-    """More iterations before the solver gives up, or more of a fixed number of iterations."""
+    """More iterations before the solver gives up, or a larger fixed number of iterations."""
 
     worlds = ("ball",)
     shown = True
@@ -136,7 +136,7 @@ class ContactStep(Choice):
 
 @choice("iterations")
 class Iterations(Choice):
-    """One solve makes more iterations, or fewer, than its stopping rule requires."""
+    """One solve that makes more or fewer iterations than its stopping rule requires."""
 
     worlds = ("ball",)
     shown = True

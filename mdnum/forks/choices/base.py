@@ -1,4 +1,4 @@
-"""The base class of numerical choices, for systems of both worlds, and the two programs of a choice."""
+"""The base class of numerical choices, for molecular dynamics and balls, and the two programs of a choice."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ _SIGNED = ("ulps", "more")
 class Choice:
     """One numerical choice that can be made differently; its arguments are the fields of a frozen dataclass.
 
-    To add a choice, write a subclass and decorate it with `choice("family")`, where the family is the word
-    before "=". A choice of another package sets its own `family`, is decorated with `choice(None)` and is
-    registered as an entry point of the group "mdnum.choices". Its fields except `both` are written after "=",
-    separated by ":"; `both`, if it exists, is written after "@". The first line of the docstring describes
-    the choice.
+    To add a choice, write a subclass and decorate it with `choice("family")`; the family is the word before
+    "=" in the text of the choice. A choice defined by another package sets its own `family`, is decorated
+    with `choice(None)` and is registered as an entry point of the group "mdnum.choices". The fields of a
+    choice are written after "=", separated by ":"; the field `both`, if it exists, is written after "@". The
+    first line of the class docstring describes the choice.
     """
 
     family: ClassVar[str] = ""  # the word before "="
@@ -53,7 +53,7 @@ class Choice:
 
     @property
     def argument(self) -> str:
-        """Text of the argument that is written after "="."""
+        """Text of the choice's argument, which is written after "="."""
         values = {one.name: getattr(self, one.name) for one in self._fields()}
         if not self.shown and all(values[one.name] == one.default for one in self._fields()):
             return ""
@@ -61,12 +61,12 @@ class Choice:
 
     @property
     def name(self) -> str:
-        """Text from which `parse` recreates the choice."""
+        """Text from which `parse` can recreate the choice."""
         both = getattr(self, "both", None)
         return self.family + (f"={self.argument}" if self.argument else "") + (f"@{both}" if both else "")
 
     def describe(self, world: str = "md") -> str:
-        """Describe the choice in one line for a system of the given world."""
+        """Describe the choice in one line, for molecular dynamics or for a ball."""
         text = (self.__doc__ or self.name).partition("\n")[0].rstrip(".")
         return text[:1].lower() + text[1:] + summing(getattr(self, "both", None))
 
@@ -117,7 +117,7 @@ def choice(family: str | None):
 
 
 def shipped(world: str) -> dict[str, Choice]:
-    """Return the built-in choices of a world that are screened by default, by name."""
+    """Return the built-in choices for molecular dynamics or balls that are screened by default, by name."""
 
     def of_family(kind: type[Choice]) -> Iterable[Choice]:
         words = kind.screened if isinstance(kind.screened, str) else kind.screened[world]
@@ -168,7 +168,7 @@ def twin_of(choice: Choice, system: Simulation | System | BallSystem) -> Twin:
 
 
 def parse(text: str, world: str | None = None) -> Choice:
-    """Parse a choice from its text.
+    """Create a choice from its text.
 
     Args:
         text: a family, with an argument where it has one: "precision=bfloat16", "precision.force=float32",
@@ -176,9 +176,9 @@ def parse(text: str, world: str | None = None) -> Choice:
             "start=17:0:+1" (atom, axis, ulps) and "start=3:velocity:+1" (ball, what, ulps), "order=3",
             "translate=0.5", "rotate=-x-yz", "noise=7", "stop=maximum", "max_iter=+2", "iterations=+1:57:3"
             (more, step, ball), "contact=later:2" (of the second contact), "contact=57:0" (inverted at a step,
-            for a ball). A final "@exact" gives both runs exact sums, for choices of an order; "@alone" stops
-            each ball separately.
-        world: world whose choices an error message lists, "md" or "ball"; default both.
+            for a ball). For a choice of summation order, a final "@exact" makes both runs compute exact sums;
+            "@alone" stops each ball separately.
+        world: "md" or "ball", the kind of system whose choices an error message lists; default both.
 
     Raises:
         InputError: the choice does not exist, or its argument is not valid.
@@ -210,13 +210,13 @@ def parse(text: str, world: str | None = None) -> Choice:
 
 
 def check(is_good: bool, message: str, where: str, remedy: str | None = None) -> None:
-    """Raise an `InputError` if an argument is not valid."""
+    """Raise an `InputError` with the message unless an argument is valid."""
     if not is_good:
         raise InputError(message, where=where, remedy=remedy)
 
 
 def applies(is_so: bool, reason: str) -> None:
-    """Raise an `InputError` with the reason if a choice does not apply to a system."""
+    """Raise an `InputError` with the reason unless a choice applies to a system."""
     if not is_so:
         raise InputError(reason)
 
@@ -236,19 +236,19 @@ def some(count: int, where: str) -> None:
 
 
 def plural(count: int, noun: str) -> str:
-    """Return the noun, with a final s if the count is not one."""
+    """Return the noun, with a final s unless the count is one."""
     return noun if abs(count) == 1 else f"{noun}s"
 
 
 def summing(both: str | None) -> str:
-    """Return the end of a sentence that describes how both runs compute sums."""
+    """Return the end of a sentence, which describes how both runs compute sums."""
     return "" if both is None else f" (both with {both} sums)"
 
 
 def summed(simulation: Simulation, both: str | None = None) -> Simulation:
-    """Return a simulation that sums forces in another order, such as "exact" or "permuted:3".
+    """Return a simulation that sums forces by another method, such as "exact" or "permuted:3".
 
-    A many-body potential has a fixed order of sums, so an `InputError` is raised.
+    An `InputError` is raised for a many-body potential, whose order of sums is fixed.
     """
     if both is None:
         return simulation
@@ -269,7 +269,7 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice that can impose a reduction on both runs; sums without an order must then agree."""
+    """A choice that can impose a reduction on both runs; with order-independent sums the runs must agree."""
 
     worlds = ("md",)
     both: str | None = None  # reduction of both runs; None for the system's own
@@ -280,9 +280,9 @@ class Summed(Choice):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """True if both runs use sums that do not depend on order, so that the choice cannot matter."""
+        """True if the sums of both runs do not depend on order, so that the choice cannot have an effect."""
         return self.both in ORDERLESS
 
     def twin(self, a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
-        """Make the pair of programs of two simulations, with the chosen reduction named in the difference."""
+        """Make the pair of programs of two simulations; the label of the difference names the reduction."""
         return simulations(a, b, difference + summing(self.both), frame)

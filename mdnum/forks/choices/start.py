@@ -1,5 +1,4 @@
-"""Choices about the start of a run: numbers of its file, coordinates, noise, and physically equivalent
-starts.
+"""Choices of the start of a run: parameters, coordinates, random noise, and physically equivalent starts.
 
 Other atom labels, another origin, other axes and other periodic images describe the same physical system.
 """
@@ -95,8 +94,8 @@ class Relabel(Summed):
 class Rotate(Summed):
     """The axes of the box exchanged or reversed.
 
-    An exchange of axes is exact, but squares of components are added in another order. If a sign changes,
-    wrapping the start into the box rounds the start once.
+    An exchange of axes is exact, but the squared components of a distance are added in another order. If the
+    sign of an axis changes, the positions are rounded once when they are wrapped into the box.
     """
 
     screened = "rotate rotate@exact"
@@ -128,7 +127,7 @@ class Rotate(Summed):
 
 
 def _is_symmetry(word: str, atoms: Any) -> bool:
-    """Return True if the box is unchanged when its axes are exchanged, up to signs of lattice vectors."""
+    """True if exchanging the axes leaves the box unchanged, up to the signs of its lattice vectors."""
     axes, signs = _read(word)
     rows = {tuple(row) for row in np.asarray(atoms.cell)[np.asarray(atoms.pbc)].tolist()}
     turned = {tuple(sign * row[k] for k, sign in zip(axes, signs, strict=True)) for row in rows}
@@ -136,7 +135,7 @@ def _is_symmetry(word: str, atoms: Any) -> bool:
 
 
 def _read(word: str) -> tuple[list[int], list[float]]:
-    """Parse a symmetry such as "-x-yz" into the axis in each place and the sign of the axis."""
+    """Parse a symmetry such as "-x-yz" into the axis at each position and the sign of this axis."""
     parts = re.findall("-?[xyz]", word)
     return ["xyz".index(part[-1]) for part in parts], [-1.0 if part[0] == "-" else 1.0 for part in parts]
 
@@ -174,11 +173,11 @@ class Translate(Summed):
 
 @choice("unwrapped")
 class Images(Choice):
-    """Start of the atoms in other periodic images.
+    """Atoms that start in other periodic images.
 
-    Positions are wrapped before the first step, so this choice cannot change a bit if the images can be
-    represented exactly: the sum of a position and a lattice vector is rounded. Both runs start at positions
-    for which this sum is exact, within an ulp of a lattice vector from the file's positions.
+    Positions are wrapped before the first step, so this choice changes no bit if the images are exact; in
+    general, the sum of a position and a lattice vector is rounded. Both runs start at positions for which
+    this sum is exact, within one rounding unit of a lattice vector from the positions in the file.
     """
 
     worlds = ("md",)
@@ -190,7 +189,7 @@ class Images(Choice):
 
     @property
     def name(self) -> str:
-        """Text of the choice: "translate=lattice", "unwrapped" or "unwrapped=3"."""
+        """Text form of the choice: "translate=lattice", "unwrapped" or "unwrapped=3"."""
         if self.seed is None:
             return "translate=lattice"
         return self.family if self.seed == 1 else f"{self.family}={self.seed}"
@@ -218,10 +217,10 @@ class Images(Choice):
 def exact_images(
     cell: Any, positions: Float[np.ndarray, "atoms 3"], images: Int[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"], int]:
-    """Return wrapped positions near given ones, their images, and the number of atoms without exact images.
+    """Return wrapped positions near given ones, their images, and the number of atoms without exact image.
 
-    Wrapping the second array gives the first, bit for bit. In a box along the axes, a position whose image
-    was rounded has an exact image (Sterbenz's lemma: the lattice vector is subtracted again without
+    Wrapping the images gives the wrapped positions, bit for bit. In a box along the axes, a position whose
+    image was rounded has an exact image (Sterbenz's lemma: the lattice vector is subtracted again without
     rounding); a second iteration is needed only if the first crosses a face of the box.
     """
     from mdnum.md.cell import wrap_positions
@@ -241,10 +240,10 @@ def exact_images(
 
 @choice("ulps")
 class Ulps(Choice):
-    """A number of the system file, changed to a nearby float of the format in which the number is used.
+    """A parameter of the system file, changed to a nearby float in the format in which the parameter is used.
 
-    For a run at constant energy, the temperature is that of its drawn velocities, and both runs draw
-    velocities.
+    For a run at constant energy, the temperature is that of the randomly drawn initial velocities of both
+    runs.
     """
 
     screened: ClassVar = {world: " ".join(f"ulps={key}" for key in keys) for world, keys in OFTEN.items()}
@@ -358,7 +357,7 @@ class StartUlp(Choice):
 
 @choice("noise")
 class NoiseChoice(Choice):
-    """Another random key of the thermostat's noise."""
+    """Another random key for the thermostat's noise."""
 
     worlds = ("md",)
     seed: int | None = None  # of the key; None for the next after the system's own
@@ -384,7 +383,7 @@ class NoiseChoice(Choice):
 class EnergyShift(Choice):
     """Pair energies shifted to zero at the cutoff, or not shifted.
 
-    The conserved energies of the two programs differ, but their motions do not: a constant has no derivative.
+    The conserved energies of the two programs differ, but their trajectories do not.
     """
 
     worlds = ("md",)

@@ -1,1 +1,1 @@
-"""Exact real arithmetic of a run's discrete map, to certify the decisions of finite-precision runs."""
+"""Exact arithmetic for the time steps of a run, to certify the decisions of finite-precision runs."""

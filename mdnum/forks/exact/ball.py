@@ -1,4 +1,4 @@
-"""The bouncing ball's program in exact arithmetic, for steps that are sums and products of floats."""
+"""The bouncing ball in exact arithmetic, for time steps that consist of sums and products of floats."""
 
 from __future__ import annotations
 
@@ -49,19 +49,19 @@ def exactly(value: SupportsFloat) -> Decimal:
 
 
 def nearest(value: Decimal) -> float:
-    """Round a decimal number to the nearest float; a zero is always positive."""
+    """Round a decimal number to the nearest float; zero has a positive sign."""
     return float(_LONG.plus(value)) + 0.0
 
 
 def ball_history(world: World, start: BallState, steps: int) -> BallRun:
-    """Compute a world's rollout in exact arithmetic, from the numbers that the world stores.
+    """Compute the run of a ball in exact arithmetic, from the numbers that the ball's `world` stores.
 
-    Quantities on which no decision depends (residuals, margins of stops, the ledger) are not recorded.
+    Quantities that do not affect decisions (residuals, stopping margins, the ledger) are not recorded.
 
-    Error: none; only the double-precision values in the record are rounded.
+    Error: none, except that the values in the record are rounded to double precision.
 
     Raises:
-        InputError: steps is below 1, or the world's steps are not sums and products.
+        InputError: steps is below 1, or a time step does not consist of sums and products.
     """
     expect_at_least(1, steps=steps)
     with decimal.localcontext(_EXACT):
@@ -82,7 +82,7 @@ def ball_history(world: World, start: BallState, steps: int) -> BallRun:
 
 
 class _ExactBall:
-    """State and step of the balls in exact numbers."""
+    """State and time step of the balls in exact numbers."""
 
     def __init__(self, world: World, start: BallState):
         contact, scheme = world.contact, world.integrator
@@ -139,7 +139,7 @@ class _ExactBall:
         return _plus(ys, h, vs), _plus(vs, self.half, a)
 
     def step(self, index: int):
-        """Make one step; return new heights and velocities, decided heights, contacts and iterations."""
+        """Make one step; return heights, velocities, heights used in decisions, contacts and iterations."""
         free, counts = self._free(index), [0] * len(self.y)
         if isinstance(self.contact_model, Penalty):
             heights = self._push(free)
@@ -204,7 +204,7 @@ class _ExactBall:
 
 
 class _ExactRule:
-    """A stopping rule in exact numbers; residuals and thresholds are per batch or per ball."""
+    """A stopping rule of the solver in exact numbers; residuals and thresholds are per batch or per ball."""
 
     def __init__(self, world: World):
         rule: Any = world.contact.stop  # type: ignore[attr-defined]
@@ -219,7 +219,7 @@ class _ExactRule:
         self.tol = None if isinstance(rule, FixedCount) else _held(world, rule.tol)
 
     def measure(self, depths: Balls) -> Balls:
-        """Return the residual of the batch, or one residual for each ball."""
+        """Return the residual of the batch, or the residual of each ball."""
         if isinstance(self.rule, PerInstance):
             return depths
         if isinstance(self.rule, GlobalSum):
@@ -233,7 +233,7 @@ class _ExactRule:
         return [largest]
 
     def stops(self, residual: Decimal, first: Decimal, iteration: int) -> bool:
-        """Return True if the residual is below its threshold."""
+        """Return True if the residual is below the threshold."""
         if self.enter is not None and iteration == 0:
             return residual < self.enter
         if self.tol is None:
@@ -244,7 +244,7 @@ class _ExactRule:
 
 
 def _held(world: World, value: Any) -> Decimal:
-    """Return a threshold after rounding to the dtype of decisions."""
+    """Return a threshold, rounded to the dtype in which decisions are made."""
     return exactly(float(np.asarray(value).astype(world.policy.dtype("decision"))))
 
 

@@ -1,4 +1,4 @@
-"""The step at which runs leave the exact history (all decisions in exact arithmetic), for each precision."""
+"""Find the step at which runs of each precision leave the exact history (decisions in exact arithmetic)."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _EXPONENTIAL = 0.95
 
 @dataclass(frozen=True)
 class PolicyHorizon:
-    """How long a run in one precision follows the exact history."""
+    """Number of steps for which a run in one precision follows the exact history."""
 
     # name, roles: of the precision, and its dtype by role
     name: str
@@ -71,12 +71,12 @@ class PolicyHorizon:
 
     @property
     def horizon(self) -> int | None:
-        """First step with a decision that differs from the exact one; None if all decisions agree."""
+        """First step with a decision that differs from the exact decision; None if all decisions agree."""
         return None if self.decision is None else self.decision.step
 
     @property
     def margin(self) -> float:
-        """Margin of the first wrong decision in the exact run; NaN if no decision is wrong."""
+        """Margin, in the exact run, of the first decision that is made wrongly; NaN if none is wrong."""
         return float("nan") if self.decision is None else self.decision.margins["A"]
 
     def is_all(self, dtype: str) -> bool:
@@ -86,7 +86,7 @@ class PolicyHorizon:
 
 @result
 class Certificate:
-    """The exact history of a system, and how long runs in finite precision follow that history."""
+    """The exact history of a system, and the number of steps for which finite-precision runs follow it."""
 
     steps: int  # last step
     timestep: float  # in the user's units of time
@@ -103,18 +103,18 @@ def certify(
     policies: Mapping[str, Roles] | None = None,
     progress: Progress | None = None,
 ) -> Certificate:
-    """Compute the exact history of a system, and the step at which a run in each precision leaves it.
+    """Compute the exact history of a system, and the step at which runs of each precision leave this history.
 
-    The numbers of the file are rounded to float64. A run in lower precision rounds them further, and this
-    rounding is part of its deviation.
+    The numbers of the system file are rounded to float64. A run in lower precision rounds these numbers
+    further, and this rounding is included in its deviation.
 
     Args:
-        system: a Lennard-Jones system of at most 108 atoms at constant energy (NVE), or a ball whose steps
-            consist of sums and products. The system's own precision is ignored.
+        system: a Lennard-Jones system of at most 108 atoms at constant energy (NVE), or a ball whose time
+            steps consist of sums and products. The precision set in the system is ignored.
         steps: last step; default the system's own.
         policies: for each named precision, the dtype of each role; default `MD_POLICIES` or `BALL_POLICIES`.
             Roles that are not named are float64.
-        progress: called with the number of items done, their total, and a dictionary of figures.
+        progress: called with the number of items done, their total, and a dictionary of current values.
 
     Raises:
         InputError: the system cannot be certified, or steps is below 1.
@@ -163,7 +163,7 @@ def _certify_md(system: Simulation, last: int, policies: Mapping[str, Roles], no
     matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
 
     def reduced(x: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Move positions into a box at the origin, so that one lattice vector corrects a displacement."""
+        """Wrap positions into a box at the origin, so that one lattice vector corrects a displacement."""
         return x - np.floor(x @ np.asarray(simulation.cell.inverse)) @ matrix
 
     rows = []
@@ -227,7 +227,7 @@ def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], 
 
 
 def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
-    """Return ln 2 divided by the growth rate of the run whose growth could be followed longest."""
+    """Return ln 2 / growth rate (steps per bit) of the run whose growth could be measured over most steps."""
     # separations that grow by a power of time, as those of a lone pair, are no exponentials
     fits = [row.growth for row in rows if row.growth is not None]
     fits = [fit for fit in fits if fit.rate > 0 and fit.r_squared > _EXPONENTIAL]
@@ -237,7 +237,7 @@ def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
 
 
 def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
-    """Add the gain of each policy over pure single precision, if the latter leaves the exact history."""
+    """Add to each policy its gain over pure single precision, if that precision leaves the exact history."""
     low = next((row for row in rows if row.is_all("float32")), None)
     high = next((row for row in rows if row.is_all("float64")), None)
     if low is None or low.horizon is None:
@@ -254,10 +254,10 @@ def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
 
 
 def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
-    """Return how many bits closer to the exact positions one run is than another, while decisions agree.
+    """Return how many bits closer one run is to the exact positions than another, while all decisions agree.
 
     The value is the median over the second half of the steps before the first wrong decision. Unlike the
-    horizon, this median does not depend on which pair happens to come close to its cutoff.
+    horizon, this median does not depend on which pair of atoms happens to approach its cutoff.
     """
     if base.separation is None or row.separation is None:
         return float("nan")

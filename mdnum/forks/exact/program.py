@@ -1,9 +1,9 @@
-"""The discrete map of a rollout in exact real arithmetic. Ball arithmetic (Arb) proves every decision.
+"""The time steps of a run in exact real arithmetic. Ball arithmetic (Arb) proves every decision.
 
-The start and all constants are the doubles that the program holds, taken as exact dyadic rationals. Positions
-and velocities are balls (intervals) of many bits. A decision is proven if its ball lies on one side of the
-threshold; otherwise the run is repeated with more bits. The result is the history that the program would have
-without any rounding.
+The start and all constants are the double-precision numbers of the program, taken as exact dyadic rationals.
+Positions and velocities are balls (intervals) with many bits. A decision is proven if the ball of its margin
+lies on one side of the threshold; otherwise the run is repeated with more bits. The result is the sequence of
+decisions that the program would make without any rounding.
 
 Source: Johansson, Arb, IEEE Transactions on Computers 66 (2017) 1281.
 """
@@ -49,10 +49,10 @@ _U = 2.0**-53
 def pull_of(
     potential: PairPotential, constants: Mapping[str, float], cutoff: str, r_cut: float, r_onset: float
 ) -> Callable[[Any], Any]:
-    """Return the function that computes 2 du/d(r²) of a pair inside its cutoff from the ball r².
+    """Return the function that computes 2 du/d(r²) of a pair inside its cutoff from the ball of r².
 
     This derivative is the factor of the displacement x_j - x_i in the force on i. Constants are exactly the
-    given doubles; derived values are enclosed at the precision that is set at the time of the call.
+    given doubles; derived values are enclosed with the precision set at the time of the call.
 
     Raises:
         TypeError: the potential uses an operation that ball arithmetic does not support.
@@ -67,7 +67,7 @@ def pull_of(
 
 
 def _lennard_jones(sigma: Any, epsilon: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Return functions for 2 du/d(r²) and u of the Lennard-Jones potential that need few operations."""
+    """Return functions for 2 du/d(r²) and u of the Lennard-Jones potential, with few operations."""
     s2 = sigma * sigma
     s6 = s2 * s2 * s2
     # u = (4 epsilon s6) r⁻⁶ (s6 r⁻⁶ - 1), 2 du/d(r²) = (attract - repel r⁻⁶) r⁻⁸
@@ -90,7 +90,7 @@ def _lennard_jones(sigma: Any, epsilon: Any) -> tuple[Callable[[Any], Any], Call
 def _enclosed(
     potential: PairPotential, **constants: Any
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Return functions that compute 2 du/d(r²) and u of a potential, one operation at a time."""
+    """Return functions that compute 2 du/d(r²) and u of any potential, one operation at a time."""
 
     def evaluate(r2, *values):
         leaves = {name: value[None] for name, value in zip(constants, values, strict=True)}
@@ -102,7 +102,7 @@ def _enclosed(
 
 @dataclass(frozen=True)
 class ExactHistory:
-    """The exact history of a run: its decisions, each of them proven."""
+    """The exact history of a run: all its decisions, with proof."""
 
     tape: DecisionTape  # every decision, proven
     # smallest |threshold - r²| of any pair at each step, length², shape (steps + 1,); good to about ten
@@ -120,7 +120,7 @@ class ExactHistory:
 
     @property
     def bits_per_step(self) -> float:
-        """Bits by which the largest ball grows per step, in the second half; NaN for a short run."""
+        """Bits by which the largest ball grows per step in the second half of a run; NaN for a short run."""
         rows = np.flatnonzero(np.isfinite(self.radius))
         if len(rows) < 4:
             return float("nan")
@@ -129,14 +129,14 @@ class ExactHistory:
 
 
 def installed() -> bool:
-    """Return True if the ball arithmetic (python-flint) is installed."""
+    """Return True if the package for ball arithmetic (python-flint) is installed."""
     from importlib.util import find_spec
 
     return find_spec("flint") is not None
 
 
 def unsupported(simulation: Simulation) -> InputError | None:
-    """Return an error, with a remedy, if the system cannot be certified; else None."""
+    """Return an error with a remedy if the system cannot be certified; otherwise None."""
     half, atoms = float(np.min(simulation.cell.widths)) / 2, simulation.atoms
     alone = simulation.pairwise and not isinstance(simulation.potential, SumPotential)
     reasons = (
@@ -185,7 +185,7 @@ def unsupported(simulation: Simulation) -> InputError | None:
 
 
 def _without_balls(simulation: Simulation) -> InputError | None:
-    """Return an error if the potential or cutoff needs an operation that balls do not support."""
+    """Return an error if the potential or cutoff needs an operation that ball arithmetic does not support."""
     from flint import arb
 
     try:
@@ -201,7 +201,7 @@ def _without_balls(simulation: Simulation) -> InputError | None:
 
 
 def _pulls(simulation: Simulation) -> list[Callable[[Any], Any]]:
-    """Return the function made by `pull_of` for each pair type."""
+    """Return, for each pair type, the function made by `pull_of`."""
     model, bare = simulation.model, simulation.model.potential
     radii = zip(np.asarray(model.r_cut), np.asarray(model.r_onset), strict=True)
     return [
@@ -211,10 +211,10 @@ def _pulls(simulation: Simulation) -> list[Callable[[Any], Any]]:
 
 
 class ExactProgram:
-    """The discrete map of a simulation in ball arithmetic, applied to its start in double precision.
+    """The time steps of a simulation in ball arithmetic, from its start in double precision.
 
     Args:
-        simulation: the simulation; its constants are doubles, regardless of the precision policy.
+        simulation: the simulation; its constants are in double precision, whatever its precision policy.
 
     Raises:
         InputError: the system cannot be certified.
@@ -249,7 +249,7 @@ class ExactProgram:
         bits: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> ExactHistory:
-        """Prove every decision up to a step, using more bits where the first attempt did not suffice.
+        """Prove every decision up to a step, with more bits wherever the first attempt is insufficient.
 
         Args:
             steps: last step.
@@ -257,8 +257,8 @@ class ExactProgram:
             progress: called with the step reached and the last step.
 
         Raises:
-            InputError: a pair is too close to its threshold to be decided with any number of bits that was
-                tried.
+            InputError: a pair is so close to its threshold that no number of bits that was tried proves the
+                decision.
         """
         expect_at_least(0, steps=steps)
         bits = math.ceil(_BITS_PER_STEP * steps) + _BITS_LEFT if bits is None else bits
@@ -278,7 +278,7 @@ class ExactProgram:
 
 
 class _Run:
-    """One attempt to prove all decisions with a fixed number of initial bits."""
+    """One attempt to prove all decisions, which begins with a fixed number of bits."""
 
     def __init__(self, program: ExactProgram, steps: int, bits: int):
         self.program, self.steps, self.bits, self.step = program, steps, bits, 0
@@ -289,7 +289,7 @@ class _Run:
         self._close = 0
 
     def bits_needed(self) -> int:
-        """Estimate the required bits from the growth of the balls so far."""
+        """Estimate the number of bits required from the growth of the balls so far."""
         grown = self._radius[: self.step + 1]
         known = np.flatnonzero(np.isfinite(grown))
         if len(known) < 50:
@@ -298,7 +298,7 @@ class _Run:
         return math.ceil(1.1 * rate * self.steps) + 2 * _BITS_LEFT
 
     def all(self, progress, restarts: int) -> ExactHistory:
-        """Run all steps and return the certified history."""
+        """Run all steps and return the exact history."""
         from flint import ctx
 
         begin, before = time.perf_counter(), ctx.prec
@@ -388,7 +388,7 @@ class _Run:
         return first
 
     def _shift(self, n: list[int]) -> tuple[Any, Any, Any]:
-        """Return the sum of n lattice vectors, an exact product of small integers and doubles."""
+        """Return the sum of integer multiples n of the lattice vectors, exactly."""
         key = (n[0], n[1], n[2])
         if key not in self._shifts:
             rows = self._lattice
@@ -399,11 +399,11 @@ class _Run:
     def _decide(
         self, x, centers: Float[np.ndarray, "atoms 3"], radius: float, thresholds: list
     ) -> tuple[Bool[np.ndarray, "all_pairs"], Int[np.ndarray, "all_pairs 3"], Float[np.ndarray, "all_pairs"]]:
-        """Make all decisions of a step, with a bound in double precision, or with the balls if that is too
+        """Make all decisions of a step with double-precision bounds, or with balls where bounds are too
         coarse.
 
-        The nearest image in double precision is the exact nearest image, or the pair is further apart than
-        r_cut in both images, because r_cut is smaller than half the box by more than rounding.
+        If the nearest image in double precision is not the exact nearest image, the pair is further apart
+        than r_cut in both images, because half the box exceeds r_cut by more than rounding.
         """
         program = self.program
         i, j, matrix = program._i, program._j, program._matrix
@@ -436,7 +436,7 @@ class _Run:
 
 
 def _log2_radius(ball) -> float:
-    """Return an upper bound on log2 of a ball's radius, for radii beyond the range of a double too."""
+    """Return an upper bound on log2 of a ball's radius, even for radii outside the range of doubles."""
     if ball.is_exact():
         return -math.inf
     mantissa, exponent = ball.rad().man_exp()
