@@ -1,4 +1,4 @@
-"""Precision (dtypes by role, rounding bounds, sums) and events (thresholds, decisions, ledger, verdicts)."""
+"""Floating-point precision, rounding bounds, sums, and discrete events such as pairs crossing a cutoff."""
 
 from __future__ import annotations
 

@@ -1,14 +1,14 @@
-"""Elementary functions in IEEE 754 operations: the same bits wherever no multiply and add are fused.
+"""Elementary functions made of IEEE 754 operations, with the same bits wherever none are fused.
 
-The functions of libraries differ from one another, and those of compilers differ between instruction sets.
-The functions here have no branch, no table and no fused multiply-add: only sums, products, quotients, roots,
-comparisons, selections, and bit operations. jax traces them, and every interpreter that runs the trace
-operation by operation (the compiled loop, fixed-point runs, numpy in the tests) obtains the same number.
+Elementary functions differ between libraries, and between the instruction sets for which a compiler generates
+code. The functions here have no branch, no table and no fused multiply-add. They consist only of sums,
+products, quotients, roots, comparisons, selections and bit operations. jax traces these functions, and every
+interpreter that runs the trace operation by operation (such as the compiled loop) obtains the same number.
 
-Arguments and results are float64. Subnormal arguments count as 0, as in XLA's threads. Results below
-2.2261e-308 are 0, and results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps,
-the spacing of the floats at the result. The bound of the exponential comes from counting roundings; the other
-bounds are at least 1.3 times the largest error in 100,000 (error functions) or ten million arguments
+Arguments and results are float64. Subnormal arguments count as 0. Results below 2.2261e-308 are 0, and
+results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps, the spacing of the
+floats at the result. The error bound of the exponential was derived by counting roundings. The other bounds
+are at least 1.3 times the largest error measured for 100,000 (error functions) or ten million arguments
 (docs/compiled-loop.md).
 """
 
@@ -49,7 +49,7 @@ def _number(bits: Any) -> Any:
 
 
 def _short(x: Any) -> Any:
-    """Return the first 26 binary digits: a product of two such numbers is exact."""
+    """Return x truncated to 26 binary digits, so that the product of two such numbers is exact."""
     return _number(_bits(x) & -(1 << 27))
 
 
@@ -58,7 +58,7 @@ def _with_sign(of: Any, x: Any) -> Any:
 
 
 def polynomial(coefficients: Sequence[float], x: Any) -> Any:
-    """Evaluate a polynomial by Horner's rule, highest coefficient first."""
+    """Evaluate a polynomial by Horner's rule, with coefficients in descending order of the power."""
     total = coefficients[0] * x + coefficients[1]
     for c in coefficients[2:]:
         total = total * x + c
@@ -66,7 +66,7 @@ def polynomial(coefficients: Sequence[float], x: Any) -> Any:
 
 
 def _halved(coefficients: Sequence[Any], x: Any) -> Any:
-    """Evaluate a polynomial by Estrin's scheme, lowest coefficient first: short chains of operations."""
+    """Evaluate a polynomial by Estrin's scheme, with coefficients in ascending order of the power."""
     if len(coefficients) == 1:
         return coefficients[0]
     pairs = [a + b * x for a, b in zip(coefficients[::2], coefficients[1::2], strict=False)]
@@ -82,7 +82,7 @@ _EXP = (
 
 
 def _reduced(x: Any, low: Any = None) -> tuple[Any, Any]:
-    """Return p, and a number whose last bits are n, with exp(x + low) = (1 + p) 2^n."""
+    """Return p and a float whose last bits are the integer n, such that exp(x + low) = (1 + p) 2^n."""
     shifted = x * (1 / math.log(2)) + _ROUND
     n = shifted - _ROUND
     r = (x - n * _LN2[0]) - n * _LN2[1]
@@ -91,13 +91,13 @@ def _reduced(x: Any, low: Any = None) -> tuple[Any, Any]:
 
 
 def _scaled(x: Any, p: Any, n: Any) -> Any:
-    """Return (1 + p) 2^n, the exponential of x."""
+    """Return (1 + p) 2^n, given p and n that represent exp(x)."""
     value = _number(_bits(1.0 + p) + (n << _EXPONENT))
     return jnp.where(x < _LEAST, 0.0, jnp.where(x <= _GREATEST, value, x + math.inf))
 
 
 def exp(x: Any, low: Any = None) -> Any:
-    """Return the exponential of x, or of x + low for an argument in two parts. Error: below 1.5 ulp."""
+    """Return exp(x + low), where x + low is an argument with more than 53 bits. Error: below 1.5 ulp."""
     return _scaled(x if low is None else x + low, *_reduced(x, low))
 
 
@@ -126,7 +126,7 @@ _LOG = [2 / (2 * k + 1) for k in range(11, 0, -1)]
 
 
 def _split(x: Any) -> tuple[Any, Any]:
-    """Return n and m with x = m 2^n and m between √(1/2) and √2, for positive normal numbers."""
+    """Return n and m such that x = m 2^n, with m between √(1/2) and √2, for positive normal numbers x."""
     bits = _bits(x)
     exponent = _number(lax.shift_right_logical(bits, np.int64(_EXPONENT)) | _COUNT) - (2.0**52 + 1023)
     m = _number((bits & _MANTISSA) | _ONE)
@@ -154,7 +154,7 @@ def log1p(x: Any) -> Any:
 
 
 def power(x: Any, y: Any) -> Any:
-    """Return x to the power y; for negative x, y must be whole. Error: below 1.5 + |y|/40 ulp."""
+    """Return x to the power y; if x is negative, y must be an integer. Error: below 1.5 + |y|/40 ulp."""
     size, huge = jnp.abs(x), 2.0**1000
     n, m = _split(size)
     # the logarithm in two parts: s and the sum that divides it lose what the second one has
@@ -184,7 +184,7 @@ _SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1)]
 
 
 def cos_sin(x: Any) -> tuple[Any, Any]:
-    """Return cosine and sine for |x| up to 8e5, NaN beyond. Error: absolute, below 2.5e-16."""
+    """Return cosine and sine of x; NaN if |x| exceeds 8e5. Absolute error: below 2.5e-16."""
     n = jnp.round(x * (2 / math.pi))
     r = (x - n * _HALF_PI[0]) - n * _HALF_PI[1]
     square = r * r
@@ -217,7 +217,7 @@ _ERF = (
 
 
 def _complement(z: Any) -> Any:
-    """Return erfc of numbers that are not negative."""
+    """Return the complementary error function of non-negative numbers."""
     z = jnp.where(z > 28, 28.0, z)
     short = _short(z)
     inverse = 1 / (_K + z)
@@ -255,5 +255,5 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 
 
 def program(name: str, *shapes: tuple[int, ...]) -> ClosedJaxpr:
-    """Return the jaxpr of the function with a given jax name, for arguments of given shapes."""
+    """Return the jaxpr of the elementary function with a given jax name, for arguments of given shapes."""
     return jax.make_jaxpr(FUNCTIONS[name])(*(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes))

@@ -1,4 +1,4 @@
-"""The event model: thresholds, margins, decisions, and the ledger of flips."""
+"""Events: comparisons of a quantity with a threshold (decisions), and the table of decisions that flip."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ INCLUSIVE = {"<": False, "<=": True}
 
 @dataclass(frozen=True)
 class Threshold:
-    """A number that a computed quantity is compared with, and the comparison operator.
+    """A threshold with which a computed quantity is compared, and the comparison operator.
 
-    The comparison is part of the physics: codes with the same cutoff may still differ in `<` against `<=` and
-    in comparing r or r², and then they differ for pairs exactly at the cutoff.
+    The comparison is part of the physical model: two codes with the same cutoff may use `<` or `<=` and
+    compare r or r². They then differ for pairs exactly at the cutoff.
     """
 
     # the threshold in the quantity's own space, exactly as the program compares it: a number, or an array
@@ -32,25 +32,26 @@ class Threshold:
             raise InputError(f"comparison {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
 
     def margin(self, quantity):
-        """Return threshold - quantity: positive means that the decision is "yes".
+        """Return threshold minus quantity, which is positive if the decision is "yes".
 
-        Error: exact if the quantity is within a factor two of the threshold (Sterbenz' lemma); the sign is
-        always right, because IEEE subtraction of unequal numbers never gives zero (gradual underflow).
+        Error: the difference is exact if the quantity is within a factor of 2 of the threshold (Sterbenz
+        lemma). The sign is always correct, because an IEEE difference of unequal numbers is never zero.
         """
         return self.value - quantity
 
     def decide(self, quantity):
-        """Return the decision, in the shape of the quantity; for NaN the decision is no."""
+        """Return True where the quantity meets the comparison with the threshold; NaN gives False."""
         return quantity <= self.value if INCLUSIVE[self.comparison] else quantity < self.value
 
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """A decision that turns yes at one threshold and no at another (a Schmitt trigger).
+    """A decision with hysteresis, like a Schmitt trigger: it turns on at one threshold and off at another.
 
-    A quantity that fluctuates about one threshold flips its decision each time. With a gap between two
-    thresholds the decision flips once; choose a gap wider than the noise. The skin of a Verlet list is such a
-    gap: the list is built when the skin is used up, not whenever an atom moves.
+    With one threshold, a quantity that fluctuates about the threshold flips the decision at each crossing.
+    With a gap between two thresholds that is wider than the noise, the decision flips once. The skin of a
+    Verlet list has the same purpose: the list is rebuilt when the skin is used up, not whenever an atom
+    moves.
     """
 
     enter: Threshold  # where a no turns yes
@@ -72,16 +73,16 @@ class Hysteresis:
             )
 
     def margin(self, quantity, before):
-        """Return the signed distance to the current threshold: positive means that the decision is "yes".
+        """Return the signed distance to the current threshold, which is positive if the decision is "yes".
 
         Args:
             quantity: computed value(s).
-            before: the decision(s) of the previous step.
+            before: the decision(s) at the previous step.
         """
         return _where(before, self.leave.margin(quantity), self.enter.margin(quantity))
 
     def decide(self, quantity, before):
-        """Return the decision for a quantity, given the previous decision."""
+        """Return the decision for a quantity, given the decision at the previous step."""
         return _where(before, self.leave.decide(quantity), self.enter.decide(quantity))
 
 
@@ -96,18 +97,18 @@ def _where(condition, yes, no):
 
 @dataclass(frozen=True)
 class Ledger:
-    """The flips of one channel in time, in the order of steps, then subjects.
+    """Table of all flips of one kind of decision (a channel), sorted by time step and then by subject.
 
     A flip at step s means that the decision at s differs from the decision at s - 1.
 
     Attributes:
         channel: name of the stream of decisions, for example "pair".
         step: step of each flip.
-        subject: labels of what was decided, shape (flips, labels).
-        entered: whether the decision turned yes.
-        margin: signed distance to the threshold at the step of the flip, in the quantity's space.
-        bound: rounding bound on the quantity, in the same space.
-        jump: change of the conserved quantity (energy) by the flip, signed.
+        subject: labels of the object of the decision, such as the two atoms of a pair, shape (flips, labels).
+        entered: whether the decision changed from no to yes.
+        margin: threshold minus quantity at the step of the flip, in the unit of the quantity.
+        bound: bound of the rounding error of the quantity, in the same unit.
+        jump: signed change of the conserved quantity (energy) by the flip.
         extra: further columns by name, each of shape (flips,).
     """
 
@@ -125,16 +126,16 @@ class Ledger:
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "flips"]:
-        """Whether another valid rounding could change the step of each flip: |margin| is within the bound."""
+        """Whether the step of each flip depends on rounding: |margin| does not exceed the error bound."""
         return np.abs(self.margin) <= self.bound
 
     def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:
-        """Return the numbers of decisions that turned yes and that turned no, at each step 0..steps."""
+        """Return, for each step 0..steps, how many decisions changed to yes and how many changed to no."""
         entered = np.bincount(self.step[self.entered], minlength=steps + 1)
         left = np.bincount(self.step[~self.entered], minlength=steps + 1)
         return entered, left
 
     def jumps(self, steps: int) -> Float[np.ndarray, "steps"]:
-        """Return the sum of the jumps of all flips at each step 0..steps."""
+        """Return, for each step 0..steps, the sum of the energy jumps of all flips."""
         # bincount of nothing is a row of integers, whatever its weights
         return np.bincount(self.step, weights=self.jump, minlength=steps + 1).astype(np.float64)

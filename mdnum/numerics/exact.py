@@ -1,9 +1,10 @@
-"""Arithmetic inside jit that has the same bits everywhere.
+"""Floating-point arithmetic inside jit whose results have the same bits on every processor.
 
-XLA on a CPU contracts a*b + c into a fused multiply-add, so the same expression has different bits in another
-fusion, another instruction set, or in numpy. A decision must not depend on the compiler: its products are
-protected by fences, and the host reproduces it bit for bit. Any other formula is run operation by operation:
-with every result rounded, in interval arithmetic, or with the same bits on every processor.
+XLA on a CPU contracts a*b + c into a fused multiply-add. Therefore the bits of an expression depend on fusion
+and on the instruction set, and differ from those of numpy. Whether a pair is inside the cutoff must not
+depend on the compiler: fences protect the products, and numpy reproduces the comparison bit for bit. Other
+formulas can be run operation by operation: with every result rounded, in interval arithmetic, or with the
+same bits on every processor.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from mdnum.numerics import elementary
 
 
 def integer_of(dtype):
-    """Return the signed integer type as wide as a float dtype."""
+    """Return the signed integer type with the same number of bits as a float dtype."""
     return jnp.dtype(f"int{8 * np.dtype(dtype).itemsize}")
 
 
 def zero_bits(dtype) -> jax.Array:
-    """Return an integer zero as wide as dtype; pass the zero into jit as an argument that XLA cannot fold."""
+    """Return an integer zero with the bits of dtype, for `fence`; pass it into jit as an argument."""
     return jax.device_put(np.zeros((), integer_of(dtype)))
 
 
@@ -39,13 +40,13 @@ def _through_integers(x, zero):
 
 @jax.custom_jvp
 def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
-    """Return x, protected from contraction into a fused multiply-add by an exclusive-or with a runtime zero.
+    """Return x unchanged, but prevent XLA from fusing the operation that computed x with the next one.
 
-    The fence also forces the rounding to float16 and bfloat16: XLA may keep the float32 in which it computed
-    (a bfloat16 product that is widened at once is never rounded on a CPU), but an integer needs the bits.
+    The fence is an exclusive-or of the bits of x with a zero that XLA does not know. It also forces the
+    rounding to float16 and bfloat16, which XLA on a CPU may omit because it computes in float32.
 
-    Source: optimization_barrier and reduce_precision do not stop the contraction on CPU
-    (openxla/xla#41579); the exclusive-or with a runtime integer does.
+    Source: optimization_barrier and reduce_precision do not prevent the contraction on a CPU
+    (openxla/xla#41579).
     """
     return _through_integers(x, zero)
 
@@ -57,9 +58,9 @@ def _fence_jvp(primals, tangents):
 
 
 def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
-    """Return dx² + dy² + dz², rounded after every operation: the bits of numpy's `dx*dx + dy*dy + dz*dz`.
+    """Return dx² + dy² + dz², rounded after every operation, so that the result has the bits of numpy's.
 
-    Error: at most gamma_3 * r² for exact components (Higham 2002, 3.1).
+    Error: at most gamma_3 r² for exact dx, dy, dz, where gamma_n = n u / (1 - n u) (Higham 2002, 3.1).
     """
     return (fence(dx * dx, zero) + fence(dy * dy, zero)) + fence(dz * dz, zero)
 
@@ -67,9 +68,9 @@ def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -
 def root(x: jax.Array) -> jax.Array:
     """Return the square root, correctly rounded on every device.
 
-    The float32 square root of a GPU has an error of one ulp for one number in six (XLA, H200). A float64 root
-    that is then rounded to float32 is correct, since 53 bits are more than twice 24 and two (Figueroa 1995,
-    "When is double rounding innocuous?").
+    On a GPU, the float32 square root has an error of one ulp for one number in six (XLA, H200). A float64
+    square root that is rounded to float32 is correct, because 53 bits are enough: at least 2 * 24 + 2
+    (Figueroa 1995, "When is double rounding innocuous?").
     """
     if x.dtype != jnp.float32 or jax.default_backend() == "cpu":
         return jnp.sqrt(x)
@@ -96,10 +97,10 @@ def stepwise(
     enter: Callable[[Any], Any] = _same,
     leave: Callable[[Any], jax.Array] = _same,
 ) -> Callable[..., Any]:
-    """Return a function of arrays that is traced at each call; a rule computes each of its operations.
+    """Return a version of a function of arrays in which a given rule computes each operation.
 
     Args:
-        function: may close over other arrays.
+        function: function of arrays, which may close over other arrays.
         rule: maps an equation of jax's program and its inputs to its outputs.
         enter: converts arguments, constants, and inputs and outputs of calls to the values of the rule.
         leave: converts a result of the rule to an array.
@@ -119,7 +120,7 @@ def stepwise(
 def interpreted(
     program: Any, arguments: Sequence[Any], rule: Rule, enter: Callable[[Any], Any] = _same
 ) -> list[Any]:
-    """Return the results of a jax program whose operations are computed by a rule (see `stepwise`)."""
+    """Run a jaxpr with a rule that computes each operation (see `stepwise`), and return the results."""
     jaxpr, constants = (program.jaxpr, program.consts) if isinstance(program, ClosedJaxpr) else (program, ())
     known = dict(zip(jaxpr.constvars, map(enter, constants), strict=True))
     known.update(zip(jaxpr.invars, map(enter, arguments), strict=True))
@@ -139,16 +140,16 @@ def interpreted(
 
 
 def inlined(equation: Any) -> Any:
-    """Return the program that an operation calls once (a function with custom derivatives), or None."""
+    """Return the jaxpr that an operation calls once (such as a function with custom derivatives), or None."""
     programs = (equation.params.get(key) for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"))
     return next(filter(None, programs), None) if equation.primitive.name in _CALLED else None
 
 
 def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
-    """Return the results that jax itself computes for one equation of a program.
+    """Return the results that jax computes for one equation of a jaxpr.
 
     Raises:
-        TypeError: the equation contains a program of its own, such as a loop.
+        TypeError: the equation contains another jaxpr, such as the body of a loop.
     """
     if any(isinstance(param, Jaxpr | ClosedJaxpr) for param in equation.params.values()):
         raise TypeError(f"{equation.primitive.name} cannot be evaluated operation by operation")
@@ -157,12 +158,12 @@ def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
 
 
 def rounded(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
-    """Return the function with a rounding after every operation that has a sixteen-bit result.
+    """Return a version of a function that rounds the result of every 16-bit floating-point operation.
 
-    XLA on a CPU computes float16 and bfloat16 expressions in float32, and may omit the roundings between two
-    operations. Here a fence follows each operation: numpy with ml_dtypes then gives the same bits for + - * /
-    and sqrt (exp and cos are float32's, which libraries round differently). Results of other dtypes do not
-    change.
+    XLA on a CPU computes float16 and bfloat16 expressions in float32, and may omit the rounding between two
+    operations. Here a fence after each operation forces the rounding. For + - * / and sqrt, the results have
+    the same bits as numpy with ml_dtypes; exp and cos are computed in float32 and may differ between
+    libraries. Results of other dtypes do not change.
 
     Args:
         function: function of arrays; it may close over others.
@@ -181,10 +182,10 @@ def _is_short(dtype: Any) -> bool:
 
 
 def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list[Any]]:
-    """Return a float64 function in ball arithmetic: each number is an interval that contains the exact value.
+    """Return a float64 function in interval arithmetic: each result is an interval with the exact value.
 
-    Constants of the formula are taken as exact float64 numbers. If the condition of a `where` holds for only
-    part of a ball, the result is the union of both values; at most one of them may be the wrong branch.
+    Constants of the formula are exact float64 numbers. If an interval contains values on both sides of the
+    condition of a `where`, the result is the union of the intervals of both branches.
 
     Args:
         function: function of scalars; jax traces it once.
@@ -297,9 +298,9 @@ _FAR = (
 
 
 def normal_quantile(u: jax.Array, zero: jax.Array) -> jax.Array:
-    """Return the normal deviate of a number u between -1 and 1: sqrt(2) erf⁻¹(u), float64.
+    """Return sqrt(2) erf⁻¹(u) in float64, a standard normal deviate if u is uniform between -1 and 1.
 
-    Error: relative, about 1e-15.
+    The relative error is about 1e-15.
     """
 
     def ratio(parts, r):
@@ -325,7 +326,7 @@ _SAFE = (
 
 @dataclass
 class _Held:
-    """A number of an interpreted program, with flags that decide whether the number needs a fence."""
+    """A number in a jaxpr that is interpreted, with flags that tell whether the number needs a fence."""
 
     value: Any
     safe: bool = True
@@ -334,7 +335,7 @@ class _Held:
 
 
 def reproducible(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
-    """Return the float64 function with results that do not depend on how it is compiled.
+    """Return a version of a float64 function whose results do not depend on how the function is compiled.
 
     Args:
         function: function of arrays; it may close over others.

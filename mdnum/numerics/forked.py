@@ -1,4 +1,4 @@
-"""Detection of forked processes: in a fork of a process that used jax, jax hangs waiting for lost threads."""
+"""Detection of forked processes: jax hangs in a fork of a process that has used jax."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _forked = False
 
 
 def check_not_forked() -> None:
-    """Check that this process may use jax; call this function before the first use of jax.
+    """Raise an error if this process cannot use jax; called before the first use of jax.
 
     Raises:
         InputError: this process is a fork of one in which jax had been used.

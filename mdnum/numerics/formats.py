@@ -1,7 +1,7 @@
-"""Emulated number formats: rounding to a format, matrix products in it, loss scaling.
+"""Emulation of floating-point formats: rounding, matrix products and loss scaling.
 
-The emulation reproduces the numbers of a format, not its speed. Some devices use TF32 for float32 matrix
-products by default: the inputs keep 10 of 23 fraction bits, the sums are float32.
+The emulation reproduces the rounding of a format, not its speed. Some devices use TF32 for float32 matrix
+products by default: the inputs keep 10 of 23 fraction bits, and the sums are in float32.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class FloatFormat:
 
     @property
     def top(self) -> int:
-        """The exponent field of infinity."""
+        """The value of the exponent field that represents infinity."""
         return 2**self.exponent - 1
 
     @property
@@ -45,7 +45,7 @@ class FloatFormat:
 
     @property
     def smallest_normal(self) -> float:
-        """The smallest number with full precision."""
+        """The smallest positive number with full precision."""
         return 2.0**self.emin
 
     @property
@@ -55,7 +55,7 @@ class FloatFormat:
 
     @property
     def unit_roundoff(self) -> float:
-        """The largest relative error of one rounding to nearest."""
+        """The largest relative error of one rounding to the nearest number."""
         return 2.0**-self.significand
 
 
@@ -93,7 +93,7 @@ def _identity_slope_jvp(primals, tangents):
 
 
 def _rounded(x: Float[Array, "..."], name: str, whole: Callable[[Array], Array]) -> Float[Array, "..."]:
-    """Round x to a format: `whole` maps x in units of the local spacing to a whole number of spacings."""
+    """Round x to a format; the function `whole` rounds x in units of the local spacing to an integer."""
     form = format_of(name)
     if form.significand >= 53:
         return x
@@ -111,13 +111,13 @@ def _rounded(x: Float[Array, "..."], name: str, whole: Callable[[Array], Array])
 def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
     """Round x to the nearest number of a format, ties to even, in the dtype of x.
 
-    Subnormals of the format are kept (`lax.reduce_precision` flushes them), and numbers beyond the largest
-    become infinite. The function rounds once from up to float64, where a cast may round twice. Its derivative
-    is 1.
+    Subnormal numbers of the format are kept (`lax.reduce_precision` flushes them to zero), and numbers beyond
+    the largest become infinite. A float64 is rounded once, whereas a cast may round twice. The derivative is
+    1.
 
     Args:
         x: float64 or narrower.
-        name: of the format; a format with more digits or range than the dtype of x leaves x unchanged.
+        name: name of the format; a format with more digits or range than the dtype of x leaves x unchanged.
     """
     return _rounded(x, name, jnp.rint)
 
@@ -125,14 +125,14 @@ def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
 def matmul(
     a: Float[Array, "... m k"], b: Float[Array, "... k n"], name: str = "float32"
 ) -> Float[Array, "... m n"]:
-    """Emulate a device's matrix product: inputs in one format, products and sums in a wider one.
+    """Emulate a device's matrix product, with inputs in one format and sums in a wider format.
 
-    With "float64" and "float32", everything is in this type. With "tf32", "bfloat16" and "float16", the
-    inputs are rounded to the format, products are exact, and sums are in float32. The result has the dtype of
-    the first matrix.
+    With "float64" and "float32", inputs, products and sums are in this format. With "tf32", "bfloat16" and
+    "float16", inputs are rounded to the format, products are exact, and sums are in float32. The result has
+    the dtype of the first matrix.
 
-    Error: at most (2u + gamma_k) |a| |b| with the format's u and float32's gamma. The sums use the order of
-    the CPU's own product, which differs from that of a device.
+    Error: at most (2u + gamma_k) |a| |b| with the unit roundoff u of the format and gamma_k of float32. The
+    order of summation is that of the CPU, which differs from the order on a device.
     """
     format_of(name)
     if name == "float64":
@@ -142,12 +142,12 @@ def matmul(
 
 
 def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Array, "..."]:
-    """Round x up or down to a neighbor in a format, with probabilities that preserve the mean.
+    """Round x stochastically to one of the two nearest numbers of a format, with x as expectation.
 
-    The result has the dtype of x; numbers of the format are unchanged. The expectation of the result is x
-    (for |x| up to the largest number), with a standard deviation of at most half the spacing; so a long sum
-    of small terms does not stagnate. The random numbers have 53 bits. The derivative by x is 1. Source: Croci
-    et al., R. Soc. Open Sci. 9, 211631 (2022).
+    The result has the dtype of x; numbers of the format are unchanged. For |x| up to the largest number of
+    the format, the expectation of the result is x, and the standard deviation is at most half the spacing. A
+    long sum of small terms therefore does not stagnate. The random numbers have 53 bits. The derivative with
+    respect to x is 1. Source: Croci et al., R. Soc. Open Sci. 9, 211631 (2022).
     """
 
     def up_or_down(places: Array) -> Array:
@@ -165,10 +165,10 @@ def quantize(
     lowest: Float[Array, ""],
     highest: Float[Array, ""],
 ) -> Float[Array, "..."]:
-    """Return the multiple of scale nearest to x, clamped to the range from lowest * scale to highest * scale.
+    """Return the multiple of `scale` nearest to x, between `lowest` * `scale` and `highest` * `scale`.
 
-    The derivative is 1 inside the range, and 0 where the value is clamped. Error: at most scale/2 inside the
-    range, plus one rounding.
+    The derivative is 1 inside this range and 0 outside. Inside, the error is at most scale/2 plus one
+    rounding.
     """
     return jnp.clip(jnp.rint(x / jnp.broadcast_to(scale, x.shape)), lowest, highest) * scale
 
@@ -188,7 +188,7 @@ def _quantize_jvp(primals, tangents):
 
 
 class ScaledGradient(NamedTuple):
-    """A loss with its gradient."""
+    """The value of a loss and its gradient."""
 
     value: Float[Array, ""]  # the loss, in its own dtype
     gradient: PyTree  # as the differentiated argument, leaves in float64
@@ -197,7 +197,7 @@ class ScaledGradient(NamedTuple):
 
 
 def scaled_gradient(function: Callable[..., Any], scale: float | Array, *args: Any) -> ScaledGradient:
-    """Compute the loss `function(*args)` and its gradient by the first argument.
+    """Compute the loss `function(*args)` and its gradient with respect to the first argument.
 
     Args:
         function: function of arrays that returns a scalar.
@@ -212,7 +212,7 @@ def scaled_gradient(function: Callable[..., Any], scale: float | Array, *args: A
 
 
 def check_scale(scale: float) -> None:
-    """Check that scaling by this factor is exact.
+    """Check that multiplication by a scale factor is exact.
 
     Raises:
         InputError: the factor is not a power of two.

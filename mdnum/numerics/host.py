@@ -1,8 +1,8 @@
-"""Evaluation of jax's programs by numpy and scipy, one operation at a time: independent and not compiled.
+"""Evaluation of jax functions by numpy and scipy, one operation at a time and without compilation.
 
-This evaluation serves as a reference: the formula is the same, but the elementary functions and loops are
-independent. Nothing is compiled, because compiling a formula's operations one by one would take longer than
-the rest of a short run.
+The results serve as a reference with the same formula, but independent elementary functions and loops.
+Nothing is compiled, because compiling the operations of a formula one by one would take longer than the rest
+of a short run.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _NAMES = {
 
 
 def by_numpy(function: Callable[..., Any], *arguments: np.ndarray) -> list[np.ndarray]:
-    """Return the results of a function of arrays; operations without a counterpart here are computed by jax.
+    """Evaluate a function of arrays by numpy; jax computes operations that numpy and scipy do not have.
 
-    Error: a few ulps for each function of numpy and scipy.
+    Error: a few ulps for each elementary function of numpy and scipy.
     """
     with jax.enable_x64(True), np.errstate(all="ignore"):
         program = jax.make_jaxpr(function)(*arguments)

@@ -1,4 +1,4 @@
-"""Analysis of traced programs: single-precision operations, and the origin of non-finite numbers."""
+"""Analysis of functions traced by jax: single-precision operations, and the origin of non-finite numbers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DIGITS = 6
 
 
 def _programs(closed: Any) -> Iterator[Any]:
-    """Yield a program and all programs that it calls."""
+    """Yield a jaxpr and all jaxprs that it calls."""
     yield closed
     for equation in closed.eqns:
         for inner in jax.tree.leaves(
@@ -32,7 +32,7 @@ def _programs(closed: Any) -> Iterator[Any]:
 
 
 def narrows(closed: Any) -> bool:
-    """Return whether a program rounds numbers from double to single precision."""
+    """Return whether a jaxpr rounds numbers from double to single precision."""
     both = {np.dtype(np.float64)}, {np.dtype(np.float32)}
     return any(
         ({one.aval.dtype for one in equation.invars}, {one.aval.dtype for one in equation.outvars}) == both
@@ -42,15 +42,15 @@ def narrows(closed: Any) -> bool:
 
 
 def held_numbers(closed: Any, least: int = 10) -> int:
-    """Count the entries in a program's large constant arrays, such as weights that a function closed over."""
+    """Count the entries of large constant arrays in a jaxpr, such as weights that a function closed over."""
     consts = [one for program in _programs(closed) for one in getattr(program, "consts", ())]
     return sum({id(one): one.size for one in consts if is_inexact(one) and one.size >= least}.values())
 
 
 def single_numbers(closed: Any) -> list[str]:
-    """Return constants of a program that were rounded to single precision, as they were most likely written.
+    """Return the constants of a jaxpr that were rounded to single precision, as short decimal numbers.
 
-    A constant that was widened again has a single-precision value, and needs only that many digits.
+    A constant that was rounded and widened again has a single-precision value with few decimal digits.
     """
     numbers: dict[str, None] = {}
     for program in _programs(closed):
@@ -69,7 +69,7 @@ def single_numbers(closed: Any) -> list[str]:
 
 @dataclass(frozen=True)
 class Operation:
-    """An operation whose result is not finite."""
+    """An operation whose result is infinite or NaN."""
 
     name: str  # of the primitive, such as "div"
     source: str  # file:line:function that wrote it, innermost one outside of JAX; empty where it is not known
@@ -83,10 +83,10 @@ class Operation:
 
 
 def first_not_finite(function: Callable[..., Any], *args: Any) -> Operation | None:
-    """Find the operation that makes the result of a function non-finite; the function is not compiled.
+    """Find the operation that first makes the result of a function infinite or NaN, without compilation.
 
     Returns:
-        the operation; None if every number of the result is finite, or if an argument is not.
+        the operation; None if all results are finite, or if an argument is not finite.
     """
     leaves, tree = jax.tree.flatten(args)
     if count_bad(leaves):
@@ -110,19 +110,19 @@ def first_not_finite(function: Callable[..., Any], *args: Any) -> Operation | No
 
 
 def count_bad(tree: Any) -> int:
-    """Count the numbers that are not finite."""
+    """Count the infinite and NaN numbers in arrays."""
     leaves = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(tree) if is_inexact(leaf)]
     return sum(int((~np.isfinite(leaf)).sum()) for leaf in leaves)
 
 
 def is_inexact(leaf: Any) -> bool:
-    """Return whether a leaf is an array of floats, including the narrow types of ml_dtypes."""
+    """Return whether an object is an array of floats, including the 8-bit and 16-bit types of ml_dtypes."""
     return jnp.issubdtype(getattr(leaf, "dtype", np.int64), jnp.floating)
 
 
 @dataclass
 class _Interpreter:
-    """Interpreter that runs a program to its end, one operation at a time."""
+    """Interpreter that runs a jaxpr one operation at a time, also after a result that is not finite."""
 
     mended: list[int]  # numbers of operations whose results are made finite
     found: Operation | None = None  # the first operation at fault
@@ -130,7 +130,7 @@ class _Interpreter:
     rounds: list[int] = field(default_factory=list)  # of the loops that it is in
 
     def closed(self, program: Any, inputs: Sequence[Any]) -> list[Any]:
-        """Run a program one operation at a time, and return its results."""
+        """Run a jaxpr one operation at a time, and return its results."""
         return interpreted(program, inputs, self._equation)
 
     def _equation(self, equation: Any, inputs: list[Any]) -> list[Any]:
@@ -199,7 +199,7 @@ class _Interpreter:
 
 
 def _written(equation: Any) -> tuple[str, tuple[str, ...]]:
-    """Return where an operation is in the source code, and the functions that lead there, outermost first."""
+    """Return the source location of an operation, and the calls that lead to it, outermost first."""
     traceback, inside = equation.source_info.traceback, f"{Path(jax.__file__).parent}/"
     frames = [
         one

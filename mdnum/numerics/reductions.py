@@ -1,8 +1,8 @@
-"""Sums of integers, which do not depend on the order; segment sums; and all reductions by name.
+"""Sums that do not depend on the order of the terms, sums over segments, and all summation orders by name.
 
-A finite float is an integer multiple of its format's smallest subnormal. The exact sum adds those integers
-in a number wide enough for all of them (Kulisch & Miranker 1986), stored as limbs of 32 bits in int64, and
-rounds once. The fixed-point sum first rounds every term to a coarser unit and then needs only one int64.
+A finite float is an integer multiple of its format's smallest subnormal number. The exact sum adds these
+integers in a long accumulator (Kulisch & Miranker 1986), stored as 32-bit limbs in int64, and rounds once.
+The fixed-point sum rounds every term to a coarser unit, so that one int64 can hold the sum.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MASK = 2**_LIMB - 1
 
 
 def _parts(terms: Float[Array, "n columns"], form: FloatFormat) -> tuple[jax.Array, list[jax.Array]]:
-    """Return every term as signed pieces of 32 bits: the limb of the lowest piece, and the pieces."""
+    """Split each term into signed 32-bit pieces; return the limb index of the lowest one, and the pieces."""
     bits = lax.bitcast_convert_type(terms, integer_of(terms.dtype)).astype(jnp.int64)
     magnitude = bits & ((1 << (8 * terms.dtype.itemsize - 1)) - 1)
     exponent, fraction = magnitude >> (form.significand - 1), magnitude & ((1 << (form.significand - 1)) - 1)
@@ -56,7 +56,7 @@ def _parts(terms: Float[Array, "n columns"], form: FloatFormat) -> tuple[jax.Arr
 
 
 def _carried(limbs: Int[Array, "limbs columns"]) -> tuple[Int[Array, "columns"], Int[Array, "limbs columns"]]:
-    """Propagate carries; return the final carry (-1 for a negative number) and limbs from 0 to 2^32 - 1."""
+    """Propagate carries between limbs; return the final carry (-1 if negative) and limbs in [0, 2^32)."""
 
     def step(carry, limb):
         value = limb + carry
@@ -66,7 +66,7 @@ def _carried(limbs: Int[Array, "limbs columns"]) -> tuple[Int[Array, "columns"],
 
 
 def _rounded(limbs: Int[Array, "limbs columns"], form: FloatFormat) -> UInt64[Array, "columns"]:
-    """Return the bits of the float nearest to a non-negative number, ties to even."""
+    """Return the bits of the float nearest to a non-negative number given by limbs, ties to even."""
     count = limbs.shape[0]
     filled = limbs != 0
     place = count - 1 - jnp.argmax(filled[::-1], axis=0)
@@ -98,14 +98,14 @@ def _rounded(limbs: Int[Array, "limbs columns"], form: FloatFormat) -> UInt64[Ar
 
 @dataclass(frozen=True)
 class Exact(Reduction):
-    """The exact sum, rounded once to nearest: the same bits in every order.
+    """The exact sum, rounded once to nearest; the result has the same bits for every order of the terms.
 
-    Error: half an ulp of the result; no intermediate overflow; up to 2^31 terms. Infinite or NaN terms give
-    the result of IEEE addition.
+    Error: at most half an ulp of the result, for up to 2^31 terms; intermediate sums do not overflow.
+    Infinite and NaN terms give the result of IEEE addition.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Return the sum, computed with integer additions only."""
+        """Return the sum, which is computed with integer additions only."""
         dtype, shape = terms.dtype, terms.shape[1:]
         form = format_of(np.dtype(dtype).name)
         flat = terms.reshape(terms.shape[0], -1)
@@ -126,7 +126,7 @@ class Exact(Reduction):
         return jnp.where(special, jnp.sum(flat, axis=0), total).reshape(shape)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """Return the error bound u |sum|, with a bound for |sum| itself, because the host adds in float64."""
+        """Return the error bound u |sum|, where |sum| is replaced by an upper bound computed in float64."""
         wide = terms.astype(np.float64)
         total = np.abs(wide.sum(axis=0)) + gamma(len(terms)) * np.abs(wide).sum(axis=0)
         return np.asarray(unit_roundoff(terms.dtype) * total)
@@ -134,11 +134,11 @@ class Exact(Reduction):
 
 @dataclass(frozen=True)
 class FixedPoint(Reduction):
-    """A sum of integers: every term is first rounded to a multiple of 2^-bits.
+    """A fixed-point sum: every term is rounded to a multiple of 2^-bits, and the multiples are added.
 
-    The result has the same bits in every order, at the cost of one rounding per term. Error: at most
-    n * 2^(-bits - 1) plus the rounding of the result. If a term beyond 2^(62 - bits) / n could overflow the
-    sum, the result is NaN, never a wrapped number.
+    The result has the same bits for every order of the n terms. Error: at most n * 2^(-bits - 1) plus the
+    rounding of the result. The result is NaN if a term exceeds 2^(62 - bits) / n, because the integer sum
+    could then overflow.
     """
 
     bits: int = 40  # binary digits after the point, from -1000 to 1000
@@ -148,7 +148,7 @@ class FixedPoint(Reduction):
             raise InputError(f"bits = {self.bits} binary places", remedy="Give a number from -1000 to 1000.")
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Return the sum, computed in one int64 per sum."""
+        """Return the sum, which is computed with one int64 as accumulator."""
         scaled = terms.astype(jnp.float64) * 2.0**self.bits
         fits = jnp.all(jnp.abs(scaled) <= 2.0**62 / terms.shape[0], axis=0)
         total = jnp.sum(jnp.rint(jnp.where(fits, scaled, 0.0)).astype(jnp.int64), axis=0)
@@ -165,7 +165,7 @@ class FixedPoint(Reduction):
 
 
 def _numbered(reduction: Callable[[int], Reduction], default: int) -> Callable[..., Reduction]:
-    """Return a function that creates a reduction from a number given as text."""
+    """Return a function that creates a summation order from its parameter, a number given as text."""
 
     def make(number: str | None = None) -> Reduction:
         try:
@@ -207,7 +207,7 @@ def segment_sum(
     reduction: Reduction = Sequential(),
     zero: Int[Array, ""] | None = None,
 ) -> Float[Array, "segments ..."]:
-    """Sum each segment in the order of a reduction, rounding after every addition.
+    """Sum the entries of each segment in a given summation order, with rounding after every addition.
 
     Args:
         values: the entries.
@@ -235,12 +235,12 @@ def segment_sum(
 def scatter_add(
     values: Float[Array, "entries ..."], index: Int[Array, "entries"], segments: int
 ) -> Float[Array, "segments ..."]:
-    """Sum each segment by XLA's scatter: in storage order on a CPU, in any order on a device."""
+    """Sum each segment by XLA's scatter operation: in storage order on a CPU, in any order on a GPU."""
     return jnp.zeros((segments, *values.shape[1:]), values.dtype).at[index].add(values)
 
 
 def orders(entries: int, count: int, seed: int = 0) -> list[Int[np.ndarray, "entries"]]:
-    """Return storage orders to test: as given, reversed, and random orders up to `count` in total."""
+    """Return `count` storage orders for tests: the given order, the reversed order, and random orders."""
     rng = np.random.default_rng(seed)
     given = np.arange(entries)
     return [given, given[::-1], *(rng.permutation(entries) for _ in range(count - 2))][:count]

@@ -1,4 +1,4 @@
-"""Precision by role: the dtypes of the state, the arithmetic, the decisions and the sums."""
+"""Choice of the dtypes of state, arithmetic, comparisons with thresholds (decisions), and sums."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _TOO_SHORT: Mapping[str, str] = {
 
 
 def carrier(name: str) -> np.dtype:
-    """Return the dtype of the arrays for a name in a policy; fixed-point numbers are stored as doubles."""
+    """Return the numpy dtype for a dtype name; fixed-point numbers are stored in float64 arrays."""
     return ALL["float64" if name == FIXED_POINT else name]
 
 
 def check_role(role: str, dtype: str) -> None:
-    """Reject a dtype that is not allowed for a role of molecular dynamics.
+    """Raise an error if a dtype is not allowed for a role (such as "force") in molecular dynamics.
 
     Raises:
-        InputError: the dtype does not exist, or has sixteen bits and the role needs more.
+        InputError: the dtype does not exist, or it has 16 bits and the role requires more.
     """
     known = ALL if role == "force" else WIDE
     if role == "state" and dtype == FIXED_POINT:
@@ -52,7 +52,7 @@ def check_role(role: str, dtype: str) -> None:
 
 @dataclass(frozen=True)
 class PrecisionPolicy:
-    """The dtype of each role of numbers in a molecular-dynamics rollout.
+    """The dtypes of state, forces, cutoff decisions and sums in a molecular-dynamics simulation.
 
     Example:
         >>> mdnum.PrecisionPolicy(force="float32")
@@ -71,22 +71,22 @@ class PrecisionPolicy:
             check_role(role, getattr(self, role))
 
     def dtype(self, role: str) -> np.dtype:
-        """Return the numpy dtype of a role ("state", "force", "decision" or "accumulate")."""
+        """Return the numpy dtype for a role: "state", "force", "decision" or "accumulate"."""
         return carrier(getattr(self, role))
 
     @property
     def geometry(self) -> np.dtype:
-        """The dtype of the displacements from which forces are computed.
+        """The dtype of the pair displacements from which forces are computed.
 
-        For forces in 32 or 64 bits this is the force dtype; for forces in sixteen bits it is the decision
-        dtype, because the difference of two sixteen-bit coordinates has no digits left.
+        For 32-bit and 64-bit forces, the force dtype is used. For 16-bit forces, the dtype of the cutoff
+        decision is used, because the difference of two 16-bit coordinates has almost no correct digits.
         """
         return self.dtype("force") if self.force in WIDE else self.dtype("decision")
 
 
 @dataclass(frozen=True)
 class RolePrecision:
-    """The dtype of each role of numbers in a small world (the ball), where sixteen bits are allowed too."""
+    """The dtypes of the numbers in a bouncing-ball simulation, where 16-bit formats are also allowed."""
 
     state: str = "float64"  # what is carried from step to step
     arithmetic: str = "float64"  # the operations between one state and the next
@@ -107,10 +107,10 @@ class RolePrecision:
             raise InputError(f"seed {self.seed} is negative", remedy="Give 0 or more", where="precision.seed")
 
     def dtype(self, role: str) -> np.dtype:
-        """Return the numpy dtype of a role ("state", "arithmetic", "decision", "accumulate" or "loss")."""
+        """Return the numpy dtype for a role: "state", "arithmetic", "decision", "accumulate" or "loss"."""
         return ALL[getattr(self, role)]
 
     @classmethod
     def all(cls, name: str) -> RolePrecision:
-        """Return a policy with every role in one dtype."""
+        """Return a precision policy with the same dtype for every role."""
         return cls(name, name, name, name, name)

@@ -1,8 +1,8 @@
-"""Floats as integers, and bounds on the rounding error of distances computed from positions.
+"""Floats as integers (ulps), and bounds on the rounding error of pair distances.
 
-A displacement is x_j - x_i, less at most one lattice vector along each periodic axis, with a rounding after
-every subtraction; squares are added in a row. The error of each rounding is proportional to the size of the
-rounded result: `Reach` bounds these sizes for a box, whatever the positions.
+A displacement is x_j - x_i minus at most one lattice vector for each periodic axis, rounded after every
+subtraction. Its squared components are added from x to z. The error of each rounding is proportional to the
+magnitude of the rounded result; `Reach` bounds these magnitudes for all positions in a box.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import DTypeLike
 
 
 def unit_roundoff(dtype: DTypeLike) -> float:
-    """Return half the spacing of floats at 1, the largest relative error of a rounding (Higham 2002, 2.1)."""
+    """Return the unit roundoff, the largest relative error of a rounding to nearest (Higham 2002, 2.1)."""
     # ml_dtypes' finfo knows bfloat16 too
     return float(ml_dtypes.finfo(np.dtype(dtype)).eps) / 2
 
@@ -26,9 +26,9 @@ def _signed(dtype: np.dtype) -> np.dtype:
 
 
 def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
-    """Return the position of x among all floats of its dtype, as a signed integer; -0 and +0 share 0.
+    """Return the index of x among all floats of its dtype, as a signed integer; -0 and +0 have index 0.
 
-    Adjacent finite floats have adjacent ordinals, so differences count ulps. NaN has no meaningful ordinal.
+    Adjacent finite floats have adjacent indices, so differences count ulps. The index of NaN has no meaning.
     """
     x = np.asarray(x)
     integer = _signed(x.dtype)
@@ -38,9 +38,9 @@ def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
 
 
 def ulp_distance(a, b, dtype: DTypeLike = np.float64) -> Int[np.ndarray, "..."]:
-    """Return the number of floats of dtype from a to b, with sign (b above a is positive).
+    """Return the signed number of steps between adjacent floats of dtype from a to b; positive if b > a.
 
-    Error: exact up to 2^62; for larger distances (floats of opposite sign) the result is ±2^62.
+    The result is exact up to 2^62; it is ±2^62 for larger numbers (floats of opposite sign).
     """
     start, end = ordinal(np.asarray(a, dtype)), ordinal(np.asarray(b, dtype))
     limit = np.int64(2**62)
@@ -51,7 +51,7 @@ def ulp_distance(a, b, dtype: DTypeLike = np.float64) -> Int[np.ndarray, "..."]:
 
 
 def neighbor(x, ulps: int, dtype: DTypeLike = np.float64):
-    """Return the float that lies the given number of ulps above x (below for a negative number)."""
+    """Return the float that is `ulps` floats above x (below x if `ulps` is negative)."""
     x = np.asarray(x, dtype)
     integer = _signed(x.dtype)
     place = ordinal(x) + ulps
@@ -67,7 +67,7 @@ _SECOND_ORDER = 1.001
 
 
 def gamma(n: int, dtype: DTypeLike = np.float64) -> float:
-    """Return n*u / (1 - n*u), which bounds the relative error of n roundings (Higham 2002, lemma 3.1)."""
+    """Return gamma_n = n u / (1 - n u), a bound on the relative error of n roundings (Higham 2002, 3.1)."""
     nu = n * unit_roundoff(dtype)
     return nu / (1.0 - nu)
 
@@ -77,7 +77,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Reach:
-    """Lattice vectors and largest coordinates of a box, which bound the rounding of a displacement."""
+    """Lattice vectors and largest coordinates of a box, which bound the rounding errors of distances."""
 
     # vectors of the periodic axes in the order in which they are taken off, length
     lattice: tuple[Vector, ...] = ()
@@ -89,10 +89,10 @@ class Reach:
         return cls(tuple(_three(row) for row in lattice), _three(coordinate))
 
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
-        """Return the summed sizes of rounded results beyond the displacement, and the number of roundings.
+        """Return the summed magnitudes of lattice terms in rounded results, and the number of roundings.
 
-        After the first subtraction a component is d + n_1 a_1 + n_2 a_2 + n_3 a_3, with each n in {-1, 0, 1};
-        each following subtraction removes one term. Each of these results contains the final displacement d.
+        After the first subtraction, a component is d + n_1 a_1 + n_2 a_2 + n_3 a_3, where d is the final
+        displacement and each n is -1, 0 or 1. Each following subtraction removes one term n_k a_k.
         """
         sizes, most = np.zeros(3), 1
         for axis in range(3):
@@ -103,7 +103,7 @@ class Reach:
         return sizes, most
 
     def narrowed(self, dtype: DTypeLike) -> Float[np.ndarray, "3"]:
-        """Return the error of lattice vectors stored in dtype, per axis, summed over the vectors, length."""
+        """Return the rounding error of lattice vectors in dtype per axis, summed over vectors, length."""
         lattice = np.array(self.lattice, np.float64).reshape(-1, 3)
         return np.abs(lattice.astype(dtype).astype(np.float64) - lattice).sum(axis=0)
 
@@ -116,20 +116,19 @@ def _three(values) -> Vector:
 def displacement_bound(
     r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None
 ):
-    """Bound the length of the error of a computed displacement.
+    """Return a bound on the error (length of the error vector) of a computed displacement.
 
-    Each rounded result contributes half an ulp, at most u times its size. If the state has more digits than
-    dtype, both positions are rounded first; if a double has more digits, the box is rounded too: the exact
-    displacement uses the positions of the state and the box of the system file. The nearest image in dtype is
-    assumed to be the true nearest image: r_cut is below half the box width by more than rounding.
+    Each rounded result contributes at most u times its magnitude. If the state has more digits than dtype,
+    both positions are rounded first. If float64 has more digits than dtype, the box is also rounded. The
+    exact displacement is defined by the positions of the state and the box of the system file. The nearest
+    image in dtype must be the true nearest image: r_cut is below half the box width by more than rounding.
 
     Args:
         r: length(s) of the displacement.
-        reach: of the box.
-        dtype: of the arithmetic.
-        state: of the positions.
-        seen: largest |coordinate| along each axis where it may be beyond that of the reach, length,
-            shape (..., 3).
+        reach: lattice vectors and largest coordinates of the box.
+        dtype: dtype of the arithmetic.
+        state: dtype of the positions.
+        seen: largest |coordinate| along each axis, if it may exceed that in `reach`, length, shape (..., 3).
 
     Returns:
         The bound, length, of the shape of r, or that of `seen` without its last axis.
@@ -147,7 +146,7 @@ def displacement_bound(
 def squared_distance_bound(
     r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None
 ):
-    """Bound |computed r² - exact r²|: the displacement's error, plus gamma_3 for squares and sums.
+    """Return a bound on |computed r² - exact r²|, from the errors of displacement, squares and sums.
 
     Args: as `displacement_bound`.
 
@@ -160,10 +159,10 @@ def squared_distance_bound(
 
 
 def distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None):
-    """Bound |computed r - exact r|, where r = sqrt(r²) with a correctly rounded square root.
+    """Return a bound on |computed r - exact r|, where r is the correctly rounded square root of r².
 
-    The error of a length is at most that of its vector; the square root halves the relative error of r² and
-    adds one rounding.
+    The error of a length is at most the length of the vector's error. The square root halves the relative
+    error of r² and adds one rounding.
 
     Args: as `displacement_bound`.
 

@@ -1,10 +1,11 @@
-"""Saltation: the effect of an event on a perturbation that is carried through it.
+"""Saltation: the change of a tangent vector (a perturbation) when the trajectory passes an event.
 
-A perturbed trajectory reaches a threshold at a different time, and between the two times only one of the
-trajectories follows the new law. To first order, the difference changes the tangent by a rank-one term, which
-is absent from derivatives of a program's steps, because the steps do not move with the event.
+A perturbed trajectory reaches a threshold at a different time; between both times, only one of the
+trajectories follows the new equation of motion. To first order, this changes the tangent by a rank-one term.
+Derivatives of a discrete time-stepping program do not contain this term, because the steps do not move with
+the event.
 
-The functions take numpy and jax arrays, with any number of leading batch axes, and work inside jit.
+The functions accept numpy and jax arrays with any number of leading batch axes, also inside jit.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ GRAZING = 1e-8
 def grazing(
     flow: Float[Any, "*batch state"], normal: Float[Any, "*batch state"], limit: float = GRAZING
 ) -> Bool[Any, "*batch"]:
-    """Return whether the trajectory only touches the threshold: n · F- is 0, and no saltation term exists.
+    """Return whether the trajectory only grazes the threshold: n · F- is 0, so no saltation term exists.
 
-    An event also grazes if the flow or the normal is zero or not finite. The function is safe inside jit.
+    The result is also True if the flow F- or the normal n is zero or not finite.
     """
     xp = normal.__array_namespace__()
     speed = xp.abs((normal * flow).sum(-1))
@@ -36,7 +37,7 @@ def time_shift(
     normal: Float[Any, "*batch state"],
     threshold_rate: Any = 0.0,
 ) -> Float[Any, "*batch"]:
-    """Return the derivative of the event time along the tangent: -(n · dx + dc) / (n · F-).
+    """Return the change of the event time per unit of the tangent dx: -(n · dx + dc) / (n · F-).
 
     Args:
         tangent: dx, the perturbation just before the event.
@@ -46,7 +47,7 @@ def time_shift(
             parameter: -1 for c = r - r_cut and the parameter r_cut).
 
     Returns:
-        The shift; 0 if the event grazes.
+        The shift of the event time; 0 if the trajectory grazes the threshold.
     """
     xp = normal.__array_namespace__()
     touch = grazing(flow_before, normal)
@@ -66,20 +67,20 @@ def carry(
 ) -> Float[Any, "*batch state"]:
     """Propagate a tangent through an event: DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
 
-    The result is the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-) times dx. The matrix is never
-    formed, so the function also handles systems of many atoms. For a ball of restitution e that hits the
-    floor with velocity v, Xi is [[-e, 0], [-(1 + e) g / v, -e]]; for a force that jumps from a to b at a
-    distance crossed with speed v, Xi is [[1, 0], [(b - a) / v, 1]].
+    The result is the product of the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-) and dx. The matrix
+    is never formed, so the function can be used for many atoms. For a ball with coefficient of restitution e
+    that hits the floor at velocity v, Xi is [[-e, 0], [-(1 + e) g / v, -e]]. For a force that jumps from a to
+    b at a distance that is crossed at speed v, Xi is [[1, 0], [(b - a) / v, 1]].
 
     Args:
-        reset: DR, Jacobian of the state after by the state before; None for the identity (a force jump).
+        reset: DR, Jacobian of the reset (state after with respect to state before); None for the identity.
         flow_before, flow_after: F- and F+, time derivatives of the state just before and just after.
-        reset_rate: dR, derivative of the reset at fixed state (the restitution as a parameter).
+        reset_rate: dR, derivative of the reset with respect to a parameter (the restitution) at fixed state.
 
     Returns:
-        The tangent just after the event, without the saltation term if the event grazes.
+        The tangent just after the event; no saltation term is added if the trajectory grazes.
 
-    Error: a few ulps of the largest term, times |n| |F-| / |n · F-|.
+        Error: a few ulps of the largest term, multiplied by |n| |F-| / |n · F-|.
 
     Source: Kong, Payne, Zhu & Johnson, Saltation Matrices: The Essential Tool for Linearizing Hybrid
     Dynamical Systems, Proc. IEEE 112 (2024) 585, arXiv:2306.06862.

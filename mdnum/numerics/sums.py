@@ -1,13 +1,13 @@
-"""Summation orders as objects, and the history of a sum, addition by addition.
+"""Summation orders, their error bounds, and the record of all additions in a sum.
 
-A reduction is used in two ways. The force loop of molecular dynamics passes blocks of terms (leading axis:
-the slots of the block) and keeps a carry, so that the terms of a whole neighbor list never exist at once; a
-reduction that needs all terms stacks them and sums at the end. All other callers pass a whole array and get
-the sum over the leading axis, rounded after every addition in the dtype of the terms: bit for bit the result
-of a numpy loop in that dtype. `jnp.sum` differs from all reductions: it adds sixteen-bit terms in float32 and
-in an order of its own, which hides the effect of a narrow accumulator.
+A summation order is used in two ways. The force loop of molecular dynamics passes blocks of terms, and a
+partial sum is carried from block to block, so that the terms of a whole neighbor list are never stored at
+once. An order that needs all terms stores them and adds at the end. All other callers pass a whole array and
+get the sum over the leading axis, rounded after every addition in the dtype of the terms, with the same bits
+as a numpy loop. `jnp.sum` differs from all orders here: it adds 16-bit terms in float32 and in another order,
+which hides the effect of a 16-bit accumulator.
 
-The derivative of every reduction is that of the exact sum: rounding and order have none.
+The derivative of every sum is that of the exact sum, because rounding and order have no derivative.
 """
 
 from __future__ import annotations
@@ -57,24 +57,24 @@ _compiled = partial(jax.jit, static_argnums=0)(_summed)
 
 
 class Reduction:
-    """Order of the additions in a sum over slots that arrive in blocks, or over an array's leading axis.
+    """Base class of summation orders, for terms that arrive in blocks and for arrays (along the first axis).
 
-    A subclass defines the sum of a whole array; its blocks are stacked and summed at the end.
+    A subclass defines the sum of a whole array; by default, blocks are stacked and summed at the end.
     """
 
     def within(self, total: jax.Array, terms: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array | None]:
-        """Process one block; return the carried total and, if summed later, the block's own sum."""
+        """Process one block of terms; return the partial sum, and stored terms (or None) for `finish`."""
         return total, jnp.stack(list(terms))
 
     def finish(self, total: jax.Array, blocks: jax.Array | None) -> jax.Array:
-        """Return the sum, from the carried total and the stacked block sums (leading axis: blocks)."""
+        """Return the sum, from the partial sum and the stacked results of the blocks (first axis: blocks)."""
         assert blocks is not None
         return self(blocks.reshape(-1, *blocks.shape[2:]))
 
     def __call__(
         self, terms: Float[Array, "n ..."], zero: Int[Array, ""] | None = None
     ) -> Float[Array, "..."]:
-        """Return the sum over the leading axis, rounded after every addition in the dtype of the terms.
+        """Return the sum over the first axis, rounded after every addition in the dtype of the terms.
 
         Args:
             terms: the terms of the sum.
@@ -87,26 +87,26 @@ class Reduction:
         return _compiled(self, terms, zero)
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Return the sum of at least one term; `add` adds two numbers and rounds."""
+        """Return the sum of one or more terms; the function `add` adds two numbers and rounds the result."""
         raise NotImplementedError(type(self).__name__)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """Bound the difference between the computed and the exact sum, on the host, in float64.
+        """Return a bound on the difference between the computed and the exact sum, in float64.
 
-        The bound holds if no sum overflows or is subnormal (XLA on a CPU flushes subnormals of every dtype
-        but float16 to zero).
+        The bound holds if no sum overflows or is subnormal (XLA on a CPU flushes subnormal numbers of every
+        dtype except float16 to zero).
         """
         factor = gamma(self.depth(len(terms)), terms.dtype)
         return np.asarray((factor if factor >= 0 else np.inf) * np.abs(terms.astype(np.float64)).sum(axis=0))
 
     def depth(self, n: int) -> int:
-        """Return the largest number of additions that any of n terms passes through."""
+        """Return the largest number of additions to which any of n terms contributes."""
         return max(n - 1, 0)
 
 
 def in_order(terms, add, start=None):
-    """Return ((0 + t0) + t1) + ..., or from another start, by a scan, which XLA does not reorder; the scan is
-    unrolled, since a step of a loop costs more than an addition.
+    """Return ((0 + t0) + t1) + ... (or with `start` instead of 0) by a scan, which XLA does not reorder; the
+    scan is unrolled, because a step of a loop costs more than an addition.
     """
     total, _ = lax.scan(
         lambda total, term: (add(total, term), None),
@@ -118,22 +118,22 @@ def in_order(terms, add, start=None):
 
 
 class Serial(Reduction):
-    """A reduction that adds term after term to one accumulator."""
+    """A summation order in which terms are added one after another to one accumulator."""
 
     def places(self, terms: np.ndarray) -> list[int]:
-        """Return the indices of terms, shape (n,), in the order in which they are added, on the host."""
+        """Return the indices of terms, shape (n,), in the order of the additions."""
         raise NotImplementedError(type(self).__name__)
 
 
 @dataclass(frozen=True)
 class Sequential(Serial):
-    """A sum term after term. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4)."""
+    """A sum in forward or reversed order. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4)."""
 
     # "forward" (left to right, as a loop does) or "reversed"
     order: Literal["forward", "reversed"] = "forward"
 
     def within(self, total, terms):
-        """Add the slots to the carry if the order is forward; keep the slots if it is reversed."""
+        """Add the terms to the partial sum if the order is forward; store them if it is reversed."""
         if self.order == "reversed":
             return super().within(total, terms)
         for term in terms:
@@ -141,7 +141,7 @@ class Sequential(Serial):
         return total, None
 
     def finish(self, total, blocks):
-        """Return the carry if the order is forward; sum the kept slots if it is reversed."""
+        """Return the partial sum if the order is forward; add the stored terms if the order is reversed."""
         return total if self.order == "forward" else super().finish(total, blocks)
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -161,7 +161,7 @@ def _tree(terms: list[jax.Array]) -> jax.Array:
 
 
 def _levels(terms, add, width: int):
-    """Sum in a tree whose nodes add `width` neighbors left to right, until one node is left."""
+    """Sum by a tree: add groups of `width` adjacent terms from left to right until one number is left."""
     while terms.shape[0] > 1:
         count = terms.shape[0]
         groups = -(-count // width)
@@ -181,10 +181,10 @@ def _levels(terms, add, width: int):
 
 @dataclass(frozen=True)
 class Blocked(Reduction):
-    """A summation tree: each node adds `width` neighbors left to right, like the blocks of a device.
+    """A summation tree: each node adds `width` adjacent terms from left to right, as thread blocks do.
 
-    Error: at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 is the balanced tree; a width of at
-    least the number of terms is the loop.
+    Error: at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 gives the balanced tree; a width not
+    below the number of terms gives a sequential loop.
     """
 
     width: int = 32  # children of a node, at least 2
@@ -194,11 +194,11 @@ class Blocked(Reduction):
             raise InputError(f"a summation tree of width {self.width} adds no terms", remedy="Use 2 or more.")
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Sum the terms level by level."""
+        """Add the terms level by level in the tree."""
         return _levels(terms, add, self.width)
 
     def depth(self, n: int) -> int:
-        """Return the number of additions: (width - 1) times the number of levels."""
+        """Return the number of additions of one term: (width - 1) times the number of levels."""
         levels = 0
         while n > 1:
             n, levels = -(-n // self.width), levels + 1
@@ -222,69 +222,69 @@ class Pairwise(Blocked):
 
 @dataclass(frozen=True)
 class Permuted(Serial):
-    """A loop over the terms in random order: a repeatable model of atomic additions on a device."""
+    """A sequential sum in a random order: a reproducible model of atomic additions on a GPU."""
 
     seed: int = 0  # of the order; the same for every sum of as many terms
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Add the terms in the order drawn for this number of terms."""
+        """Add the terms in the random order that belongs to this number of terms."""
         return in_order(terms[np.array(self.places(terms))], add)
 
     def places(self, terms: Any) -> list[int]:
-        """Draw a random order for this number of terms."""
+        """Return the random order that belongs to this number of terms."""
         return np.random.default_rng(self.seed).permutation(len(terms)).tolist()
 
 
 @dataclass(frozen=True)
 class Halves(Reduction):
-    """Two loops over the first and the second half of the terms, whose results are added at the end.
+    """A sequential sum of the first half of the terms plus a sequential sum of the second half.
 
-    Two scatters give this order, one for each end of a pair, if each pair is stored once. Error: at most
-    gamma_{n/2} * sum |terms|.
+    This order results from two scatter operations, one for each atom of a pair, if each pair is stored once.
+    Error: at most gamma_{n/2} * sum |terms|.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Add the sums of both halves; the middle term of an odd number belongs to the second half."""
+        """Add the sums of both halves; if the number of terms is odd, the second half has one term more."""
         half = terms.shape[0] // 2
         if half == 0:
             return in_order(terms, add)
         return add(in_order(terms[:half], add), in_order(terms[half:], add))
 
     def depth(self, n: int) -> int:
-        """Return the number of additions in the longer of the two loops, plus one for the final addition."""
+        """Return the number of additions in the longer half, plus one for the final addition."""
         return n - n // 2 if n > 1 else 0
 
 
 @dataclass(frozen=True)
 class Twice(Reduction):
-    """A sum of all halved terms, taken twice: a loop, and the same loop again from its result.
+    """A sequential sum in which each term is halved and added twice: all terms once, then all terms again.
 
-    A scatter onto the sums of a dense list gives this order, if each pair is stored from both ends. Error: at
-    most gamma_{2n} * sum |terms|, if no half of a term is subnormal.
+    This order results from scatter operations over a neighbor list that stores each pair for both atoms.
+    Error: at most gamma_{2n} * sum |terms|, if no halved term is subnormal.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Sum the halved terms twice; halving is exact."""
+        """Add all halved terms twice; halving is exact."""
         halves = terms * jnp.asarray(0.5, terms.dtype)
         return in_order(halves, add, in_order(halves, add))
 
     def depth(self, n: int) -> int:
-        """Count the additions of a term in both loops."""
+        """Return the number of additions to which a term contributes in both passes."""
         return max(2 * n - 1, 0)
 
 
 @dataclass(frozen=True)
 class Sorted(Serial):
-    """A loop over terms sorted by magnitude, then by sign, so that the order of arrival does not matter.
+    """A sequential sum of terms sorted by magnitude and sign, so that the storage order does not matter.
 
-    The smallest term first loses least if all terms have one sign (Higham 2002, 4.2), the largest first if
-    terms cancel.
+    Ascending order has the smallest error if all terms have the same sign (Higham 2002, 4.2), and descending
+    order if terms cancel.
     """
 
     order: Literal["ascending", "descending"] = "ascending"  # of magnitudes, "ascending" or "descending"
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Sort each column along the leading axis, and add its terms in this order."""
+        """Sort each column of terms along the first axis, and add its terms in this order."""
         _, terms = lax.sort((jnp.abs(terms), terms), dimension=0, num_keys=2)
         return in_order(terms if self.order == "ascending" else terms[::-1], add)
 
@@ -313,10 +313,10 @@ class _Compensated(Reduction):
 
 @dataclass(frozen=True)
 class Kahan(_Compensated):
-    """A loop that subtracts from each term the error of the previous addition (Kahan, CACM 8, 40 (1965)).
+    """Compensated summation: the error of each addition is subtracted from the next term (Kahan 1965).
 
-    Error: at most (2u + O(n u²)) * sum |terms|; the compensation fails for a term much larger than the sum so
-    far.
+    Error: at most (2u + O(n u²)) * sum |terms|. The compensation fails for a term that is much larger than
+    the partial sum. Source: Kahan, CACM 8, 40 (1965).
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -334,7 +334,7 @@ class Kahan(_Compensated):
 
 @dataclass(frozen=True)
 class Neumaier(_Compensated):
-    """Kahan's sum for terms of any size: the rounding errors are summed separately and added at the end.
+    """Compensated summation that adds up all rounding errors separately and adds them at the end.
 
     Error: at most u |sum| + O(n² u²) * sum |terms|. Source: Neumaier, ZAMM 54, 39 (1974).
     """
@@ -365,7 +365,7 @@ class Neumaier(_Compensated):
 
 @dataclass(frozen=True)
 class Addition:
-    """One addition in the history of a sum."""
+    """One addition in the record of a sum."""
 
     term: str  # index of the term that was added
     addend: float  # what was added to the accumulator
@@ -379,7 +379,7 @@ class Addition:
 
 @dataclass(frozen=True)
 class RunningSum:
-    """A sum with its history."""
+    """A sum and the record of all its additions."""
 
     dtype: str  # of the terms and of the accumulator
     reduction: Any  # the order
@@ -389,18 +389,18 @@ class RunningSum:
 
     @property
     def error(self) -> float:
-        """Result minus exact sum, rounded to float64."""
+        """Computed sum minus exact sum, rounded to float64."""
         return float(Fraction(self.result) - self.exact)
 
     @property
     def bits_lost(self) -> int:
-        """Number of bits lost in all additions."""
+        """Number of bits lost by rounding in all additions."""
         return sum(row.bits_lost for row in self.rows)
 
     columns = ("term", "addend", "running sum", "exact sum", "bits lost")
 
     def table(self) -> tuple[tuple[Any, ...], ...]:
-        """Return plain rows under `columns`, with exact sums rounded to float64."""
+        """Return the additions as rows with the columns `columns`; exact sums are rounded to float64."""
         return tuple(
             (row.term, row.addend, row.running, float(row.exact), row.bits_lost) for row in self.rows
         )
@@ -409,15 +409,15 @@ class RunningSum:
 def running_sum_table(
     terms: Any, reduction: Reduction = Sequential(), dtype: DTypeLike | None = None
 ) -> RunningSum:
-    """Return the history of a sum in the order of a reduction.
+    """Return a sum in a given order, with the record of all its additions.
 
     Args:
         terms: the numbers, shape (n,).
-        reduction: a loop: sequential, reversed, permuted or sorted.
+        reduction: a sequential order: sequential, reversed, permuted or sorted.
         dtype: terms are rounded to this dtype first; None keeps the dtype of the terms.
 
     Raises:
-        InputError: there are no terms, a number is not finite, or the reduction is no loop.
+        InputError: there are no terms, a term is not finite, or the summation order is not sequential.
     """
     terms = np.asarray(terms)
     terms = terms.astype(np.dtype(dtype) if dtype is not None else terms.dtype)
@@ -438,7 +438,7 @@ def running_sum_table(
 
 
 def _place(x: Any) -> int:
-    """Return the exponent of the last place of a float: x is a multiple of 2^place."""
+    """Return the exponent of the last place of a float x, such that the spacing of floats is 2^place."""
     info = ml_dtypes.finfo(x.dtype)
     exponent = math.frexp(float(x))[1] - 1 if x else info.minexp
     return max(exponent, int(info.minexp)) - info.nmant

@@ -1,13 +1,13 @@
-"""Two runs that differ in one choice: when and how fast they diverge, and whether flips are the cause.
+"""Divergence of two runs that differ in one setting: its start, its rate, and whether flips caused it.
 
-The verdict compares two separations from the first run: that of the second run, and that of the second run's
-arithmetic under the first run's decisions. Only the latter separation shows whether the flips are the cause.
-If the latter run also splits, repeats of the pair decide whether the flips accelerated the split or are
-bystanders, by a sequential sign test: if at most half of such pairs are delayed by more than a given delay,
-the probability that k or more of n pairs are delayed is at most that of k or more heads in n tosses, whatever
-the distribution of the delays. All these pairs have the same displacement of their starts. At another
-displacement the majority may differ; the verdict is then left open. docs/verdict-calibration.md has the error
-rates.
+A flip is a cutoff decision that differs between the runs. The verdict compares the second run with a
+counterfactual run, which has the arithmetic of the second run but the cutoff decisions of the first run. If
+the counterfactual run stays close to the first run, the flips caused the split. If it also splits, repeats of
+the pair of runs decide whether the flips accelerated the split or are bystanders. Repeats are evaluated by a
+sequential sign test: if at most half of all pairs are delayed, the probability that k or more of n pairs are
+delayed is at most that of k or more heads in n coin tosses, for any distribution of the delays. All these
+pairs start with the same displacement. If the majority differs at another displacement, the verdict is left
+open. docs/verdict-calibration.md has the error rates.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _ALIKE = 4
 
 @dataclass(frozen=True)
 class Delay:
-    """The steps at which a pair of runs splits, both free and with the first run's decisions imposed."""
+    """The steps at which a pair of runs splits, without and with the first run's decisions imposed."""
 
     # free, imposed: steps of the two splits; None for one that was not seen
     free: int | None
@@ -44,12 +44,12 @@ class Delay:
 
     @classmethod
     def of(cls, free: Float[np.ndarray, "steps"], imposed: Float[np.ndarray, "steps"], tolerance: float):
-        """Create a `Delay` from separations at each step, length; NaN after a run ended."""
+        """Create a `Delay` from the separations at each step, length; NaN after a run has ended."""
         splits = (split_of(run, tolerance) for run in (free, imposed))
         return cls(*splits, free_until=_last_seen(free), imposed_until=_last_seen(imposed))
 
     def beyond(self, steps: float) -> bool | None:
-        """Return whether the split comes more than `steps` later without the flips; None if unknown."""
+        """Return whether the runs split more than `steps` later without the flips; None if unknown."""
         if self.free is not None and self.imposed is not None:
             return self.imposed - self.free > steps
         if self.free is not None:
@@ -61,14 +61,14 @@ class Delay:
 
 @cache
 def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
-    """Return the stages of the sign test: at each, the number of pairs and the number that must agree.
+    """Return the stages of the sequential sign test: number of pairs, and number that must agree, at each.
 
-    The error probability is spent in proportion to the pairs (Lan and DeMets, Biometrika 70, 659, 1983): up
-    to each stage the exact probability that fair coins have stopped on one given side is at most the
-    corresponding share of the error.
+    The error probability is spent in proportion to the number of pairs (Lan and DeMets, Biometrika 70, 659,
+    1983): the exact probability that fair coin tosses stop the test with a given result by some stage is at
+    most the error times the fraction of pairs used by this stage.
 
     Args:
-        pairs: largest number of pairs.
+        pairs: largest number of pairs of runs.
         error: probability of either verdict if each pair is as likely delayed as not.
     """
     ends = [*range(1 + LOOK, pairs, LOOK), pairs]
@@ -99,7 +99,7 @@ FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
 
 @dataclass(frozen=True)
 class Count:
-    """Numbers of pairs whose split was delayed, and of pairs whose split was not."""
+    """Numbers of pairs of runs with a delayed split, and of pairs without a delay."""
 
     pairs: int  # that were run, the pair itself among them
     later: int  # that were delayed by more than asked for
@@ -108,12 +108,12 @@ class Count:
 
     @property
     def needed(self) -> tuple[int, int] | None:
-        """The current or next stage of the test: number of pairs, and how many must agree; None if none."""
+        """The current or next stage of the sign test (pairs, pairs that must agree); None after the last."""
         return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
 
     @property
     def delayed(self) -> bool | None:
-        """Whether most pairs are delayed; None if these pairs do not decide the question."""
+        """Whether most pairs of runs are delayed; None if the sign test has no result at this stage."""
         need = dict(looks(self.most)).get(self.pairs)
         if need is None:
             return None
@@ -121,14 +121,14 @@ class Count:
 
     @property
     def majority(self) -> bool | None:
-        """Whether all of the first pairs, or more than half of all pairs, are delayed; None if unknown."""
+        """Whether all pairs of a first small group, or more than half of all pairs, are delayed, or None."""
         if self.later > self.most / 2 or self.later == self.pairs >= _ALIKE:
             return True
         return False if self.not_later > self.most / 2 or self.not_later == self.pairs >= _ALIKE else None
 
     @property
     def wanted_for_majority(self) -> int:
-        """Number of pairs that would settle the majority if all agreed; 0 if needless or impossible."""
+        """Number of further pairs that decide the majority if all agree; 0 if no pair is needed or left."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -136,19 +136,19 @@ class Count:
 
     @property
     def wanted(self) -> int:
-        """Number of pairs to run before the next stage; 0 if there is none or the result is clear."""
+        """Number of pairs to run before the next stage of the test; 0 if the test has ended."""
         if self.delayed is not None:
             return 0
         return next((end - self.pairs for end, _ in looks(self.most) if end > self.pairs), 0)
 
 
 def count(delays: tuple[Delay, ...], steps: float, most: int) -> Count:
-    """Count the pairs whose split comes more than a given number of steps later without the flips.
+    """Count the pairs of runs that split more than a given number of steps later without the flips.
 
     Args:
-        delays: of the pair itself and its repeats.
-        steps: number of steps beyond which a pair counts as delayed.
-        most: largest number of pairs.
+        delays: delays of the pair itself and of its repeats.
+        steps: delay (number of steps) above which a pair counts as delayed.
+        most: largest number of pairs of runs.
     """
     found = [delay.beyond(steps) for delay in delays]
     return Count(len(found), found.count(True), found.count(False), most)
@@ -185,7 +185,7 @@ _HALF = 3.0
 
 @dataclass(frozen=True)
 class Dates:
-    """The steps at which two runs diverge; None for an event that does not happen within the horizon."""
+    """The steps at which the bits, decisions and positions of two runs first differ; None if they do not."""
 
     first_bit: int | None  # first step whose state bits differ
     fork: int | None  # first step whose decisions differ
@@ -194,7 +194,7 @@ class Dates:
 
 @dataclass(frozen=True)
 class Growth:
-    """Exponential growth of a separation, fitted to its logarithm."""
+    """Exponential growth of the separation of two runs, from a linear fit to its logarithm."""
 
     rate: float  # per step; NaN where too few rows could be fitted
     r_squared: float  # of the fit
@@ -204,21 +204,21 @@ class Growth:
 
     @property
     def plain(self) -> bool:
-        """Whether the separation really grows, so that the fit is not a line through noise."""
+        """Whether the separation grows significantly, so that the fit is not a line through noise."""
         return bool(np.isfinite(self.rate) and self.rate > 0 and self.r_squared > FITS)
 
     def steps_to(self, start: float, end: float) -> float | None:
-        """Return the steps in which a separation grows from one size to another; None without growth."""
+        """Return the number of steps in which a separation grows from `start` to `end`, or None."""
         if not (np.isfinite(self.rate) and self.rate > 0 and start > 0):
             return None
         return max(0.0, float(np.log(end / start) / self.rate))
 
 
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
-    """Return a logarithm's growth per row, its standard error, and whether it exceeds that of linear growth.
+    """Return the mean slope of a logarithm, its standard error, and whether it exceeds that of linear growth.
 
-    The rate and its error are estimated from blocks of the later rows. The result is NaN, NaN, False if there
-    are too few rows or if they are not finite.
+    Slope and error, per row, are estimated from blocks of the later rows. The result is NaN, NaN, False if
+    there are too few rows or if the rows are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
@@ -236,22 +236,22 @@ def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
 
 
 def split_of(separation: Float[np.ndarray, "steps"], tolerance: float) -> int | None:
-    """Return the first step at which a separation exceeds the tolerance; None if there is none."""
+    """Return the first step at which a separation exceeds the tolerance; None if there is no such step."""
     beyond = separation > tolerance
     return int(beyond.argmax()) if beyond.any() else None
 
 
 def _last_seen(separation: Float[np.ndarray, "steps"]) -> int:
-    """Return the last step at which a separation is known; -1 if there is none."""
+    """Return the last step at which a separation is known; -1 if it is unknown at every step."""
     seen = np.flatnonzero(np.isfinite(separation))
     return int(seen[-1]) if len(seen) else -1
 
 
 def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
-    """Fit the rate at which a separation grows before saturation.
+    """Fit the exponential growth rate of the separation of two runs before saturation.
 
-    The fit uses the rows up to the split whose separation lies between 1e-12 and a tenth of the tolerance,
-    after the last row below the lower end. A slope through noise has a low r_squared.
+    The fit uses steps before the split with a separation between 1e-12 and 0.1 times the tolerance, after the
+    last step below this range. A slope through noise has a low r_squared.
 
     Args:
         separation: of each step, length; NaN after a run ended.
@@ -271,7 +271,7 @@ def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Return the slope of a fitted straight line and its r²."""
+    """Return the slope and r² of a straight line that is fitted to points."""
     slope, base = np.polyfit(x, y, 1)
     spread = float(np.sum((y - y.mean()) ** 2))
     return float(slope), 1.0 - float(np.sum((y - slope * x - base) ** 2)) / spread if spread > 0 else 0.0
@@ -280,15 +280,16 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 def expected(
     separation: Float[np.ndarray, "steps"], tolerance: float, exponent: float | None = None
 ) -> float | None:
-    """Predict the number of further steps until two runs split; None if there is no basis for a prediction.
+    """Predict the number of further steps until two runs split; None if no prediction is possible.
 
-    The growth of the separation has predictive value only if it outlasts the first steps: its later half must
-    be several e-foldings, at a rate within a factor of 2 of the whole.
+    A prediction requires that exponential growth continues after the first steps: in the later half of the
+    fitted steps, the separation must grow by several e-foldings, at a rate within a factor of 2 of the
+    overall rate.
 
     Args:
         separation: of each step, length; NaN after a run ended.
         tolerance: of the split, length.
-        exponent: the Lyapunov exponent per step, if known; no fit is then needed.
+        exponent: the Lyapunov exponent per step, if known; nothing is then fitted.
     """
     seen = _last_seen(separation)
     if seen < 0 or not separation[seen] > 0:
@@ -311,7 +312,7 @@ def expected(
 
 @dataclass(frozen=True)
 class ForkVerdict:
-    """Whether the flips caused the split, accelerated it, or were only bystanders."""
+    """Verdict on whether flips caused the split of two runs, accelerated it, or were only bystanders."""
 
     # "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon, or no
     # counterfactual that was followed far enough), "cause" (without the flips no split), "accelerated" (most
@@ -335,7 +336,7 @@ class ForkVerdict:
 
     @property
     def wanted(self) -> int:
-        """Number of repeats to run before the next stage, of `other` if present; 0 if none are needed."""
+        """Number of repeats to run next, at the other displacement if `other` is set; 0 if the test ended."""
         if self.other is not None:
             return self.other.wanted_for_majority
         return self.count.wanted if self.count is not None else 0
@@ -352,18 +353,18 @@ def judge(
     other: Sequence[Delay] = (),
     ended: Mapping[str, Any] | None = None,
 ) -> ForkVerdict:
-    """Return the verdict on a pair of runs.
+    """Return the verdict on whether flips caused or accelerated the split of a pair of runs.
 
     Args:
-        dates: of the pair.
+        dates: steps at which the pair of runs diverges.
         free: separation of the two free runs at each step, length.
-        imposed: separation of the counterfactual from the first run, length; NaN after it ended. None if
-            there is no counterfactual.
+        imposed: separation of the counterfactual run from the first run, length; NaN after a run has ended;
+            None without a counterfactual run.
         tolerance: of the split, length.
-        repeats: of the pair, with the start perturbed by as much as the choice perturbs it.
-        most: largest number of repeats; at the other displacement one more, as the pair is not counted there.
-        other: repeats of the pair, with the start perturbed by another displacement.
-        ended: if the fork is that only one run ended: values that describe which run and how.
+        repeats: delays of repeats, whose starts are displaced by as much as the setting displaces the pair.
+        most: largest number of repeats; one more at the other displacement, where the pair is not counted.
+        other: delays of repeats whose starts are displaced by another distance.
+        ended: values that describe how one run ended early, if the fork is that only one run ended.
     """
     last = len(free) - 1
     if ended is not None:
@@ -401,9 +402,10 @@ def _counted(
     gained: float,
     reasons: tuple[Reason, ...],
 ) -> ForkVerdict:
-    """Return the verdict if the runs also split under the first run's decisions, by counting later splits.
+    """Return the verdict on runs that also split with imposed decisions, by counting delayed splits.
 
-    The count at the other displacement can only withdraw a verdict, so it uses up no error probability.
+    The count at the other displacement can only withdraw a verdict, so it does not add to the error
+    probability.
     """
     pair = delays[0][0]
     threshold = 0.0 if rate is None else E_FOLDINGS / rate
@@ -438,7 +440,7 @@ def _kept(
     most: int,
     rate: float | None,
 ) -> ForkVerdict:
-    """Return the verdict if the runs do not split under the first run's decisions."""
+    """Return the verdict on runs that do not split when the first run's decisions are imposed."""
     seen = max(0, _last_seen(imposed))
     reach = float(np.nanmax(imposed, initial=0.0))
     below = float(np.log(tolerance / reach)) if reach > 0 else float("inf")
@@ -456,7 +458,7 @@ def _kept(
 
 
 def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason, ...]:
-    """Return reasons for a verdict without a split: the last separation, and its expected growth."""
+    """Return reasons for the verdict on runs without a split: the last separation, and its growth."""
     seen = float(free[np.isfinite(free)][-1])
     now: Reason = ("outlook", {"steps": len(free) - 1, "separation": seen, "tolerance": tolerance})
     more = expected(free, tolerance)
@@ -466,7 +468,7 @@ def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason
 
 
 def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:
-    """Predict the step at which a counterfactual may split; None if its separation does not grow."""
+    """Predict the step at which a counterfactual run splits; None if its separation does not grow."""
     fit = growth(separation[: seen + 1], tolerance)
     now = float(separation[seen])
     if not (fit.plain and now > 0):
@@ -494,7 +496,7 @@ SERIES: Mapping[tuple[Name, Name, Name], str] = {
 
 @dataclass(frozen=True)
 class SplitCell:
-    """The step at which one run splits from another."""
+    """The step at which one run splits from a reference run."""
 
     # arithmetic, decisions: whose they are in the run
     arithmetic: Name
@@ -505,13 +507,13 @@ class SplitCell:
 
     @property
     def same(self) -> bool:
-        """Whether the run is the reference itself."""
+        """Whether the run and the reference run are the same."""
         return self.arithmetic == self.decisions == self.reference
 
 
 @dataclass(frozen=True)
 class Share:
-    """Contribution of one difference to a split: how much later the split comes without it."""
+    """Contribution of the decisions or the arithmetic to a split: the delay of the split without them."""
 
     what: What  # the difference that is taken away; the other one stays
     reference: Name  # the run that is compared with
@@ -521,10 +523,10 @@ class Share:
 
 
 def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:
-    """Return the splits from A, then from B, of the runs (A, A), (B, B), (B, A) and (A, B) that were made.
+    """Return the splits of all runs (arithmetic, decisions) = (A, A), (B, B), (B, A), (A, B) from A and B.
 
     Args:
-        series: separations at each step, length: "B", and those of SERIES; NaN after a run ended.
+        series: separations at each step, length, by the names "B" and those in SERIES; NaN after a run ended.
         tolerance: of the split, length.
     """
     names: tuple[Name, ...] = ("A", "B")
@@ -546,10 +548,10 @@ def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -
 
 
 def shares(cells: tuple[SplitCell, ...], rate: float) -> tuple[Share, ...]:
-    """Return how much the decisions and the arithmetic contribute to a split, relative to runs A and B.
+    """Return how much decisions and arithmetic contribute to a split, in comparison with run A and run B.
 
     Args:
-        cells: of `table`.
+        cells: result of `table`.
         rate: growth rate of the free runs' separation, per step; NaN if unknown.
     """
     free = next((cell.split for cell in cells if cell.arithmetic == cell.decisions != cell.reference), None)
