@@ -1,1 +1,1 @@
-"""Molecular dynamics: boxes, lists, decisions, potentials and integrators."""
+"""Molecular dynamics: boxes, neighbor lists, pair decisions, potentials and integrators."""

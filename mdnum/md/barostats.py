@@ -1,11 +1,12 @@
 """Constant pressure and temperature: the Martyna-Tobias-Klein barostat and stochastic cell rescaling.
 
 Both barostats change only the volume of the box (`box = "isotropic"`), or all six parameters of its shape
-without a rotation ("full"). Rates and strains are numbers times the unit matrix, or symmetric matrices. The
-pressure is (2 K + virial) / 3 V with the instantaneous kinetic energy K; the pressure tensor is Π / V, Π = Σ
-m v ⊗ v + Σ r ⊗ F. Volumes are sampled with the weight exp(-(U + p V) / k_B T) dV, and full boxes h with the
-measure dh / det(h)², det(h) = V. If the total momentum is zero, the center of mass does not contribute to the
-pressure, and the mean volume of an ideal gas is N k_B T / p; otherwise it is (N + 1) k_B T / p.
+without a rotation ("full"). Rates and strains are multiples of the unit matrix, stored as numbers, or
+symmetric matrices. The pressure is (2 K + virial) / 3 V with the instantaneous kinetic energy K; the pressure
+tensor is Π / V with Π = Σ m v ⊗ v + Σ r ⊗ F. Volumes are sampled with the weight exp(-(U + p V) / k_B T) dV,
+and matrices h of full boxes with the measure dh / det(h)², det(h) = V. If the total momentum is zero, the
+center of mass does not contribute to the pressure, and the mean volume of an ideal gas is N k_B T / p;
+otherwise it is (N + 1) k_B T / p.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ _TERMS = 14
 
 
 def growth(a: Rate) -> Rate:
-    """Return (exp(a) - 1) / a = Σ aᵏ / (k + 1)! for a number or (3, 3) matrix with norm up to 0.5.
+    """Return (exp(a) - 1) / a = Σ aᵏ / (k + 1)! for a number or (3, 3) matrix a with norm up to 0.5.
 
-    For matrices, the characteristic polynomial is used, so that equal eigenvalues do not prevent
-    differentiation.
+    For matrices, the characteristic polynomial is used, so that the result is differentiable even if
+    eigenvalues are equal.
     """
     if a.ndim == 0:
         total = jnp.zeros(())
@@ -50,29 +51,29 @@ def growth(a: Rate) -> Rate:
 
 
 def invariants(a: Float[Array, "3 3"], square: Float[Array, "3 3"]) -> tuple[Number, Number, Number]:
-    """Return the coefficients of a³ = first a² - second a + third, from a matrix and its square."""
+    """Return the three coefficients of a³ = first a² - second a + third, from a (3, 3) matrix a and a²."""
     first = jnp.trace(a)
     second = 0.5 * (first**2 - jnp.trace(square))
     return first, second, a[0] @ jnp.cross(a[1], a[2])
 
 
 def times(a: Rate, b: Rate) -> Rate:
-    """Return the product of two rates, both numbers or both matrices."""
+    """Return the product of two rates, which are both numbers or both matrices."""
     return a @ b if a.ndim else a * b
 
 
 def exponential(a: Rate) -> Rate:
-    """Return exp(a) for a rate a with norm up to 0.5; exactly one if a is zero."""
+    """Return exp(a) for a rate a with norm up to 0.5; the result is exactly one if a is zero."""
     return unit(a) + times(a, growth(a))
 
 
 def unit(a: Rate) -> Rate:
-    """Return the unit rate: the number one or the unit matrix."""
+    """Return the unit rate, the number one or the unit matrix, in the form of a given rate."""
     return jnp.eye(3) if a.ndim else jnp.ones(())
 
 
 def trace(a: Rate) -> Number:
-    """Return the trace of a rate as a (3, 3) matrix."""
+    """Return the trace of a rate; a number stands for a multiple of the (3, 3) unit matrix."""
     return jnp.trace(a) if a.ndim else 3 * a
 
 
@@ -82,11 +83,11 @@ def matrix(a: Rate) -> Float[Array, "3 3"]:
 
 
 def acted(x: Vector, a: Rate, *, fused: bool = False) -> Vector:
-    """Return the product of vectors (as rows) and a rate, in float64.
+    """Return the product of vectors (as rows) and a rate (number or matrix), in float64.
 
     Args:
-        fused: whether to write sums, which XLA fuses with the operations around them. That is faster unless
-            the vectors are expensive to compute, since each row computes them again.
+        fused: True to write the product as sums, which XLA fuses with other operations. Fusion is faster
+            unless the vectors are expensive to compute, since each row of the result computes them again.
     """
     x = x.astype(jnp.float64)
     if a.ndim == 0:
@@ -95,7 +96,7 @@ def acted(x: Vector, a: Rate, *, fused: bool = False) -> Vector:
 
 
 class Barostat(Integrator):
-    """Base class of both barostats, with the options that they accept.
+    """Base class of both barostats, with their common options.
 
     Attributes:
         kT: energy. pressure: energy/length³. relaxation, pressure_relaxation: internal time.
@@ -110,7 +111,7 @@ class Barostat(Integrator):
     @property
     @abstractmethod
     def box(self) -> str:
-        """One of `boxes`."""
+        """Type of box changes, an element of `boxes`."""
 
     @property
     def anisotropic(self):
@@ -130,12 +131,12 @@ class Barostat(Integrator):
             raise InputError(message, where="dynamics.kind", remedy="Use nose-hoover, csvr or langevin")
 
     def motion(self, v: Vector, masses: Masses) -> Float[Array, "3 3"]:
-        """Return Σ m v ⊗ v, an energy."""
+        """Return the kinetic tensor Σ m v ⊗ v, an energy."""
         v = v.astype(jnp.float64)
         return (masses * v) @ v.T
 
     def excess(self, v: Vector, at: AtStep) -> Rate:
-        """Return Π - p V: kinetic and virial contributions by direction, minus those of the set pressure."""
+        """Return the tensor Π - p V at the set pressure p, or its mean diagonal for an isotropic box."""
         given = self.pressure * volume(at.cell)
         if not self.anisotropic:
             return (2 * self.kinetic(v, at.masses) + at.virial) / 3 - given
@@ -153,7 +154,7 @@ def volume(cell: Cell) -> Number:
 
 
 class BoxState(NamedTuple):
-    """Extra state of the integrator `MTK`."""
+    """Extra state of the integrator `MTK`: rate of the box, thermostat chains and initial volume."""
 
     rate: Rate  # of the box, one over time
     atoms: Chain  # thermostats of the atoms
@@ -162,13 +163,14 @@ class BoxState(NamedTuple):
 
 
 class MTK(Barostat):
-    """Deterministic, time-reversible sampling of the isothermal-isobaric ensemble.
+    """Integrator for the isothermal-isobaric ensemble, deterministic and time-reversible.
 
     Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), with the operator splitting of Tuckerman et al.,
-    J. Phys. A 39, 5629 (2006), eq. 38 ff.: thermostat chains of box and atoms, kick of the box by its excess
-    pressure, kick of the atoms, drift in the changing box, and the same operators in reverse order. The
-    inertia of the box is (N_f + 3) k_B T τ_p² (a third of this for a full box), and it has one or six degrees
-    of freedom. The drift is exact: x' = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
+    J. Phys. A 39, 5629 (2006), eq. 38 ff. Operators: thermostat chains of box and atoms, kick of the box by
+    its excess pressure, kick of the atoms, drift in the changing box, and the same in reverse order. The
+    inertia of the box is (N_f + 3) k_B T τ_p² (a third of this value for a full box). The box has one degree
+    of freedom (six for a full box). The drift at box rate a is exact: x' = x exp(a t) + v t exp(a t / 2)
+    sinh(a t / 2) / (a t / 2).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -198,12 +200,12 @@ class MTK(Barostat):
         return 0.5 * jnp.trace(self.motion(v, masses))
 
     def inertia(self, masses):
-        """Inertia of the box, energy times time²."""
+        """Inertia of the box, in units of energy times time²."""
         share = 3 if self.anisotropic else 1
         return (self.freedom(masses) + 3) / share * self.kT * self.pressure_relaxation**2
 
     def _held(self, v, extra, masses, time):
-        """Advance the independent thermostat chains of box and atoms by a time."""
+        """Advance the independent thermostat chains of box and atoms by the given time."""
         freedom, kT = self.freedom(masses), self.kT
         own, of_box = self._own(extra, masses)
         scale, atoms = extra.atoms.act(self.kinetic(v, masses), freedom, kT, self.relaxation, time)
@@ -212,11 +214,11 @@ class MTK(Barostat):
         return v, extra._replace(rate=extra.rate * slowed, atoms=atoms, chain=chain)
 
     def _own(self, extra, masses):
-        """Return the kinetic energy of the box, and its degrees of freedom."""
+        """Return the kinetic energy of the box, and its number of degrees of freedom."""
         return 0.5 * self.inertia(masses) * jnp.sum(jnp.square(extra.rate)), 6 if self.anisotropic else 1
 
     def _pushed(self, v, extra, at, time):
-        """Return the rate of the box after the action of the excess pressure and the kinetic energy."""
+        """Return the state after excess pressure and kinetic energy have acted on the box for a time."""
         heat = 2 * self.kinetic(v, at.masses) / self.freedom(at.masses)
         push = self.excess(v, at) + heat * unit(extra.rate)
         # of an isotropic box the three directions together
@@ -224,7 +226,7 @@ class MTK(Barostat):
         return extra._replace(rate=extra.rate + time * share * push / self.inertia(at.masses))
 
     def _kicked(self, v, extra, at, time):
-        """Return velocities after the forces, and the friction caused by the rate of the box, have acted."""
+        """Return velocities after forces and the friction due to the box rate have acted for a time."""
         rate = extra.rate
         slow = -time * (rate + trace(rate) / self.freedom(at.masses) * unit(rate))
         kick = acted(at.acceleration, time * growth(slow), fused=True)
@@ -258,7 +260,7 @@ class MTK(Barostat):
 
 
 class Move(NamedTuple):
-    """Extra state of `CellRescaling`: the last move of the box and its effect."""
+    """Extra state of `CellRescaling`: the last change of the box and the work done on the atoms."""
 
     strain: Rate  # logarithm of the deformation
     # root: of the volume before; step: of that root; force: on it, and excess: along the other directions,
@@ -271,15 +273,15 @@ class Move(NamedTuple):
 
 
 class CellRescaling(Barostat):
-    """Isothermal-isobaric ensemble by stochastic cell rescaling (first order in time), with CSVR.
+    """Integrator for the isothermal-isobaric ensemble: first-order stochastic cell rescaling with CSVR.
 
     Bernetti, Bussi, J. Chem. Phys. 153, 114107 (2020): in the middle of the drift, the square root of the
-    volume, whose noise is independent of the volume, takes an Euler step with the present forces; velocities
-    are scaled inversely to the box (their sec. II C). In a full box (del Tatto, Raiteri, Bernetti, Bussi,
-    Appl. Sci. 12, 1139, 2022) the traceless strain also takes an Euler step, whose noise is computed from the
-    geometric mean of both volumes. The probabilities of each move and its reverse are known, so that the
-    total energy minus heat and work is an effective energy, which is conserved except for the error of the
-    time step.
+    volume is propagated by an Euler step with the present forces. The noise of this variable does not depend
+    on the volume. Velocities are scaled inversely to the box (sec. II C of the paper). In a full box (del
+    Tatto, Raiteri, Bernetti, Bussi, Appl. Sci. 12, 1139, 2022) the traceless strain is also propagated by an
+    Euler step, with noise computed from the geometric mean of the volumes before and after the step. From the
+    probabilities of each step and its reverse, an effective energy (total energy minus heat and work) is
+    computed, which is conserved within the time-step error.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -288,7 +290,7 @@ class CellRescaling(Barostat):
 
     Attributes:
         compressibility: length³/energy; its ratio to pressure_relaxation determines how fast the box changes,
-            but does not affect the ensemble. key: random key. box: "isotropic" or "full".
+            but not the ensemble. key: random key. box: "isotropic" or "full".
     """
 
     name = "cell-rescaling"
@@ -306,21 +308,21 @@ class CellRescaling(Barostat):
 
     @property
     def _mobility(self):
-        """Return the mobility of the square root of the volume."""
+        """Return the mobility of the square root of the volume, √V."""
         return self.compressibility / (4 * self.pressure_relaxation)
 
     def _forces(self, v, at):
-        """Return the root of the volume, the force on it, and the traceless part of the excess (see `Move`).
+        """Return √V, the force on √V, and the traceless part of the excess pressure tensor (see `excess`).
 
-        The forces are derivatives of k_B T times the logarithm of the density of this root, V^(1/2) exp(-(U +
-        K + p V) / k_B T).
+        The force is the derivative of k_B T times the logarithm of the density of √V, V^(1/2) exp(-(U + K + p
+        V) / k_B T).
         """
         root, excess = jnp.sqrt(volume(at.cell)), self.excess(v, at)
         part = trace(excess) / 3
         return root, (2 * part + self.kT) / root, excess - part * unit(excess)
 
     def _shear(self, root, after):
-        """Mobility of a traceless strain between two volumes, from their roots; the same for the way back."""
+        """Return the mobility of a traceless strain, from √V before and after; equal for the reverse step."""
         return 4 / 3 * self._mobility / (root * after)
 
     def finish(self, v, extra, at, time):

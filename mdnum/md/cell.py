@@ -1,8 +1,8 @@
-"""Boxes: lattice vectors, periodicity per axis, wrapping and the minimum image, on the host and in jit.
+"""Simulation boxes: lattice vectors, periodicity, wrapping and minimum image, on the host and in jit.
 
-Host and jit execute the same operations in the same order. Lattice vectors are subtracted as n * L, with n in
-{-1, 0, 1} for wrapped positions. These products are exact, so that a fused multiply-add gives the same bits
-as separate rounding, and numpy reproduces the results of jit.
+Code on the host and in jit executes the same operations in the same order. Lattice vectors are subtracted as
+n * L, where n is -1, 0 or 1 for wrapped positions. The products n * L are exact, so that fused and separate
+multiplication and addition give the same bits, and numpy reproduces the results of jit.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mdnum.numerics.rounding import Reach
 
 
 class Cell(eqx.Module):
-    """A parallelepiped box, usable on the host (numpy leaves) and in jit (jax leaves)."""
+    """A parallelepiped simulation box, with numpy arrays on the host or jax arrays in jit."""
 
     # lattice vectors as rows, length, shape (3, 3); a free axis may hold a zero vector
     matrix: Float[np.ndarray | jax.Array, "3 3"]
@@ -35,11 +35,11 @@ class Cell(eqx.Module):
 
     @classmethod
     def create(cls, matrix, pbc: Any = True) -> Cell:
-        """Make a cell from lattice vectors.
+        """Make a box from lattice vectors.
 
         Args:
             matrix: lattice vectors as rows, shape (3, 3), or three edge lengths.
-            pbc: one flag or one per axis.
+            pbc: one flag for all axes, or one flag per axis.
 
         Raises:
             InputError: a periodic axis without a lattice vector, or vectors that span no volume.
@@ -72,34 +72,34 @@ class Cell(eqx.Module):
 
     @property
     def widths(self) -> Float[np.ndarray, "3"]:
-        """Perpendicular widths of the periodic axes, length; infinity for a free axis."""
+        """Perpendicular widths of the box along periodic axes, length; infinity along nonperiodic axes."""
         with np.errstate(divide="ignore"):
             widths = 1.0 / np.linalg.norm(np.asarray(self.inverse), axis=0)
         return widths
 
     def is_narrow(self, radius):
-        """True if a radius exceeds half a perpendicular width, so that the minimum image misses pairs."""
+        """Return True if a radius exceeds half a width of the box, so that the minimum image misses pairs."""
         return ((2 * radius) ** 2 * (self.inverse**2).sum(0) > 1).any()
 
     @property
     def nearby2(self):
-        """Square of half the smallest width, less a margin for rounding (inside jit).
+        """Square of half the smallest perpendicular width, reduced by a margin for rounding (inside jit).
 
-        `minimum_image` returns a shorter displacement with the same bits.
+        `minimum_image` returns displacements shorter than this half width unchanged, bit for bit.
         """
         return (1 - 1e-9) * 0.25 / jnp.max(jnp.sum(self.inverse * self.inverse, axis=0))
 
     @property
     def volume(self) -> float:
-        """Volume of the three lattice vectors, length cubed; NaN where one is missing (ASE's convention)."""
+        """Volume of the three lattice vectors, length³; NaN if a vector is missing (ASE's convention)."""
         volume = float(abs(np.linalg.det(np.asarray(self.matrix))))
         return volume if volume > 0 else float("nan")
 
     def reach(self, positions: Float[np.ndarray, "atoms 3"]) -> Reach:
-        """Return magnitudes of the terms of displacements of wrapped positions, for rounding bounds.
+        """Return magnitudes of the terms that are summed in displacements, as needed for rounding bounds.
 
-        Along periodic axes these magnitudes follow from the box. Along free axes they allow the atoms to move
-        to twice their present distances.
+        Along periodic axes, these magnitudes follow from the box. Along nonperiodic axes, the magnitudes
+        allow for motion of the atoms to twice their present distances.
 
         Args:
             positions: initial positions of the atoms, length.
@@ -117,16 +117,16 @@ class Cell(eqx.Module):
         return Reach.of(lattice, np.where(free, box + room, box))
 
     def astype(self, dtype) -> Cell:
-        """The cell with jax leaves of the given dtype."""
+        """Return the box with jax arrays of the given dtype."""
         return Cell(
             jnp.asarray(self.matrix, dtype), jnp.asarray(self.inverse, dtype), self.pbc, self.orthorhombic
         )
 
     def minimum_image(self, x, y, z):
-        """Components of a displacement reduced to its nearest image.
+        """Return the components of the minimum image of a displacement.
 
         The result is correct for every vector whose nearest image is shorter than half the smallest
-        perpendicular width; callers reject longer cutoffs.
+        perpendicular width; calling functions reject longer cutoffs.
         """
         if not any(self.pbc):
             return x, y, z
@@ -135,15 +135,14 @@ class Cell(eqx.Module):
         return _subtract(lattice, x, y, z, _images(lattice, x, y, z, rounding))
 
     def deformation(self, now: Cell):
-        """Deformation from this box to another, shape (3, 3): new lattice rows = old rows @ deformation.
+        """Return the deformation F from this box to another, shape (3, 3): new lattice rows = old rows @ F.
 
-        Directions along free axes do not change. If the vectors are equal, the result is exactly the
-        identity.
+        Directions along nonperiodic axes do not change. For equal lattice vectors, F is exactly the identity.
         """
         return np.eye(3) + self.inverse @ (now.matrix - self.matrix)
 
     def deformed(self, by) -> Cell:
-        """Return the box after a deformation, which multiplies the lattice vectors as rows (inside jit).
+        """Return the box after its lattice vectors (rows) are multiplied by a deformation (inside jit).
 
         Args:
             by: deformation, shape (3, 3), float64. If orthorhombic is True, the deformed box must be
@@ -152,7 +151,7 @@ class Cell(eqx.Module):
         return self.spanned(self.matrix @ by)
 
     def spanned(self, matrix) -> Cell:
-        """A box with new lattice vectors (as rows) and the same periodic axes (inside jit)."""
+        """Return a box with new lattice vectors (rows) and the same periodic axes (inside jit)."""
         flags = np.array(self.pbc)
         rows = jnp.where(flags[:, None], matrix, 0.0)
         # of the products of rows: a free axis, which has none, keeps an inverse of 0
@@ -163,12 +162,12 @@ class Cell(eqx.Module):
     def spent(self, x, reference: Cell, home, r_list):
         """Return the largest displacement relative to the box plus half the strain loss (inside jit).
 
-        A list contains every pair inside the cutoff as long as the result is at most half its skin.
+        A neighbor list contains every pair inside the cutoff as long as the result is at most half the skin.
 
         Args:
             x, home: present positions, in this box, and positions when the list was built, in the box
                 `reference`; length, shape (3, atoms). Both boxes are in float64.
-            r_list: radius of the list, length.
+            r_list: radius of the neighbor list, length.
 
         Returns:
             length, float64.
@@ -177,12 +176,12 @@ class Cell(eqx.Module):
         return self.astype(x.dtype).farthest(moved) + 0.5 * strain_loss(reference, self, r_list)
 
     def farthest(self, moved):
-        """Return the largest length of the nearest images of displacements, float64 (inside jit)."""
+        """Return the largest length of the minimum images of displacements, float64 (inside jit)."""
         d = self.minimum_image(*moved)
         return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
 
     def wrap(self, x, y, z):
-        """Components wrapped into the box, and the integer lattice coordinates that were subtracted."""
+        """Return the components wrapped into the box, and the numbers of lattice vectors subtracted."""
         if not any(self.pbc):
             zero = np.zeros_like(x) if isinstance(x, np.ndarray) else jnp.zeros_like(x)
             return (x, y, z), (zero, zero, zero)
@@ -212,7 +211,7 @@ def _subtract(lattice, x, y, z, n):
 
 @njit(inline="always")
 def nearest_image(lattice, x, y, z):
-    """Return the minimum image of one displacement, for compiled loops; same bits as `Cell.minimum_image`.
+    """Return the minimum image of a displacement in a compiled loop, with the bits of `Cell.minimum_image`.
 
     Args:
         lattice: the box as returned by `box_of`, in the dtype of the displacement.
@@ -236,16 +235,16 @@ def nearest_image(lattice, x, y, z):
 
 
 def stacked(cells: Sequence[Cell], dtype: DTypeLike = np.float64):
-    """Convert boxes to arrays for compiled loops: one box for all rows or one per row (see `box_of`)."""
+    """Convert one box, or one box per row, to arrays that compiled loops accept (see `box_of`)."""
     numbers = np.array([(cell.matrix, cell.inverse) for cell in cells], dtype)
     return numbers, cells[0].pbc, all(cell.orthorhombic for cell in cells)
 
 
 @njit(inline="always")
 def box_of(boxes, row):
-    """Return the box of a row: lattice vectors, their inverse, periodicity, and whether it is orthorhombic.
+    """Return the box of a row: lattice vectors, inverse matrix, periodicity, and an orthorhombic flag.
 
-    The result consists of tuples, because reference counts of arrays would slow down a compiled loop.
+    The result consists of tuples: arrays would slow down a compiled loop by reference counting.
     """
     numbers, pbc, orthorhombic = boxes
     a, m = numbers[row % len(numbers), 0], numbers[row % len(numbers), 1]
@@ -255,7 +254,7 @@ def box_of(boxes, row):
 
 
 class HostCell:
-    """Fast host version of the methods of `Cell` for one dtype, for many calls with few positions."""
+    """Fast host version of the methods of `Cell`, for many calls with few positions in one dtype."""
 
     def __init__(self, cell: Cell, dtype: DTypeLike = np.float64):
         self.dtype = np.dtype(dtype)
@@ -265,7 +264,7 @@ class HostCell:
     def displacement(
         self, start: Float[np.ndarray, "... 3"], end: Float[np.ndarray, "... 3"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Components of the nearest image of end - start, with the bits that the force loop computes."""
+        """Return the components of the minimum image of end - start, with the same bits as the force loop."""
         start, end = np.asarray(start, self.dtype), np.asarray(end, self.dtype)
         x, y, z = (end[..., k] - start[..., k] for k in range(3))
         if not any(self._lattice[2]):
@@ -276,11 +275,11 @@ class HostCell:
 def wrap_positions(
     cell: Cell, positions: Float[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
-    """Wrap positions, which may be far outside the box; return them and the images that they were in.
+    """Wrap positions, which may be far outside the box; return positions and the images that contained them.
 
-    Error: the first pass subtracts up to n lattice vectors at once and rounds n*L; the second pass wraps
-    positions that this rounding left outside. A coordinate may still equal L after L is added to a tiny
-    negative number.
+    Error: the first pass subtracts n lattice vectors at once and rounds n*L; a second pass wraps positions
+    that are still outside due to this rounding. A coordinate may equal L after L is added to a tiny negative
+    number.
     """
     wrapped = np.array(positions, np.float64, copy=True)
     images = np.zeros(wrapped.shape, np.int64)
@@ -297,26 +296,27 @@ def displacement(
     end: Float[np.ndarray, "... 3"],
     dtype: DTypeLike = np.float64,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Components of the nearest image of end - start, with the bits that the force loop computes in dtype."""
+    """Return the components of the minimum image of end - start, with the bits of the force loop."""
     return HostCell(cell, dtype).displacement(start, end)
 
 
 def transformed(x, by):
-    """Return components of positions after a deformation, which multiplies positions as rows (inside jit)."""
+    """Return the components of positions multiplied, as rows, by a deformation (inside jit)."""
     # one product: XLA fuses sums that are written out with what makes their operands, again for each row
     return jnp.matmul(by.astype(x.dtype).T, x, precision="highest")
 
 
 def strain_loss(reference: Cell, now: Cell, r_list):
-    """Return a bound on the decrease of a distance of length r_list by the deformation of the box alone.
+    """Return a bound on the decrease of a distance of length r_list due to the deformation of the box.
 
-    The deformation F maps a vector of length r_list to a vector of length sigma_min(F) * r_list or more. The
-    list is complete as long as this bound plus twice the largest displacement relative to the box is at most
-    the skin. The function works on the host and inside jit.
+    The deformation F maps a vector of length r_list to a vector of at least length sigma_min(F) * r_list. A
+    neighbor list is complete as long as the bound plus twice the largest displacement relative to the box is
+    at most the skin. The function works on the host and inside jit.
 
-    The bound uses sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t| with the symmetric part S of F, a
-    third t of its trace, and the Frobenius norm. It needs no matrix decomposition. It is exact if the box
-    keeps its shape; otherwise its error is at most 0.41 |S - t| plus the square of a rotation.
+    The bound uses sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|, where S is the symmetric part of F,
+    t a third of the trace of F, and |.| the Frobenius norm. No matrix decomposition is needed. The bound is
+    exact if the box keeps its shape; otherwise its error is at most 0.41 |S - t| plus the square of a
+    rotation.
 
     Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
     """
@@ -328,13 +328,12 @@ def strain_loss(reference: Cell, now: Cell, r_list):
 
 
 def complete(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Replace every non-periodic cell vector by a unit vector perpendicular to the others.
+    """Replace each lattice vector of a nonperiodic axis by a unit vector perpendicular to the other vectors.
 
-    Otherwise a tilted vector of a non-periodic axis would affect the choice of images along the periodic
-    axes.
+    A tilted vector of a nonperiodic axis would otherwise change the images chosen along periodic axes.
 
     Args:
-        cell: lattice vectors as rows, length; rows of non-periodic axes may be anything.
+        cell: lattice vectors as rows, length; rows of nonperiodic axes are ignored.
         pbc: which axes are periodic.
     """
     from ase.geometry import complete_cell

@@ -1,11 +1,11 @@
-"""Cutoffs: formulas that truncate, shift or switch a pair potential u(r) at r_cut.
+"""Cutoffs: formulas that truncate, shift or switch a pair potential u(r) at the cutoff radius r_cut.
 
-Every cutoff maps the value u and slope w = du/d(r²) of the bare potential to those of the cut potential, for
-pairs inside the cutoff. Which pairs are inside is decided elsewhere.
+Every cutoff maps the value u and slope w = du/d(r²) of the bare potential to the value and slope of the cut
+potential, for pairs inside the cutoff. The module `decide` determines the pairs inside.
 
-A cutoff is one class with a formula `cut`, a name and a smoothness. System files, the command line, jumps,
-comparisons with other codes and certificates look it up in `CUTOFFS`. A class may also define the independent
-implementation `reference` and the interval version `enclose`; by default both are derived from `cut`.
+A cutoff is a class with a formula `cut`, a name and a smoothness. All other parts of the package find the
+class by its name in `CUTOFFS`. A class may also define the independent implementation `reference` and the
+interval version `enclose`; by default, both are derived from `cut`.
 
 The functions work with numpy and jax arrays; this module does not import jax.
 """
@@ -24,7 +24,7 @@ from mdnum.registry import Registry
 
 
 class AtCutoff(NamedTuple):
-    """Constants of the bare potential at its cutoff, one per pair type (or broadcast per pair)."""
+    """Constants of the bare potential at its cutoff radius, one value per pair type (or one per pair)."""
 
     # r_cut, r_onset: cutoff and onset of switching, length
     r_cut: Float[Any, "..."]
@@ -34,7 +34,7 @@ class AtCutoff(NamedTuple):
 
 
 class Undecided(Exception):
-    """Raised if an interval contains a threshold, so that the decision is not proven at this precision."""
+    """Error for an interval that contains a threshold, so the decision is not proven at this precision."""
 
 
 class Cutoff(ABC):
@@ -47,7 +47,7 @@ class Cutoff(ABC):
 
     @abstractmethod
     def cut(self, r2, u, w, at: AtCutoff) -> tuple[Float[Any, "..."], Float[Any, "..."]]:
-        """Energy and slope of the cut potential inside r_cut.
+        """Return energy and slope of the cut potential, for pairs inside r_cut.
 
         Args:
             r2: squared distances, length².
@@ -59,15 +59,15 @@ class Cutoff(ABC):
         """
 
     def energy_jump(self, at: AtCutoff):
-        """Return the energy jump when a pair enters: the limit of the cut energy at r_cut from inside."""
+        """Return the energy jump as a pair enters: the limit of the cut energy at r_cut from inside."""
         return self._limits(at)[0] if self.smoothness < 0 else 0 * at.energy
 
     def force_jump(self, at: AtCutoff):
-        """Return the jump of the radial force (positive: repulsive) when a pair enters, energy per length."""
+        """Return the jump of the radial force (positive: repulsive) as a pair enters, energy per length."""
         return -2 * at.r_cut * self._limits(at)[1] if self.smoothness < 1 else 0 * at.slope
 
     def jumps(self, at: AtCutoff):
-        """Return the energy jump and the force jump of each term; a single potential is one term."""
+        """Return (energy jump, force jump) of each term of the potential; a single potential is one term."""
         return [(self.energy_jump(at), self.force_jump(at))]
 
     def _limits(self, at: AtCutoff):
@@ -75,7 +75,7 @@ class Cutoff(ABC):
 
     @property
     def continuous(self) -> Cutoff:
-        """Return the cutoff that has the same forces and a continuous energy."""
+        """Cutoff with the same forces and a continuous energy."""
         return self if self.smoothness >= 0 else Level(self)
 
     def reference(
@@ -83,8 +83,8 @@ class Cutoff(ABC):
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
         """Return energy and derivative with respect to r in float64 on the host, as a reference for `cut`.
 
-        If a cutoff does not override this method, jax computes the derivative from the energy of `cut`; the
-        slope that `cut` returns is not used.
+        The default method differentiates the energy of `cut` with jax; the slope returned by `cut` is not
+        used.
 
         Args:
             r, u, du: distances, bare energy and its derivative with respect to r.
@@ -106,7 +106,7 @@ class Cutoff(ABC):
     ) -> Callable[[Any], Any]:
         """Return 2 denergy/d(r²) of the cut potential in ball arithmetic, as a function of the interval r².
 
-        If a cutoff does not override this method, the operations of `cut` are executed one by one.
+        The default method executes the operations of `cut` one by one in ball arithmetic.
 
         Args:
             pull, energy: 2 du/d(r²) and u of the bare potential, as functions of the ball r².
@@ -136,14 +136,14 @@ _ORDERS = len(_DERIVATIVES) - 1
 
 
 def check(cutoff: type[Cutoff] | Cutoff) -> None:
-    """Test that the slope of a cutoff is that of its energy, and that its declared smoothness is correct.
+    """Check that a cutoff's slope is the derivative of its energy, and its smoothness is as declared.
 
-    The test uses u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. It computes derivatives of the energy
-    with respect to r² (nested jvp) at 2⁻⁴⁶ from r_cut and from both sides of the onset, up to one order above
-    the declared smoothness; at this order, a derivative must jump for one of the two potentials. The energy
-    counts as jumping above 1e-9 u(r_cut), and derivative k above 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k.
-    Jumps at other distances and beyond the sixth derivative are not detected; a declared smoothness of 6 or
-    more is tested up to 6.
+    The test uses u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. Derivatives of the energy with respect
+    to r² (nested jvp) are computed at a distance of 2⁻⁴⁶ from r_cut and on both sides of the onset, up to one
+    order above the declared smoothness. At this highest order, the derivative must jump for at least one of
+    the two potentials. An energy difference above 1e-9 u(r_cut) counts as a jump, and so does a difference of
+    derivative k above 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k. Jumps at other distances and jumps of
+    derivatives beyond the sixth are not detected.
 
     Raises:
         ValueError: the test fails; the message names the quantity and the distance.
@@ -161,7 +161,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
 
 
 def _ends(made: Cutoff, power: int) -> bool:
-    """Execute the part of `check` for u = r^(-2 power); return whether a derivative that may jump does so."""
+    """Run the checks for u = r^(-2 power); return True if a derivative that is allowed to jump does jump."""
     import jax
     import jax.numpy as jnp
 
@@ -218,7 +218,7 @@ def _shipped(cutoff: type[Cutoff]) -> type[Cutoff]:
 
 
 class _Truncated(Cutoff):
-    """Base of cutoffs that leave the force unchanged up to the cutoff."""
+    """Base class of cutoffs that leave the force unchanged up to r_cut."""
 
     def force_jump(self, at):
         return -at.slope
@@ -278,12 +278,12 @@ class ForceShifted(Cutoff):
 
 
 class _Switching(Cutoff):
-    """Base of cutoffs with a switching factor s, from 1 at the onset to 0 at the cutoff."""
+    """Base class of cutoffs with a switching factor s(r), decreasing from 1 at the onset to 0 at r_cut."""
 
     switches = True
 
     def factor(self, r, at: AtCutoff):
-        """Return s(r) and ds/dr beyond the onset: an independent implementation in numpy."""
+        """Return s(r) and ds/dr beyond the onset, from an independent implementation in numpy."""
         raise NotImplementedError
 
     def factor_of_ball(self, r2, at: AtCutoff):
@@ -342,14 +342,14 @@ class Switched(_Switching):
 
 
 class _SwitchedInDistance(_Switching):
-    """Base of switching functions of t, which increases from 0 at the onset to 1 at the cutoff."""
+    """Base class of switching functions of t, which increases from 0 at the onset to 1 at r_cut."""
 
     @abstractmethod
     def switch(self, t) -> tuple[Float[Any, "..."], Float[Any, "..."]]:
-        """Switching function and its derivative for t in [0, 1] from onset to cutoff."""
+        """Return the switching function and its derivative for t in [0, 1], from onset to cutoff."""
 
     def switch_of_ball(self, t):
-        """Switching function and its derivative in ball arithmetic."""
+        """Return the switching function and its derivative with respect to t, in ball arithmetic."""
         return self.switch(t)
 
     def cut(self, r2, u, w, at):
@@ -414,7 +414,7 @@ class Level(Cutoff):
 
     @property
     def switches(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """True if the other cutoff has an onset."""
+        """True if the underlying cutoff has an onset."""
         return self.inner.switches
 
     def cut(self, r2, u, w, at):

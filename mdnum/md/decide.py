@@ -1,7 +1,7 @@
-"""Pair decisions: which pairs are inside the cutoff, by the comparison that the system file specifies.
+"""Decisions which pairs are inside the cutoff, by the comparison that the system file specifies.
 
-Only this module defines the compared quantity and its threshold. The force loop, the check of lists and the
-host code that writes the ledger use it, and obtain the same bits.
+The compared quantity and its threshold are defined only in this module. The force loop, the check of neighbor
+lists and the host code that writes the ledger use this module, and obtain the same bits.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class PairDecider:
 
     @property
     def convention(self) -> PairDecider:
-        """The same decider without radii, which are arguments of the program, and without data for bounds."""
+        """The same decision rule without radii and error-bound data, as static data for compiled programs."""
         return replace(self, r_cut=(), reach=_NO_REACH, state="float64")
 
     @property
@@ -68,7 +68,7 @@ class PairDecider:
 
     @property
     def thresholds(self) -> tuple[Threshold, ...]:
-        """Thresholds per pair type, in the dtype and the quantity (r or r²) of the comparison."""
+        """Thresholds by pair type, in the dtype of the comparison; a threshold is r_cut or its square."""
         scalar = np.dtype(self.dtype).type
         comparison = self.compare.split()[1]
         values = [scalar(r) * scalar(r) if self.space == "r2" else scalar(r) for r in self.r_cut]
@@ -76,32 +76,31 @@ class PairDecider:
 
     @property
     def exact_thresholds(self) -> tuple[float, ...]:
-        """The thresholds in double precision, which other dtypes approximate."""
+        """Thresholds by pair type in double precision, to which thresholds of other dtypes are rounded."""
         return tuple(threshold.value for threshold in replace(self, dtype="float64").thresholds)
 
     @cached_property
     def bounds(self) -> tuple[float, ...]:
-        """Bound on |computed margin - exact margin| given the state, by pair type, in the quantity's space.
+        """Bounds on |computed margin - exact margin| by pair type, in units of the compared r or r².
 
-        The exact margin is the margin of the positions of the state, with the box and threshold of the
-        system, which are doubles (error analysis: numerics.rounding). The bound is evaluated at 1.001 r_cut,
-        and holds for every pair up to this distance; for more distant pairs the decision is correct, or the
-        margin is within the bound. It assumes that atoms are within `reach`; if they may have left this
-        range, use `bounds_at`.
+        The exact margin follows from the stored positions, and from the box and the threshold in double
+        precision (error analysis: numerics.rounding). The bound is evaluated at 1.001 r_cut, and holds for
+        every pair up to this distance; for more distant pairs, the decision is correct, or the margin is
+        within the bound. The bound is valid for atoms within `reach`; otherwise, use `bounds_at`.
         """
         return tuple(float(bound) for bound in self._bounds(None))
 
     @cached_property
     def grows(self) -> bool:
-        """True if bounds may increase with the positions."""
+        """True if rounding bounds may increase with the magnitude of positions."""
         narrows = unit_roundoff(np.dtype(self.state)) < unit_roundoff(np.dtype(self.dtype))
         return narrows and len(self.reach.lattice) < 3
 
     def bounds_at(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows types"]:
-        """Return bounds for several states; they are larger if atoms have left the reach along a free axis.
+        """Return bounds for several states, larger if atoms are beyond `reach` along a nonperiodic axis.
 
-        The rounding error of a position increases with its magnitude, and along a free axis positions are not
-        wrapped.
+        The rounding error of a position increases with its magnitude; positions are not wrapped along
+        nonperiodic axes.
 
         Args:
             x: wrapped positions of each state, in the dtype of the state, length.
@@ -116,7 +115,7 @@ class PairDecider:
         return bounds
 
     def _bounds(self, seen: Float[np.ndarray, "rows 3"] | None) -> list:
-        """Return `bounds` by pair type, for atoms within the larger of the reach and the given magnitudes."""
+        """Return `bounds` by pair type, for coordinates up to the maximum of reach and given magnitudes."""
         bound = squared_distance_bound if self.space == "r2" else distance_bound
         given = self.reach, np.dtype(self.dtype), np.dtype(self.state), seen
         return [
@@ -125,21 +124,21 @@ class PairDecider:
         ]
 
     def values(self) -> jax.Array:
-        """Threshold values as an array of the decision's dtype, shape (types,)."""
+        """Return the thresholds as an array of the dtype of the decision, shape (types,)."""
         return jax.device_put(np.array([t.value for t in self.thresholds], np.dtype(self.dtype)))
 
     def quantity(self, dx, dy, dz, zero: jax.Array) -> jax.Array:
-        """Return the compared quantity inside jit, with the same bits as `host_quantity`."""
+        """Return the compared quantity, r or r², inside jit, with the same bits as `host_quantity`."""
         r2 = squared_norm(dx, dy, dz, zero)
         return root(r2) if self.space == "r" else r2
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
-        """Return the compared quantity on the host, from displacement components of the decision's dtype."""
+        """Return the compared quantity (r or r²) on the host, from components in the decision's dtype."""
         r2 = dx * dx + dy * dy + dz * dz
         return np.sqrt(r2) if self.space == "r" else r2
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
-        """Return thresholds minus quantities on the host: positive inside, with the bits of the decision.
+        """Return margins (threshold minus r or r²) on the host, positive inside, bitwise as in the decision.
 
         Args:
             displacement: three components, in the dtype of the decision. kind: pair type of each pair.
@@ -148,12 +147,12 @@ class PairDecider:
         return thresholds[kind] - self.host_quantity(*displacement).astype(np.float64)
 
     def inside(self, quantity, value):
-        """Return the decisions: compare quantities with thresholds by the convention (jax or numpy)."""
+        """Compare quantities with thresholds by the convention; True for pairs inside (jax or numpy)."""
         return quantity <= value if self.compare.endswith("<=") else quantity < value
 
 
 class Tables(NamedTuple):
-    """A pair table (neighbor list) on the device."""
+    """A neighbor list, stored as a pair table on the device."""
 
     # neighbor of each slot and atom in sorted labels, padded with the number of atoms, shape (slots/8, 8,
     # atoms)
@@ -166,14 +165,14 @@ class Tables(NamedTuple):
     edges: Int[Array, "first second"] | None = None
 
     def groups(self) -> tuple[Int[Array, "groups 4 atoms"], UInt8[Array, "groups 4 atoms"] | None]:
-        """Neighbors and pair types, GROUP slots at a time."""
+        """Return neighbors and pair types in groups of GROUP slots."""
         atoms = self.index.shape[-1]
         types = None if self.types is None else self.types.reshape(-1, GROUP, atoms)
         return self.index.reshape(-1, GROUP, atoms), types
 
 
 class Decisions(NamedTuple):
-    """Decisions from one pass over a list."""
+    """Decisions for all pairs of a neighbor list, from one pass over the list."""
 
     bits: UInt8[Array, "words atoms"]  # decisions, eight slots to a byte, shape (slots/8, atoms)
     # smallest |margin| of any listed pair, in the quantity's space. Only where it is within the rounding
@@ -182,12 +181,12 @@ class Decisions(NamedTuple):
 
 
 def packed(halves: UInt8[Array, "groups atoms"]) -> UInt8[Array, "words atoms"]:
-    """Pack the decisions of groups of slots, two groups per byte."""
+    """Pack decisions into bytes, two groups of slots per byte."""
     return halves[0::2] | (halves[1::2] << jnp.uint8(GROUP))
 
 
 def halves_of(bits: UInt8[Array, "words atoms"]) -> UInt8[Array, "groups atoms"]:
-    """Unpack decisions into groups, whose decisions are in the low bits: the inverse of `packed`."""
+    """Unpack bytes into the decisions of two groups each, in the low bits: the inverse of `packed`."""
     mask = jnp.uint8((1 << GROUP) - 1)
     return jnp.stack([bits & mask, bits >> jnp.uint8(GROUP)], axis=1).reshape(-1, bits.shape[-1])
 
@@ -200,13 +199,13 @@ def unpacked(half: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
 
 
 class SlotJudge:
-    """Decisions for groups of slots of all atoms, inside jit, with the nearest margin of each atom.
+    """Decisions for groups of slots of all atoms, inside jit, with the smallest |margin| of each atom.
 
     Args:
-        decider: the convention.
-        thresholds: in its dtype and space, shape (types,).
+        decider: the comparison that defines a decision.
+        thresholds: thresholds of the decider by pair type, in its dtype, shape (types,).
         cell: the box.
-        zero: an integer zero whose value XLA does not know when it compiles.
+        zero: an integer zero whose value is unknown to XLA at compile time.
         positions: positions in sorted order, wrapped, shape (3, atoms).
     """
 
@@ -226,11 +225,11 @@ class SlotJudge:
         self.value = thresholds
 
     def start(self) -> jax.Array:
-        """Return the initial value of the nearest margin of each atom."""
+        """Return the initial value of the smallest |margin| of each atom."""
         return jnp.full(self.atoms, jnp.inf, self.value.dtype)
 
     def group(self, j, types):
-        """Return displacement, quantity, decision and threshold for GROUP neighbors j of every atom.
+        """Return displacement, compared quantity, decision and threshold for GROUP neighbors j of every atom.
 
         Args:
             j: neighbors, shape (GROUP, atoms). types: their pair types, or None.
@@ -242,7 +241,7 @@ class SlotJudge:
         return d, quantity, self.decider.inside(quantity, threshold), threshold
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Decisions of a group as the low bits of a byte per atom, and the nearest margin so far."""
+        """Return decisions of a group as the low bits of a byte per atom, and the smallest |margin| yet."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         margin = jnp.abs(threshold - quantity)
         for k in range(GROUP):
@@ -251,7 +250,7 @@ class SlotJudge:
         return bits, nearest
 
     def decide(self, tables: Tables) -> Decisions:
-        """Return the decisions of a whole list, without forces."""
+        """Return the decisions for a whole neighbor list, without computing forces."""
 
         def block(nearest, listed):
             _, quantity, inside, threshold = self.group(*listed)
@@ -262,12 +261,12 @@ class SlotJudge:
         return self.finish(nearest, halves)
 
     def finish(self, nearest, halves) -> Decisions:
-        """Decisions of the complete pass, two groups per byte."""
+        """Return the decisions of a complete pass over the list, two groups per byte."""
         return Decisions(packed(halves), jnp.min(nearest, initial=jnp.inf).astype(jnp.float64))
 
 
 def displacements(components, cell: Cell, j):
-    """Return nearest images of x_j - x_i, per component; XLA clamps indices of padding to valid indices."""
+    """Return minimum images of x_j - x_i by component; padding indices are clamped to valid indices."""
     return cell.minimum_image(*(c.at[j].get(mode="promise_in_bounds") - c for c in components))
 
 
@@ -275,12 +274,12 @@ def displacements(components, cell: Cell, j):
 
 
 def zeros(shape: int | tuple[int, ...], dtype: Any) -> Array:
-    """Return zeros on the device, without compiling a program for each shape as jnp.zeros does."""
+    """Return zeros on the device; unlike jnp.zeros, no program is compiled for each shape."""
     return jax.device_put(np.zeros(shape, dtype))
 
 
 class Changes(NamedTuple):
-    """Changed decisions, step by step; each is stored once, at the atom that comes first in sorted order."""
+    """Changed decisions of several steps; each pair is stored once, at its first atom in sorted order."""
 
     # row, sorted atoms and whether inside now (plus 2 for each channel before), shape (room, 4)
     pairs: Int[Array, "room 4"]
@@ -291,20 +290,20 @@ class Changes(NamedTuple):
 
     @classmethod
     def empty(cls, room: int, dtype: np.dtype) -> Changes:
-        """Empty buffers with space for a given number of changes."""
+        """Return empty buffers with space for the given number of changes."""
         return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(3, np.int64))
 
     def emptied(self) -> Changes:
-        """The same buffers without any changes."""
+        """Return the same buffers, emptied."""
         return self._replace(count=jnp.zeros_like(self.count))
 
     @property
     def found(self) -> int:
-        """Number of changes found, stored or not."""
+        """Number of changes found, including changes that did not fit into the buffers."""
         return int(np.asarray(self.count)[0])
 
     def cut(self) -> Changes:
-        """Return buffers cut to about the number of changes, so that little data is copied to the host."""
+        """Return buffers cut to about the number of changes, to reduce the transfer to the host."""
         room = 1 << self.found.bit_length()
         if foreign.known() or room >= len(self.pairs):
             return self
@@ -321,11 +320,11 @@ class Changes(NamedTuple):
         row: Int[Array, ""],
         most: int,
     ) -> tuple[Changes, UInt8[Array, "words atoms"]]:
-        """Add the changes since the previous decisions; return them and the decisions, in the same memory.
+        """Record the decisions that changed; return the changes and the decisions, in the same memory.
 
         Args:
-            most: largest number of changes per step on a device other than a CPU, where the time of a step
-                does not depend on their number. If there are more, `count` exceeds the capacity.
+            most: largest number of changes recorded per step, on a device other than a CPU. If there are
+                more, `count` exceeds the capacity.
         """
         if foreign.known() and x.dtype == np.float64:
             return self._noted_by_host(before, bits, tables, x, v, row)
@@ -367,19 +366,19 @@ class Changes(NamedTuple):
 
 @partial(jax.jit, static_argnames="room")
 def _cut(parts: tuple[Array, ...], room: int) -> tuple[Array, ...]:
-    """Return the first rows of each array."""
+    """Return the given number of first rows of each array."""
     return tuple(part[:room] for part in parts)
 
 
 @cache
 def _noting() -> str:
-    """Register `_note` with XLA, and return its name."""
+    """Register the function `_note` with XLA, and return its name."""
     made = cfunc(numba.types.intp(numba.types.intp), _note)
     return registered("mdnum_changes", made.ctypes, made)
 
 
 def _note(frame):
-    """Execute `Changes.noted` when XLA calls it; return 0 (no error)."""
+    """Execute `Changes.noted` in a call from XLA; return 0 (no error)."""
     if not asked_to_run(frame):
         return 0
     operands, results = peek(frame, 9), peek(frame, 14)
@@ -412,12 +411,12 @@ _TOGETHER = 128
 
 @njit
 def note(before, bits, index, x, v, row, pairs, ends, count):
-    """Add the decisions that changed in a step to the arrays of `Changes`; without space, only count them.
+    """Append the decisions that changed in a step to `Changes`; changes beyond the capacity are only counted.
 
-    The array of previous decisions is overwritten with the present ones.
+    The array of previous decisions is overwritten with the present decisions.
 
-    The words are processed in blocks, with separate passes that find changes, look up neighbors and store the
-    rows. A single pass would be slower: every change would cost a mispredicted branch and a wait for memory.
+    Words of 64 decisions are processed in blocks, by separate passes that find changes, look up neighbors and
+    store rows. In a single pass, every change would cost a mispredicted branch and a wait for memory.
     """
     words, atoms = bits.shape
     size, flat = words * atoms, index.reshape(-1)

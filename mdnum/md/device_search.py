@@ -1,9 +1,9 @@
-"""Neighbor search on the device in XLA: lists are built and kept in the memory that holds the positions.
+"""Neighbor search in XLA on the device, where neighbor lists are built and stored next to the positions.
 
 An atom is compared with the atoms in neighboring bins, in the same order as in `md.host_search`, so that both
-searches make the same table from the same bins. A search copies two numbers to the host: the largest number
-of atoms in a bin, and the largest number of neighbors. If an axis is free, the extent of the atoms along it
-is copied, too.
+searches build the same table from the same bins. A search copies two numbers to the host: the largest number
+of atoms in a bin, and the largest number of neighbors. The extent of the atoms along nonperiodic axes is
+copied, too.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class DeviceBuilder:
     def build(
         self, positions: Float[Array | np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[Array, "slots atoms"], Int[Array, "atoms"], int]:
-        """Build a list like `neighbors.ListBuilder.build`; table and order stay on the device."""
+        """Build a list like `neighbors.ListBuilder.build`; the table and atom order stay on the device."""
         x = jnp.asarray(positions, np.float64).T
         extent, low, high = cell.widths.copy(), np.zeros(3), np.ones(3)
         if not all(cell.pbc):
@@ -90,7 +90,7 @@ def _binned(x, cell: Cell, low, span, bins: _Whole):
 def _searched(
     x, places, cell: Cell, start, r2_list, bins: _Whole, reach: _Whole, room: int, slots: int, blocks: int
 ):
-    """Return neighbors of every sorted atom, and the largest neighbor count, which may exceed the slots."""
+    """Return the neighbors of every sorted atom, and the largest neighbor count (incomplete if > slots)."""
     atoms = x.shape[1]
     matrix = cell.matrix
     # layer after layer along the third axis, as the host goes

@@ -1,4 +1,4 @@
-"""The embedded-atom method from a single-element setfl table (.eam.alloy), in full precision."""
+"""Embedded-atom potential from a single-element setfl table (.eam.alloy), in full precision."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mdnum.md.manybody import ManyBody, Smoothness
 
 @dataclass(frozen=True)
 class Setfl:
-    """An embedded-atom table with the contents of a setfl file."""
+    """Contents of a setfl file: the tabulated functions of an embedded-atom potential."""
 
     element: str  # chemical symbol
     comment: tuple[str, ...]  # the three lines at the head of the file
@@ -32,10 +32,10 @@ class Setfl:
 
 
 def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
-    """Read a table with all digits; line breaks between numbers are ignored.
+    """Read a setfl table with all digits, whatever the line breaks between numbers.
 
-    The reader of jax-md rounds all numbers to float32, which causes errors of 4e-4 eV/Å in the forces of
-    copper.
+    In contrast, the reader of jax-md rounds all numbers to float32, which causes errors of 4e-4 eV/Å in the
+    forces of copper.
 
     Args:
         symbols: chemical symbols of the atoms, which must agree with the element of the table.
@@ -104,10 +104,10 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
 
 
 class Spline(eqx.Module):
-    """Piecewise cubic through a table, twice continuously differentiable ("not-a-knot" ends).
+    """Piecewise cubic interpolation of a table, twice continuously differentiable ("not-a-knot" ends).
 
-    The spline equals scipy's InterpolatedUnivariateSpline(k=3), which ASE's EAM uses. Outside the table it is
-    extrapolated with the first and last cubic; see `inside`.
+    The spline equals scipy's InterpolatedUnivariateSpline(k=3), which ASE's EAM uses. Outside the table, the
+    spline is extrapolated with the first and last cubic; see `inside`.
     """
 
     # of 1, t, t², t³ per interval, t the distance from its left end, shape (4, intervals)
@@ -119,7 +119,7 @@ class Spline(eqx.Module):
 
     @classmethod
     def through(cls, values: Float[np.ndarray, "points"], step: float, start: float = 0.0) -> Spline:
-        """Make the spline through values at start, start + step, ..."""
+        """Make the spline through the values at start, start + step, start + 2 step, ..."""
         from scipy.interpolate import CubicSpline
 
         # fitted on the whole numbers: knots like i * step are rounded, and their differences more so
@@ -129,11 +129,11 @@ class Spline(eqx.Module):
 
     @property
     def end(self) -> float:
-        """The last point of the table."""
+        """Argument of the last entry of the table."""
         return self.start + self.intervals * self.step
 
     def __call__(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Value at x; differentiable."""
+        """Return the value of the spline at x; the function is differentiable."""
         offset = x - self.start
         which = jnp.clip(jnp.floor(offset / self.step), 0, self.intervals - 1)
         t = offset - which * self.step
@@ -143,7 +143,7 @@ class Spline(eqx.Module):
     def on_host(
         self, x: Float[np.ndarray, "..."]
     ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
-        """Return value and slope at x without compilation; the value has the same bits as in jax."""
+        """Return value and slope of the spline at x without compilation; the value is bitwise as in jax."""
         offset = x - self.start
         which = np.clip(np.floor(offset / self.step), 0, self.intervals - 1)
         t = offset - which * self.step
@@ -151,7 +151,7 @@ class Spline(eqx.Module):
         return c0 + t * (c1 + t * (c2 + t * c3)), c1 + t * (c2 + t * c3) + t * (c2 + t * c3 + t * c3)
 
     def inside(self, x: Float[Array, "..."]) -> Array:
-        """True if x is in the range of the table, within rounding error."""
+        """Return True if x is in the range of the table, within rounding error."""
         slack = 1e-9 * self.step
         return (x >= self.start - slack) & (x <= self.end + slack)
 
@@ -162,9 +162,9 @@ class Spline(eqx.Module):
 class EmbeddedAtom(ManyBody):
     """E = sum_i F(rho_i) + 1/2 sum_ij phi(r_ij), rho_i = sum_j density(r_ij), for one element.
 
-    The sums of jax-md are correct for a list without atoms as their own neighbors. The list of jax-md
-    contains such entries, which add the density at r = 0; its splines round the table to float32 and return 0
-    beyond it.
+    The EAM energy of jax-md is correct only for a neighbor list in which no atom is its own neighbor. The
+    lists of jax-md contain such entries, which add the density at r = 0. The splines of jax-md round the
+    table to float32 and return 0 outside its range.
 
     Error: if a density is outside the embedding table, energy and forces are NaN. The deviation of the spline
     from the tabulated function is not considered an error.
@@ -182,7 +182,7 @@ class EmbeddedAtom(ManyBody):
     file: str = eqx.field(static=True, kw_only=True, default="")  # the table that it was read from
 
     def charge(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the density of an atom at distance r; 0 at r = 0 (the atom itself) and beyond r_cut."""
+        """Return the electron density due to an atom at distance r; 0 at r = 0 and beyond r_cut."""
         counts = (r > 0) & (r < self.r_cut)
         return jnp.where(counts, self.density(jnp.where(counts, r, 1.0)), 0.0)
 
@@ -192,7 +192,7 @@ class EmbeddedAtom(ManyBody):
         return jnp.where(counts, self.pair(jnp.where(counts, r, 1.0)), 0.0)
 
     def embed(self, rho: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the embedding energy of an atom for a density; NaN outside the table."""
+        """Return the embedding energy of an atom at a given density; NaN outside the table."""
         # a factor and not a selection: it makes the slope NaN too, and forces with it
         on = self.embedding.inside(rho)
         return self.embedding(rho * jnp.where(on, 1.0, jnp.nan).astype(rho.dtype))
@@ -215,7 +215,7 @@ class EmbeddedAtom(ManyBody):
 def embedded_atom(
     path: Path | str, symbols: Sequence[str] = (), pbc: tuple[bool, bool, bool] = (True, True, True)
 ) -> EmbeddedAtom:
-    """Make the embedded-atom potential of a setfl table, which is read by `read_setfl`."""
+    """Make the embedded-atom potential defined by a setfl file (see `read_setfl`)."""
     table = read_setfl(Path(path), symbols)
     r = table.dr * np.arange(len(table.r_pair))
     # the file holds r phi: phi at r = 0 is unknown, so its spline starts one step later, as ASE's does
@@ -235,7 +235,7 @@ def embedded_atom(
 
 
 def _smoothness(table: Setfl, pair: Spline, density: Spline, embedding: Spline) -> Smoothness:
-    """Bound the jumps at r_cut: a crossing changes one pair term and the densities of two atoms."""
+    """Return upper limits of the jumps at r_cut, where a crossing changes one pair term and two densities."""
     steepest = np.max(np.abs(embedding.on_host(table.drho * np.arange(len(table.embedding)))[1]))
     at = np.array([table.r_cut])
     energy, force = (
