@@ -1,17 +1,17 @@
-"""The bouncing ball in closed form: its motion, and its derivative with respect to every parameter.
+"""Closed-form motion of a bouncing ball, and the derivatives of this motion with respect to all parameters.
 
-A ball above a floor at height 0, with gravity g, starts at (y0, v0). It reaches the floor at t_1 = (v0 + s) /
-g with speed s = sqrt(v0² + 2 g y0). With restitution e, impact n has speed e^(n-1) s, and the time between
-impacts n and n + 1 is 2 e^n s / g. Therefore
+A ball starts at height y0 above the floor (at height 0) with velocity v0, under gravity g. It reaches the
+floor at t_1 = (v0 + s) / g with speed s = sqrt(v0² + 2 g y0). With the coefficient of restitution e, impact n
+has speed e^(n-1) s, and the time between impacts n and n + 1 is 2 e^n s / g. Therefore
 
     t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e),
 
-so infinitely many impacts take place in a finite time (Zeno). With a spring, y'' = -g - k y - c y' below the
-floor, and each contact is a damped cosine. Penalty contacts discretize this differential equation. A ball
-with restitution follows another motion, even in the limit of stiff springs, unless its restitution is 1.
+so infinitely many impacts take place in a finite time (Zeno). With a spring and a damper, y'' = -g - k y - c
+y' below the floor, and each contact is a damped cosine. Penalty contacts discretize this equation. A ball
+with a coefficient of restitution moves differently, even in the limit of stiff springs, unless e = 1.
 
-All computations use numpy in float64 on the host. They share no code with the programs of this package,
-because they are the reference for these programs.
+All computations use numpy in float64. They share no code with the simulations of this package, because they
+are the reference for these simulations.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MOST = 100_000  # contacts after which something is wrong: each damped one take
 
 @dataclass(frozen=True)
 class Known:
-    """A quantity with a closed-form value, and its derivative with respect to every parameter."""
+    """The exact value of a quantity, and its derivatives with respect to all parameters."""
 
     value: Float[np.ndarray, "..."]  # shape of what was asked for (times or impact numbers)
     # derivative by name of the parameter, each of that shape
@@ -45,10 +45,10 @@ Parameters = Mapping[str, complex]
 
 
 class _Motion:
-    """Base class of both motions: checks of the start, derivatives, height and velocity.
+    """Base class of both exact motions: validation of the start, derivatives, height and velocity.
 
-    Source: complex-step derivatives, which involve no cancellation (Squire & Trapp, SIAM Review 40 (1998)
-    110).
+    Derivatives are complex-step derivatives, which have no cancellation (Squire & Trapp, SIAM Review 40
+    (1998) 110).
     """
 
     y0: float
@@ -64,7 +64,7 @@ class _Motion:
             raise InputError("the ball starts at rest on the floor", remedy="Give it a height or a velocity")
 
     def _known(self, quantities: Callable[[Parameters], tuple[Any, ...]]) -> tuple[Known, ...]:
-        """Evaluate functions of complex parameters, with their derivatives."""
+        """Evaluate functions of complex parameters; return their values and complex-step derivatives."""
         at = self._at
         moved = {name: quantities(at | {name: value + 1j * _STEP}) for name, value in at.items()}
         found = []
@@ -80,7 +80,7 @@ class _Motion:
     def first_contact(self) -> Known:
         """Return the time (s) at which the ball first reaches the floor.
 
-        Error: a few ulps, for either sign of v0.
+        Error: a few ulps, for upward and for downward v0.
         """
         return self._known(_down)[0]
 
@@ -98,14 +98,14 @@ class _Motion:
 
 
 def _down(p: Parameters) -> tuple[complex, complex]:
-    """Return time and speed of the first contact, without cancellation if the ball moves downward."""
+    """Return time (s) and speed (m/s) of the first contact, without cancellation for a downward start."""
     y0, v0, g = p["y0"], p["v0"], p["gravity"]
     speed = np.sqrt(v0 * v0 + 2 * g * y0)
     return (v0 + speed) / g if v0.real >= 0 else 2 * y0 / (speed - v0), speed
 
 
 def _impact(p: Parameters, n: Any) -> tuple[Any, Any]:
-    """Return the time of impact n and the speed after the impact."""
+    """Return the time (s) of impact n and the speed (m/s) after this impact."""
     first, speed = _down(p)
     e = p["restitution"]
     power, between = _powers(e, np.asarray(n, np.float64) - 1)
@@ -114,16 +114,16 @@ def _impact(p: Parameters, n: Any) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class ExactImpact(_Motion):
-    """The exact motion of a ball with restitution.
+    """The exact motion of a ball that bounces with a coefficient of restitution.
 
-    Impacts are numbered from 1. At the time of an impact, the state is that after the impact.
+    Impacts are numbered from 1. At the time of an impact, the state is the state after the impact.
 
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.
 
-    Error: values and derivatives are computed without cancellation. Impact speeds and times have errors of
-    about ten ulps, plus n ulps for the n-th power of e, for any e including values at and near 1. Height and
-    velocity are those at a time that differs by a few ulps, within the same errors.
+        Error: values and derivatives are computed without cancellation. Impact speeds and times have errors
+            of about ten ulps, plus n ulps for the n-th power of e, for any e including values at and near 1.
+            Height and velocity have the same errors, plus the effect of a change of the time by a few ulps.
     """
 
     y0: float  # height at the start, m, at least 0
@@ -151,7 +151,7 @@ class ExactImpact(_Motion):
         """Return the time (s) at which the ball comes to rest after infinitely many impacts.
 
         Raises:
-            InputError: the restitution is 1.
+            InputError: the coefficient of restitution is 1.
         """
         if self.restitution == 1:
             raise InputError(
@@ -213,9 +213,9 @@ class ExactPenalty(_Motion):
     """The exact motion of a ball on a penalty contact, with or without damping.
 
     The equation y'' = -g - k y - c y' holds as long as the ball is below the floor, so the damper may pull at
-    the end of a contact. The end time of a contact has a closed form without damping. With damping it is the
-    root of one equation between the lowest point and the next crest. A ball whose crest remains below the
-    floor comes to rest at depth g / k.
+    the end of a contact. Without damping, the end time of a contact has a closed form. With damping, the end
+    time is the root of an equation between the lowest point and the next maximum of the height. If this
+    maximum is below the floor, the ball comes to rest at depth g / k.
 
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.
@@ -280,7 +280,7 @@ def _bounced(p: Parameters, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _arc(p: Parameters, s: complex, tau):
-    """Return height and velocity at a time tau after entering a contact with speed s."""
+    """Return height and velocity at a time tau after the start of a contact with speed s."""
     k, half, deep = p["k"], p["damping"] / 2, p["gravity"] / p["k"]
     w = np.sqrt(k - half * half)
     fade, cosine, sine = np.exp(-half * tau), np.cos(w * tau), np.sin(w * tau) / w
@@ -292,7 +292,7 @@ def _arc(p: Parameters, s: complex, tau):
 
 
 def _end(p: Parameters, s: complex) -> complex | None:
-    """Return the duration (s) of a contact entered with speed s, or None if the contact never ends."""
+    """Return the duration (s) of a contact that begins with speed s, or None if the contact never ends."""
     half = p["damping"].real / 2
     if half * half > p["k"].real:
         return None
@@ -338,9 +338,9 @@ def _later(t: Times) -> Float[np.ndarray, "*times"]:
 
 
 def _powers(e: complex, n: Any) -> tuple[Any, Any]:
-    """Return e^n and 1 + e + ... + e^(n-1) for integers n, by repeated squaring with sums of one sign.
+    """Return e^n and 1 + e + ... + e^(n-1) for integers n, by repeated squaring and without cancellation.
 
-    Near e = 1 the formula (1 - e^n) / (1 - e) loses all digits, and its derivative even earlier.
+    Near e = 1, the formula (1 - e^n) / (1 - e) and its derivative lose all digits by cancellation.
     """
     n = np.asarray(n, np.float64)
     power, total = np.ones(n.shape, complex), np.zeros(n.shape, complex)

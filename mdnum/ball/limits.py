@@ -1,4 +1,4 @@
-"""Largest numbers of the ball's formats, and the smallest tolerance of its solver. No jax is imported."""
+"""Ranges of floating-point formats, and the smallest tolerance of a bouncing ball's contact solver."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ _ROLES = {
 
 
 def largest(name: str) -> float:
-    """Return the largest finite number of a format."""
+    """Return the largest finite number of a floating-point format."""
     return float(ml_dtypes.finfo(DTYPES[name]).max)
 
 
 def spacing(value: float, name: str) -> float:
-    """Return the distance from a number to the next number of a format."""
+    """Return the distance from a number to the next number of a floating-point format."""
     limits = ml_dtypes.finfo(DTYPES[name])
     exponent = int(np.floor(np.log2(max(abs(value), float(limits.smallest_normal)))))
     return float(limits.eps) * 2.0**exponent
 
 
 def rounded(value: float, name: str) -> float:
-    """Return the number of a format that is nearest to a value."""
+    """Return the number of a floating-point format that is nearest to a value."""
     with np.errstate(over="ignore"):
         return float(np.asarray(value, DTYPES[name]))
 
 
 def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") -> dict[str, float]:
-    """Return the smallest tolerance (m) that a solver can meet, for each role whose format limits the
-    tolerance.
+    """Return the smallest tolerance (m) of an iterative solver that each role's floating-point format allows.
 
-    A penetration stops shrinking once its fraction `gain` rounds to zero, and a tolerance that a format
-    cannot represent changes when rounded. The largest of the values is the smallest usable tolerance.
+    A penetration no longer decreases when `gain` times the penetration rounds to zero, and a tolerance below
+    the smallest number of a format rounds to zero. The smallest usable tolerance is the largest of the
+    values.
 
     Args:
         precision: names of formats by role, as attributes.
@@ -50,7 +50,7 @@ def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") ->
         kind: the quantity compared with the tolerance: "sum" of the residuals, "relative" to the first sum,
             or "term" (a single residual, or the largest).
 
-    Error: exact up to the rounding of alpha k; tested against every small penetration.
+        Error: exact except for the rounding of alpha k; tested for every small penetration.
     """
     formats = {role: getattr(precision, role) for role in _ROLES[kind]}
     least = {role: smallest(name) for role, name in formats.items()}
@@ -58,7 +58,7 @@ def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") ->
 
 
 def _stuck(name: str, gain: float) -> float:
-    """Return the smallest number above every penetration that rounding may keep unchanged in an iteration."""
+    """Return the smallest penetration above which an iteration always changes the rounded penetration."""
     if name == "float16":
         # of n grains the iteration takes gain * n, which rounds to none up to one half
         return (math.floor(0.5 / gain) + 1) * smallest(name)

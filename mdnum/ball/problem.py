@@ -1,4 +1,4 @@
-"""A rollout with a loss, as a differentiable function of named parameters."""
+"""A bouncing-ball simulation with a loss, as a differentiable function of named parameters."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ START = ("y0", "v0")  # parameters of the start rather than of the world; a valu
 
 
 class BallLoss(Protocol):
-    """Protocol of a loss: a sum over steps and a final term, of shape () and in the dtype of their input."""
+    """Protocol of a loss of a bouncing-ball simulation: a sum over time steps and a final term."""
 
     def step(self, state: BallState, record: BallRecord, dtype: Any) -> Float[Array, ""]:
-        """Return the contribution to the loss of the step that made this state."""
+        """Return the contribution to the loss from the time step that led to this state."""
         ...
 
     def end(self, state: BallState, steps: int, total: Float[Array, ""]) -> Float[Array, ""]:
@@ -33,12 +33,12 @@ class BallLoss(Protocol):
 
 
 class FinalHeight(eqx.Module):
-    """Mean final height, m, as a loss; with a target, the mean squared distance from the target, m²."""
+    """Loss: the mean final height, m, or with a target the mean squared distance from the target, m²."""
 
     target: float | None = eqx.field(static=True, default=None)
 
     def step(self, state, record, dtype):
-        """Return zero, because only the final state contributes."""
+        """Return zero, because only the final state contributes to the loss."""
         return jnp.zeros((), dtype)
 
     def end(self, state, steps, total):
@@ -50,35 +50,35 @@ class FinalHeight(eqx.Module):
 
 
 class MeanHeight(eqx.Module):
-    """Height averaged over balls and steps, m, as a loss."""
+    """Loss: the height averaged over balls and time steps, m."""
 
     def step(self, state, record, dtype):
-        """Return the mean height over the batch."""
+        """Return the height averaged over all balls."""
         return jnp.mean(state.y.astype(dtype), dtype=dtype)
 
     def end(self, state, steps, total):
-        """Return the sum over steps divided by the number of steps."""
+        """Return the sum over time steps, divided by the number of steps."""
         return total / max(steps, 1)
 
 
 class ResidualPenetration(eqx.Module):
-    """Penetration left by the contact model, summed over steps and averaged over balls, as a loss."""
+    """Loss: the penetration that remains after each step, summed over steps and averaged over balls."""
 
     power: int = eqx.field(static=True, default=2)  # 2 for squares, m²; 1 for the penetration itself, m
 
     def step(self, state, record, dtype):
-        """Return the mean of |p|^power over the batch."""
+        """Return the mean of |p|^power over all balls, where p is the remaining penetration."""
         left = record.left.astype(dtype)
         return jnp.mean(left if self.power == 1 else left**self.power, dtype=dtype)
 
     def end(self, state, steps, total):
-        """Return the penetration summed over steps."""
+        """Return the remaining penetration, summed over steps."""
         return total
 
 
 @dataclass(frozen=True)
 class BallProblem:
-    """A differentiable simulation problem: a world, a start, a number of steps and a loss."""
+    """A differentiable bouncing-ball problem: a model, initial heights and velocities, steps and a loss."""
 
     world: World  # the program
     y0: Any  # heights at the start, m, a number or shape (balls,)
@@ -87,7 +87,7 @@ class BallProblem:
     loss: BallLoss = field(default_factory=FinalHeight)  # of the rollout
 
     def with_values(self, values: Mapping[str, Any]) -> BallProblem:
-        """Return the problem with other values of named parameters, including start values."""
+        """Return the problem with other parameter values, including initial heights and velocities."""
         start = {name: values[name] for name in START if name in values}
         rest = {name: value for name, value in values.items() if name not in START}
         return replace(self, world=self.world.with_values(rest), **start)
@@ -106,16 +106,16 @@ class BallProblem:
     def value(
         self, overrides: Mapping[str, Any] | None = None, imposed: BallDecisions | None = None
     ) -> float:
-        """Compute the loss, optionally with other parameter values; one compiled program serves all values.
+        """Compute the loss, optionally with other parameter values, which do not need another compilation.
 
         Args:
-            imposed: decisions of every step that replace the world's own, leading axis steps.
+            imposed: decisions of every step (first axis: steps) that replace the model's own decisions.
         """
         problem = self.with_values(overrides or {})
         return float(_loss(problem.bare, problem.world, *problem.start_arrays, imposed))
 
     def origin(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return the point at which `loss_at` is differentiated: parameter values, zero start displacement.
+        """Return the arguments at which `loss_at` is differentiated: parameter values, and 0 for y0 and v0.
 
         Raises:
             InputError: a parameter does not exist.
@@ -128,15 +128,14 @@ class BallProblem:
     def value_and_grad(
         self, names: Sequence[str], imposed: BallDecisions | None = None, scale: float = 1.0
     ) -> tuple[float, dict[str, float]]:
-        """Compute the loss and its derivatives with respect to named parameters through the actual
-        iterations.
+        """Compute the loss and its derivatives with respect to named parameters, through all iterations.
 
         Args:
-            names: names of parameters; y0 and v0 displace the whole batch.
-            imposed: decisions of every step that replace the world's own, leading axis steps.
+            names: names of parameters; y0 and v0 are common displacements of all balls.
+            imposed: decisions of every step (first axis: steps) that replace the model's own decisions.
             scale: factor of the loss in the reverse pass (`mdnum.numerics.formats`), a power of two.
 
-        Error: rounding of the reverse pass in the dtypes of the policy.
+            Error: rounding errors of the reverse pass in the dtypes of the policy.
         """
         check_scale(scale)
         made = _value_and_grad(
@@ -145,17 +144,17 @@ class BallProblem:
         return float(made.value), {name: float(made.gradient[name]) for name in names}
 
     def run(self, **options: Any) -> BallRun:
-        """Simulate the problem; for options see `simulate`."""
+        """Run the simulation of the problem; for options see `simulate`."""
         return simulate(self.world, self.world.start(self.y0, self.v0), self.steps, **options)
 
     @property
     def bare(self) -> tuple[int, BallLoss]:
-        """Number of steps and loss, without the world."""
+        """The number of steps and the loss, without the bouncing-ball model."""
         return self.steps, self.loss
 
     @property
     def start_arrays(self) -> tuple[Array, Array]:
-        """Heights and velocities of the start as floating arrays, shapes (balls,) and () or (balls,)."""
+        """Initial heights, shape (balls,), and velocities, shape () or (balls,), as floating-point arrays."""
         y = jnp.atleast_1d(jnp.asarray(self.y0))
         y = y if jnp.issubdtype(y.dtype, jnp.floating) else y.astype(jnp.float64)
         return y, jnp.asarray(self.v0).astype(y.dtype)
@@ -169,10 +168,10 @@ def loss_of(
     loss: BallLoss,
     imposed: BallDecisions | None = None,
 ) -> Float[Array, ""]:
-    """Compute the loss of a rollout; traceable and differentiable in every argument except steps and loss.
+    """Compute the loss of a simulation; differentiable with respect to all arguments except steps and loss.
 
     Args:
-        imposed: decisions of every step, leading axis steps; None for the world's own decisions.
+        imposed: decisions of every step (first axis: steps) to impose; None for the model's own decisions.
 
     Returns:
         the loss in the dtype of its role.
@@ -190,11 +189,11 @@ def loss_of(
 
 
 def loss_at(bare, world, y0, v0, values, imposed):
-    """Evaluate `loss_of` for given parameter values. All inputs are arguments, so that XLA keeps fences.
+    """Compute the loss for given parameter values; all inputs are arguments, so that XLA keeps fences.
 
     Args:
         bare: number of steps, and loss.
-        values: parameter values by name; for a start parameter, its displacement (`BallProblem.origin`).
+        values: parameter values by name; for y0 and v0, displacements of the start (`BallProblem.origin`).
     """
     world = world.with_values({name: value for name, value in values.items() if name not in START})
     y0, v0 = (
@@ -215,9 +214,9 @@ def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
-    """Compute final heights and their derivative with respect to one parameter, by forward mode.
+    """Compute final heights and their derivatives with respect to one parameter, by forward mode.
 
-    One compilation serves all step sizes and numbers of steps.
+    The function is compiled once for all time steps and numbers of steps.
     """
     return _arrive(world, y0, jnp.asarray(steps), name)
 

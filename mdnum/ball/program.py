@@ -1,4 +1,4 @@
-"""The ball as a `Program`: its rollouts are short, so whole rollouts are kept and compared at once."""
+"""The bouncing ball as a `Program` for comparisons of runs; runs are short and compared as a whole."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
 
 @dataclass(frozen=True)
 class ImposedDecision:
-    """One decision that is imposed on a run; the run makes all other decisions itself."""
+    """A single decision that is imposed on a run; all other decisions are made by the run itself."""
 
     channel: Literal["contact", "stop"]
     step: int  # from 1
@@ -34,7 +34,7 @@ class ImposedDecision:
 
 @dataclass(frozen=True)
 class BallProgram:
-    """World, start and steps of a ball's run, and methods to compare the run with another program's."""
+    """Model, initial state and steps of a bouncing-ball run, with methods to compare it with another run."""
 
     problem: BallProblem  # the program
     # its balls are those of the other program in this order; None where they are the same
@@ -49,7 +49,7 @@ class BallProgram:
 
     @property
     def steps(self) -> int:
-        """Number of steps of the system's own run."""
+        """Number of steps in the system file."""
         return self.problem.steps
 
     @property
@@ -59,7 +59,7 @@ class BallProgram:
 
     @property
     def scale(self) -> float:
-        """Largest start height; for balls that start on the floor, the largest height that they reach."""
+        """Largest initial height, m; if all balls start on the floor, the largest height in the run, m."""
         start = self.problem.world.start(self.problem.y0, self.problem.v0)
         height = float(np.abs(np.asarray(start.y, np.float64)).max())
         if height:
@@ -69,21 +69,21 @@ class BallProgram:
 
     @property
     def ulp(self) -> float:
-        """One ulp of the largest start height, m."""
+        """One ulp of the largest initial height, m."""
         return spacing(float(np.abs(np.asarray(self.problem.y0)).max()), self.problem.world.policy.state)
 
     @property
     def streams(self) -> bool:
-        """Always False: a rollout is compared at exactly the requested steps."""
+        """Always False, because a run is compared at exactly the requested steps."""
         return False
 
     @property
     def imposable(self) -> None:
-        """Always None: every decision of a ball can be imposed."""
+        """Always None, because every decision of a ball can be imposed."""
         return None
 
     def check(self, other: BallProgram) -> None:
-        """Check that both programs make the same kinds of decisions for the same number of balls.
+        """Raise an error if two programs have different kinds of decisions or numbers of balls.
 
         Raises:
             InputError: the kinds of decisions or the numbers of balls differ.
@@ -101,7 +101,7 @@ class BallProgram:
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
-        """Simulate a rollout, with the balls in the order of the other program.
+        """Run the simulation; the result has the balls in the order of the program with which it is compared.
 
         Args:
             decisions: decisions imposed on the balls in that order; None for the program's own decisions and
@@ -125,7 +125,7 @@ class BallProgram:
         return run
 
     def _pinned(self, steps: int) -> BallDecisions | None:
-        """Return the pinned decisions as imposed decisions, -1 for free ones; None if nothing is pinned."""
+        """Return the pinned decisions as arrays, with -1 for other decisions; None if nothing is pinned."""
         if not self.pins:
             return None
         world = self.problem.world
@@ -179,7 +179,7 @@ class BallProgram:
     def repeats(
         self, others: Sequence[BallProgram], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Compute the separations of perturbed runs (see `Program.repeats`)."""
+        """Compute the separations of pairs of runs with perturbed starts (see `Program.repeats`)."""
         # of the number of steps that was run before: another one would be another compiled program
         steps = min((known for known in self._runs if known >= last), default=last)
         a = self.run(steps)
@@ -191,7 +191,7 @@ class BallProgram:
         return found
 
     def nudged(self, size: float, count: int, seed: int) -> list[BallProgram]:
-        """Return programs whose start heights are displaced at random by up to `size`, at least an ulp."""
+        """Return programs with random displacements of initial heights, up to `size` but at least an ulp."""
         rng = np.random.default_rng(seed)
         y = np.asarray(np.atleast_1d(self.problem.y0), np.float64)
         size = max(size, self.ulp)
@@ -199,7 +199,7 @@ class BallProgram:
         return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
 
     def decision(self, other: BallProgram, flips: Sequence[CrossDecision], separation: float) -> Decision:
-        """Return the first decision at a fork: contacts before stops, lowest ball first."""
+        """Return the decision that differs first at a fork: contacts before stops, lowest ball first."""
         first = flips[0]
         return Decision(
             channel=first.channel,
@@ -216,7 +216,7 @@ class BallProgram:
         )
 
     def number(self, key: str) -> Number:
-        """Find a parameter by its key in the system file, the last word of the key, or the world's own name.
+        """Find a parameter by its key in the system file, the end of this key, or its name in the model.
 
         Raises:
             InputError: the parameter does not exist.
@@ -261,7 +261,7 @@ class BallProgram:
         return DecisionHistory(every, digest, x, value, float("nan"), "", first=1)
 
     def differing(self, other: BallProgram, steps: int, step: int, key: str) -> Differing:
-        """Return the first decision at a step that differs between the programs, and both loss gradients."""
+        """Return the first decision at a step that differs from another program, and both loss gradients."""
         problems = [replace(one.problem, steps=steps) for one in (self, other)]
         runs = [problem.run(history=True) for problem in problems]
         flips = [flip for flip in cross_decisions(runs[0], runs[1], step) if flip.step == step]
@@ -281,7 +281,7 @@ class BallProgram:
 
 
 def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float:
-    """Return threshold minus residual at one iteration of a joint solve, from the recorded residuals."""
+    """Return threshold minus recorded residual at one iteration of a solver that all balls share."""
     if run.history is None or not isinstance(run.world.contact, Projection):
         return margin
     rule = run.world.contact.stop
@@ -290,7 +290,7 @@ def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float
 
 
 def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
-    """Return a run with its balls in the order of the other program."""
+    """Return a run with its balls in the order of the program with which it is compared."""
     place = np.argsort(order)
     columns = ("y", "v", "height", "contact", "iterations", "reason", "residual", "margin", "before")
     arrays = {name: getattr(run, name) for name in columns}
@@ -333,7 +333,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
 
 
 def _guarded(separation: np.ndarray, furthest: np.ndarray, guard: float | None) -> np.ndarray:
-    """Set separations to NaN after the step at which a contact far from the floor is imposed."""
+    """Set separations to NaN after the step at which a contact is imposed too far from the floor."""
     beyond = furthest > (np.inf if guard is None else guard)
     if beyond.any():
         separation[int(beyond.argmax()) + 1 :] = np.nan

@@ -1,4 +1,4 @@
-"""Rollouts of balls: a compiled loop in chunks, its record on the host, and comparison of two rollouts."""
+"""Simulation of bouncing balls: the compiled time-stepping loop, its record, and comparisons of two runs."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """A finished rollout. In arrays with one row per step, row s is the step that made state s + 1.
+    """Record of a finished run. In arrays with one row per step, row s is the step from state s to s + 1.
 
     Attributes:
-        world: the world that was simulated.
+        world: the bouncing-ball model that was simulated.
         steps, balls: number of steps and of balls.
         y, v: heights (m) and velocities (m/s), shape (steps + 1, balls), in the dtype of the state; only the
             first and the last state if states were not kept.
@@ -62,7 +62,7 @@ class BallRun:
 
     @property
     def kept(self) -> bool:
-        """True if every state was kept."""
+        """True if the states of all time steps were kept."""
         return len(self.y) == self.steps + 1
 
     @property
@@ -83,7 +83,7 @@ class BallRun:
 
     @property
     def final(self) -> tuple[np.ndarray, np.ndarray]:
-        """Heights and velocities at the end of the rollout."""
+        """Heights (m) and velocities (m/s) at the end of the run."""
         return self.y[-1], self.v[-1]
 
     @cached_property
@@ -92,19 +92,19 @@ class BallRun:
         return energy(self.world, self.y, self.v)
 
     def ended(self) -> dict[str, int]:
-        """Count the solves that ended for each reason."""
+        """Number of iterative solves that ended for each reason."""
         codes, counts = np.unique(self.reason, return_counts=True)
         return {Reason(code).word: int(n) for code, n in zip(codes, counts, strict=True)}
 
     def decisions(self) -> BallDecisions:
-        """Return the decisions of all steps, to be imposed on another rollout."""
+        """Return the decisions of all steps, which can be imposed on another run."""
         return BallDecisions(self.contact, self.iterations)  # type: ignore[arg-type]
 
 
 def energy(world: World, y: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "..."]:
     """Compute the mechanical energy per mass, (m/s)²: kinetic, gravitational, and that of a penalty spring.
 
-    Error: evaluated in float64; a softplus contact is treated as the spring that it approximates.
+    Error: evaluated in float64; a softplus contact is treated as a linear spring without smoothing.
     """
     y, v = np.asarray(y, np.float64), np.asarray(v, np.float64)
     total = float(world.gravity) * y + 0.5 * v * v
@@ -123,20 +123,20 @@ def simulate(
     imposed: BallDecisions | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BallRun:
-    """Advance a batch of balls and record every decision.
+    """Run a simulation of balls, and record every decision.
 
     Args:
         start: start state, made by `world.start`.
-        history: whether to keep the residual of every stop decision too.
+        history: whether to keep also the residual of every stop decision.
         keep: whether to keep every state; otherwise only the first and last states and the flips are kept.
-        imposed: decisions of every step that replace the world's own, leading axis steps.
+        imposed: decisions of every step (first axis: steps) that replace the model's own decisions.
         progress: called with the numbers of steps made and requested.
 
     Returns:
-        the record, on the host.
+        the record of the run.
 
     Raises:
-        InputError: steps is below 1.
+        InputError: the number of steps is below 1.
     """
     check_not_forked()
     expect_at_least(1, steps=steps)
@@ -177,7 +177,7 @@ _COUNTS: dict[tuple[Any, int], tuple[int, ...]] = {}
 
 
 def undecided(world: World, start: BallState, steps: int) -> BallDecisions:
-    """Return decisions that impose nothing: all values are -1, leading axis steps."""
+    """Return arrays of decisions with -1 everywhere, so that no decision is imposed; first axis: steps."""
     kind = jax.tree.structure(world), len(start.y)
     if kind not in _COUNTS:
         solve = eqx.filter_eval_shape(lambda world, start: world.advance(start)[1].solve, world, start)
@@ -200,7 +200,7 @@ def _chunk(world: World, state: BallState, imposed: Any, length: int, history: b
 
 
 def _flips(world: World, made: int, before, y, v, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Compute the ledger rows of a chunk from its record and from the state and contacts before it."""
+    """Find all contact flips in a chunk of steps, given the state and contacts before the chunk."""
     contact = rows["contact"]
 
     def packed(bits: np.ndarray) -> np.ndarray:
@@ -232,10 +232,9 @@ def _flips(world: World, made: int, before, y, v, rows: dict[str, np.ndarray]) -
 def height_bound(
     world: World, y: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."]
 ) -> Float[np.ndarray, "..."]:
-    """Bound the rounding error |computed - exact| of the height in a contact decision, m.
+    """Return a bound on the rounding error of the height that a contact decision uses, m.
 
-    Four roundings lead from the previous state to the height; the bound adds the absolute values of all
-    terms.
+    The height results from the previous state by four roundings; the bound adds the magnitudes of all terms.
 
     Args:
         y, v: height (m) and velocity (m/s) of the previous state.
@@ -246,9 +245,9 @@ def height_bound(
 
 
 def residual_bound(world: World, residual: Any, terms: int) -> Any:
-    """Bound the rounding error |computed - exact| of a residual, in the unit of the residual.
+    """Return a bound on the rounding error of a residual, in the unit of the residual.
 
-    All terms of a residual have one sign, so the error of their sum is at most gamma times the sum.
+    All terms of a residual have the same sign, so the error of their sum is at most gamma_n times the sum.
 
     Args:
         residual: residual that a stop decision compares with its threshold.
@@ -261,7 +260,7 @@ def residual_bound(world: World, residual: Any, terms: int) -> Any:
 
 
 class CrossDecision(NamedTuple):
-    """A decision that differs between two runs."""
+    """A contact or stop decision that differs between two runs at the same step."""
 
     step: int  # from 1
     channel: str  # "contact" or "stop"
@@ -279,13 +278,13 @@ class CrossDecision(NamedTuple):
 
     @property
     def run(self) -> str:
-        """Run that decided yes: the run in which the ball touches, or whose solver stops first."""
+        """Run with the decision "yes": its ball touches the floor, or its solver stops first."""
         return "A" if (self.a > self.b) == (self.channel == "contact") else "B"
 
 
 @dataclass(frozen=True)
 class BallDifference:
-    """Differences between two rollouts of the same length: steps, counts and separation."""
+    """Differences between two runs of the same length: first steps, numbers of decisions, and separation."""
 
     seed: int | None  # first step whose state bits differ (0: the start itself); None where none do
     fork: int | None  # first step whose decisions differ; None where none do
@@ -302,10 +301,10 @@ class BallDifference:
 
 
 def first_difference(a: BallRun, b: BallRun) -> BallDifference:
-    """Compare two rollouts, and find where they first differ.
+    """Compare two runs, and find the steps at which bits and decisions first differ.
 
     Raises:
-        InputError: the rollouts differ in length or batch size.
+        InputError: the runs have different lengths or numbers of balls.
     """
     if (a.steps, a.balls) != (b.steps, b.balls):
         raise InputError(
@@ -330,7 +329,7 @@ def first_difference(a: BallRun, b: BallRun) -> BallDifference:
 
 
 def cross_decisions(a: BallRun, b: BallRun, last: int | None = None) -> list[CrossDecision]:
-    """List all decisions that differ between two runs of equal size; contacts of a step precede its stops.
+    """List all decisions that differ between two runs, by step; contact decisions precede stop decisions.
 
     Args:
         a, b: the two runs; margins and bounds of contacts are NaN if their states were not kept.
@@ -352,7 +351,7 @@ def cross_decisions(a: BallRun, b: BallRun, last: int | None = None) -> list[Cro
 
 
 def _stops(a: BallRun, b: BallRun, rows: int) -> list[CrossDecision]:
-    """List the solves that took a different number of iterations in the two runs."""
+    """List the time steps at which the solvers of two runs took different numbers of iterations."""
     row, ball = np.nonzero(_unequal_counts(a, b, rows))
     if a.iterations.ndim == b.iterations.ndim == 1:
         ball = np.full(len(row), -1)
@@ -375,7 +374,7 @@ def _stops(a: BallRun, b: BallRun, rows: int) -> list[CrossDecision]:
 
 
 def _solving(run: BallRun, rows: int) -> np.ndarray:
-    """Return which balls the iterations can move: under a shared rule, balls without contact do not move."""
+    """Return whether iterations of a step can move a ball; a projection moves only balls in contact."""
     if isinstance(run.world.contact, Projection):
         return run.contact[:rows]
     return np.ones((rows, run.balls), bool)
@@ -388,10 +387,10 @@ def _at(values: np.ndarray, row: np.ndarray, ball: np.ndarray) -> np.ndarray:
 def overridden(
     run: BallRun, last: int | None = None
 ) -> tuple[Int[np.ndarray, "times"], Float[np.ndarray, "times"]]:
-    """Count imposed decisions that differ from the run's own, and return their distance to the threshold.
+    """Count imposed decisions that differ from the decisions that the run would have made by itself.
 
     Args:
-        run: a run under imposed decisions.
+        run: a run with imposed decisions.
         last: the last step to compare; default all.
 
     Returns:
@@ -421,7 +420,7 @@ def overridden(
 
 
 def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
-    """Return where iteration counts of two runs differ: shape (rows, 1) for a shared rule, else per ball."""
+    """Return where iteration counts differ, shape (rows, 1) for a shared rule, else (rows, balls)."""
     counts = [run.iterations.reshape(run.steps, -1)[:rows] for run in (a, b)]
     differ = counts[0] != counts[1]
     if _counted(a) != _counted(b):
@@ -433,7 +432,7 @@ def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
 
 
 def _counted(run: BallRun) -> str:
-    """Return the name of the quantity in the iteration counts of a run."""
+    """Return the name of the quantity that the iteration counts of a run represent."""
     contact, scheme = run.world.contact, run.world.integrator
     if isinstance(scheme, EventLocated):
         return "impacts"

@@ -1,8 +1,7 @@
-"""One step of a ball: integration schemes and contact models (force, iterated constraint or impact).
+"""A time step of the bouncing ball: integration schemes and contact models.
 
-Every scheme defines the height at which the contact decision is made; the record contains this height. All
-products are rounded before they are added (no fused multiply-add), so numpy in the same dtype gives the same
-bits.
+Every integration scheme defines the height that decides contact; this height is recorded. All products are
+rounded before they are added (no fused multiply-add), so numpy gives the same bits in the same dtype.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ Touching = Bool[Array, "balls"]
 
 
 class BallState(NamedTuple):
-    """A batch of balls between two steps."""
+    """State of all balls between two time steps."""
 
     step: Int[Array, ""]  # number of steps made
     y: Float[Array, "balls"]  # heights above the floor, m, shape (balls,)
@@ -37,7 +36,7 @@ class BallState(NamedTuple):
 
 
 class BallDecisions(NamedTuple):
-    """All decisions of a step; also used to impose all or some decisions on a step."""
+    """All decisions of a time step; decisions can also be imposed on a step in this form."""
 
     # whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1, and a negative
     # number where the step is to decide by itself
@@ -49,7 +48,7 @@ class BallDecisions(NamedTuple):
 
 
 class BallRecord(NamedTuple):
-    """Record of one step: height, contact decision, remaining penetration and iterative solve."""
+    """Record of one time step: height, contact decision, remaining penetration and iterative solve."""
 
     height: Float[Array, "balls"]  # what the contact decision compared with zero, m, shape (balls,)
     contact: Bool[Array, "balls"]  # the decision, shape (balls,)
@@ -59,22 +58,22 @@ class BallRecord(NamedTuple):
 
     @property
     def decisions(self) -> BallDecisions:
-        """Decisions of the step, in the form in which they can be imposed on another step."""
+        """The decisions of the step, which can be imposed on another step."""
         return BallDecisions(self.contact, self.solve.iterations)
 
 
 class Rounding(eqx.Module):
-    """Fence that forces a value, such as a product, to be rounded before use; it stores the zero for this."""
+    """Function that forces the rounding of a value, such as a product, before the value is used."""
 
     zero: Int[Array, ""]  # an integer zero that the compiler must not know (see mdnum.numerics.exact)
 
     def __call__(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return x, rounded to its dtype at this point."""
+        """Return x, and force the compiler to round x to its dtype at this point."""
         return fence(x, self.zero)
 
 
 class Motion(NamedTuple):
-    """Input of a contact model for one step."""
+    """Input of a contact model for one time step."""
 
     # y, v, carried: height, velocity and the acceleration that velocity Verlet carries, in the dtype of
     # arithmetic
@@ -94,7 +93,7 @@ class Motion(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """Result of a step: height, velocity, the acceleration carried to the next step, and the record."""
+    """Result of a time step: height, velocity, acceleration for the next step, and the record."""
 
     y: Balls
     v: Balls
@@ -115,11 +114,11 @@ class Scheme(Protocol):
     h: Any  # time step, s
 
     def fly(self, y: Balls, v: Balls, a: Balls, r: Rounding) -> tuple[Balls, Balls]:
-        """Make one step under a constant acceleration."""
+        """Advance height and velocity by one time step under a constant acceleration."""
         ...
 
     def push(self, pull: Pull, motion: Motion) -> Moved:
-        """Make one step under a contact force; the record does not yet contain the remaining penetration."""
+        """Make one time step with a contact force; the remaining penetration is not recorded yet."""
         ...
 
 
@@ -132,7 +131,7 @@ class _Euler(eqx.Module):
     h: Any
 
     def push(self, pull, motion):
-        """Make one step under a contact force, with the contact decision made at the old height."""
+        """Make one time step with a contact force; the height before the step decides contact."""
         y, v = motion.y, motion.v
         contact = motion.judge(y)
         a = pull(y, v, contact)
@@ -169,7 +168,7 @@ class BallVerlet(eqx.Module):
         return y, r(v + r(half * a))
 
     def push(self, pull, motion):
-        """Make one step, deciding contact at the new height; damping uses the half-step velocity."""
+        """Make one time step; the final height decides contact, and damping uses the half-step velocity."""
         r = motion.rounding
         y, v, half = self._drift(motion.y, motion.v, motion.carried, r)
         contact = motion.judge(y)
@@ -180,8 +179,8 @@ class BallVerlet(eqx.Module):
 class ImplicitMidpoint(eqx.Module):
     """Implicit midpoint scheme, solved by Newton's method. Order 2, stable for any time step.
 
-    The acceleration is that of the middle of the step. Derivatives are implicit: those of the solved
-    equation, not of the iterations.
+    The acceleration is evaluated in the middle of the step. Derivatives are implicit derivatives of the
+    solved equation, not derivatives of the iterations.
     """
 
     h: Any  # time step, s
@@ -194,7 +193,7 @@ class ImplicitMidpoint(eqx.Module):
         return r(y + r(self.h * middle)), r(v + r(self.h * a))
 
     def push(self, pull, motion):
-        """Make one step, with the contact decision made at the height in the middle of the step."""
+        """Make one time step with a contact force; the height in the middle of the step decides contact."""
         y, v, r, judge = motion.y, motion.v, motion.rounding, motion.judge
         half = r(0.5 * self.h)
         quarter = r(half * half)
@@ -243,7 +242,7 @@ class ImplicitMidpoint(eqx.Module):
 
 
 class EventLocated(eqx.Module):
-    """Flight along the exact parabola, with every impact located inside the step. For `Impact` only."""
+    """Exact parabolic flight, in which the time of every impact is located. For `Impact` contacts only."""
 
     h: Any  # time step, s; the trajectory does not depend on it, only where it is looked at
     max_impacts: int = eqx.field(static=True, default=200)  # the cap on impacts inside one step
@@ -263,29 +262,29 @@ class Contact(Protocol):
     """Base class of the contact models."""
 
     def move(self, motion: Motion) -> Moved:
-        """Make one step with this contact model."""
+        """Make one time step with this contact model."""
         ...
 
     def acceleration(self, y: Balls, v: Balls, free: Balls, contact: Touching, r: Rounding) -> Balls:
-        """Return the acceleration of a state, for schemes that carry it to the next step."""
+        """Return the acceleration of a state, for integration schemes that use it in the next step."""
         ...
 
 
 class _Forceless(eqx.Module):
-    """A contact model that resets the state instead of exerting a force."""
+    """A contact model that resets the state and does not exert a force."""
 
     def acceleration(self, y, v, free, contact, r):
-        """Return the acceleration without contact, because there is no contact force."""
+        """Return the acceleration in flight, because this contact model has no contact force."""
         return free
 
 
 class Penalty(eqx.Module):
     """Force k p - damping v on a ball in contact, with p = -y; a smooth contact has a softplus p.
 
-    If a contact is imposed on a step, the force is -k y for either sign of y: the branch continues smoothly
-    beyond its threshold, like an imposed pair force beyond its cutoff.
+    If contact is imposed, the force is -k y for either sign of y: like an imposed pair force beyond its
+    cutoff, the contact force continues smoothly beyond its threshold.
 
-    Source: the soft contact of the discrete element method (Cundall and Strack 1979).
+    Source: soft contact of the discrete element method (Cundall and Strack 1979).
     """
 
     k: Any  # stiffness per mass, 1/s²
@@ -296,18 +295,18 @@ class Penalty(eqx.Module):
     smooth: bool = eqx.field(static=True, default=False)
 
     def depth(self, y, contact):
-        """Return the penetration p, m."""
+        """Return the penetration p of each ball, m."""
         if self.smooth:
             return self.eps * jax.nn.softplus(-y / self.eps)
         return jnp.where(contact, -y, jnp.zeros_like(y))
 
     def acceleration(self, y, v, free, contact, r):
-        """Return the sum of control, gravity, spring and damper."""
+        """Return the total acceleration from control, gravity, spring and damper."""
         drag = jnp.where(contact, r(self.damping * v), jnp.zeros_like(v))
         return r(free + r(r(self.k * self.depth(y, contact)) - drag))
 
     def move(self, motion: Motion) -> Moved:
-        """Make one step of the scheme under this force."""
+        """Make one time step of the integration scheme with this contact force."""
         r = motion.rounding
 
         def pull(y, v, contact):
@@ -318,11 +317,12 @@ class Penalty(eqx.Module):
 
 
 class Projection(_Forceless):
-    """Iteration y ← y + alpha k p, p = max(0, -y), until the rule stops; then clamping and restitution.
+    """Iteration y ← y + alpha k max(0, -y) until the stopping rule holds; then clamping and restitution.
 
-    Each iteration leaves 1 - alpha k of the penetration, so tol is reached after ceil(log(tol / p0) / log(1 -
-    alpha k)) iterations; with alpha k in (1, 2) they overshoot, and at 2 they never end. The floor is at 0
-    for any k: k affects the final height only through the remaining penetration.
+    Each iteration multiplies the penetration by 1 - alpha k, so tol is reached from p0 after ceil(log(tol /
+    p0) / log(1 - alpha k)) iterations. With alpha k between 1 and 2, iterations overshoot; with alpha k = 2,
+    they never end. For any k, the floor is at 0: k affects the final height only through the remaining
+    penetration.
     """
 
     k: Any  # gain, dimensionless; what is learned in place of a stiffness
@@ -334,7 +334,7 @@ class Projection(_Forceless):
     derivative: Any = None
 
     def move(self, motion: Motion) -> Moved:
-        """Make one step: flight, and a projection back to the floor if the flight ends below it."""
+        """Make one time step: flight, and a projection to the floor if the flight ends below the floor."""
         r, policy = motion.rounding, motion.policy
         height, v = motion.integrator.fly(motion.y, motion.v, motion.free, r)
         contact = motion.judge(height)
@@ -372,9 +372,9 @@ class Projection(_Forceless):
 class Impact(_Forceless):
     """Instantaneous impact: v ← -restitution v at the floor.
 
-    With an event-located step the impact happens at its exact time, and the flight continues for the rest of
-    the step. With any other scheme, a ball that passed the floor is put on the floor, and its velocity is
-    reset, at the end of the step: an error of order h in the state and of order 1 in the derivative.
+    With `EventLocated`, the impact takes place at its exact time, and the flight continues for the rest of
+    the step. With any other scheme, a ball below the floor is put on the floor, and its velocity is reset, at
+    the end of the step. This causes an error of order h in the state and of order 1 in the derivative.
     """
 
     restitution: Any = 0.8  # speed after over speed before
@@ -383,7 +383,7 @@ class Impact(_Forceless):
     rest_speed: Any = 1e-6
 
     def move(self, motion: Motion) -> Moved:
-        """Make one step: flight with the impacts of this step."""
+        """Make one time step: flight with all impacts in this step."""
         if isinstance(motion.integrator, EventLocated):
             return self._located(motion, motion.integrator)
         r = motion.rounding
@@ -455,7 +455,7 @@ class Impact(_Forceless):
 
 
 def lowest(y, v, a, time, r):
-    """Return the lowest height of the parabola over the given time: at its end, or at its vertex."""
+    """Return the lowest height of the parabola in the given time, which is at the end or at the vertex."""
     end = r(y + r(time * r(v + r(r(0.5 * time) * a))))
     up = (a > 0) & (v < 0) & (r(-v) < r(a * time))
     safe = jnp.where(up, a, jnp.ones_like(a))
@@ -465,7 +465,7 @@ def lowest(y, v, a, time, r):
 def time_of_impact(y, v, a, r):
     """Return the first time (s) at which the parabola meets the floor; infinite if there is no such time.
 
-    Error: a relative error of a few units roundoff; the form of the root without cancellation is used.
+    The relative error is a few units of roundoff, because the formula for the root avoids cancellation.
     """
     inside = r(r(v * v) - r(r(2.0 * a) * y))
     # the argument is masked as well, so that no derivative is taken where there is no root

@@ -1,8 +1,8 @@
-"""Iterative solvers: stopping rules, the loop that they stop, and derivatives of the loop.
+"""Iterative solvers: the loop, the rules that stop the loop, and derivatives of the loop.
 
-A rule turns the terms of a residual (one per ball) into the quantity that is compared with a threshold. A sum
-over the batch couples independent balls, and its last bits depend on the order of summation; a rule per ball
-has neither disadvantage.
+A stopping rule computes, from the residual of each ball, the quantity that is compared with a threshold. The
+sum over all balls couples independent balls, and its last bits depend on the order of summation; a separate
+rule for each ball avoids both problems.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Map = Callable[[tuple, Any], tuple[tuple, Any]]
 
 
 class Reason(IntEnum):
-    """Reason for which the solver of a step ended."""
+    """Reason why the iterative solver of a time step ended."""
 
     NONE = 0
     TOLERANCE = 1
@@ -44,7 +44,7 @@ class Reason(IntEnum):
 
 
 class Solve(NamedTuple):
-    """Record of one iterative solve; shape () if one rule stops all balls, else (balls,)."""
+    """Record of one iterative solve: arrays of shape () if one rule stops all balls, else (balls,)."""
 
     iterations: Int[Array, "..."]  # how often it went on
     reason: Int[Array, "..."]  # a `Reason`
@@ -66,16 +66,16 @@ class StopRule(Protocol):
     def measure(
         self, terms: Float[Array, "balls"], accumulate: Any, decision: Any, zero: Int[Array, ""]
     ) -> Float[Array, "..."]:
-        """Return the residual, in the dtype of decisions, from terms summed in the dtype of sums."""
+        """Return the residual in the dtype `decision`, from terms summed in the dtype `accumulate`."""
         ...
 
     def threshold(self, first: Float[Array, "..."], iteration: Int[Array, "..."]) -> Float[Array, "..."]:
-        """Return the threshold of the residual at an iteration, given the residual of the first decision."""
+        """Return the threshold at an iteration, given the residual before the first iteration."""
         ...
 
 
 def stops(threshold: Float[Array, "..."], residual: Float[Array, "..."]) -> Bool[Array, "..."]:
-    """Return the stopping decision: True if residual < threshold."""
+    """Return whether the solver stops: True if residual < threshold."""
     return Threshold(threshold, "<", "residual").decide(residual)
 
 
@@ -90,7 +90,7 @@ class _ToleranceRule(eqx.Module):
 
 
 class GlobalSum(_ToleranceRule):
-    """Stopping rule with one residual for the batch: the sum of all terms, in the order of a reduction."""
+    """Stopping rule that compares the sum of the residuals of all balls with a tolerance."""
 
     reduction: Reduction = eqx.field(static=True, default=Pairwise())
 
@@ -99,24 +99,24 @@ class GlobalSum(_ToleranceRule):
 
 
 class PerInstance(_ToleranceRule):
-    """Stopping rule with a residual for each ball: each ball stops independently of the others."""
+    """Stopping rule that compares the residual of each ball separately with a tolerance."""
 
     def measure(self, terms, accumulate, decision, zero):
         return terms.astype(decision)
 
 
 class Maximum(_ToleranceRule):
-    """Stopping rule with one residual for the batch: the largest term, independent of summation order."""
+    """Stopping rule that compares the largest residual of all balls with a tolerance."""
 
     def measure(self, terms, accumulate, decision, zero):
         return jnp.max(terms).astype(decision)
 
 
 class Relative(GlobalSum):
-    """Stopping rule that compares the sum of the residual terms with the tolerance times the first sum."""
+    """Stopping rule that compares the sum of residuals with the tolerance times the initial sum."""
 
     def threshold(self, first, iteration):
-        """Return tol times the first residual, or the smallest normal number if that residual is zero."""
+        """Return tol times the first residual; if this residual is zero, the smallest normal number."""
         scaled = jnp.asarray(self.tol).astype(first.dtype) * first
         # float32's smallest would be 0 in float16, and no residual is below that
         least = jnp.finfo(first.dtype).tiny
@@ -124,14 +124,14 @@ class Relative(GlobalSum):
 
 
 class HysteresisStop(eqx.Module):
-    """Stopping rule with hysteresis: a solve starts only above one threshold and ends below a lower one."""
+    """Stopping rule with hysteresis: a solve starts only above one threshold, and ends below a lower one."""
 
     rule: _ToleranceRule  # says what the residual is, and where a solver that has started stops
     enter: Any  # a residual below this starts no solve; at least the rule's tolerance
 
     @property
     def max_iter(self) -> int:
-        """Largest number of iterations of the inner rule."""
+        """Largest number of iterations of the inner rule `rule`."""
         return self.rule.max_iter
 
     def measure(self, terms, accumulate, decision, zero):
@@ -144,20 +144,20 @@ class HysteresisStop(eqx.Module):
 
 
 class FixedCount(eqx.Module):
-    """Stopping rule with a fixed number of iterations for any residual, so that no decision can flip."""
+    """Stopping rule with a fixed number of iterations, which does not depend on the residual."""
 
     count: int = eqx.field(static=True, default=10)  # iterations; also the cap
 
     @property
     def max_iter(self) -> int:
-        """Number of iterations, which is also the largest number."""
+        """Number of iterations, which is fixed."""
         return self.count
 
     # for the record only
     measure = Maximum.measure
 
     def threshold(self, first, iteration):
-        """Return a threshold that stops the solver exactly when the count is reached."""
+        """Return a threshold at which the solver stops exactly after the fixed number of iterations."""
         reached = jnp.broadcast_to(iteration >= self.count, first.shape)
         return jnp.where(reached, np.inf, -np.inf).astype(first.dtype)
 
@@ -173,7 +173,7 @@ def iterate(
     imposed: Int[Array, "..."] | None = None,
     history: bool = False,
 ) -> tuple[Any, Solve]:
-    """Iterate until the rule or its cap ends the loop, or the imposed number of iterations is reached.
+    """Iterate until the rule stops, or the largest or an imposed number of iterations is reached.
 
     Args:
         rule: stopping rule.
@@ -182,11 +182,11 @@ def iterate(
         terms: function that returns the terms of the residual, one per ball.
         policy: dtypes of sums and decisions.
         zero: zero for fenced sums, unknown to the compiler.
-        imposed: number of iterations that replaces the rule's own; if negative, the rule decides.
+        imposed: number of iterations to make instead of applying the rule; the rule is applied if negative.
         history: whether to keep the residual of every decision.
 
     Returns:
-        the final value, and the record of the solve.
+        the final value of the iteration, and the record of the solve.
     """
     accumulate, decision = policy.dtype("accumulate"), policy.dtype("decision")
 
@@ -240,26 +240,26 @@ def iterate(
 
 
 def no_solve(dtype: Any) -> Solve:
-    """Create the record of a step without a solver."""
+    """Create the record of a time step that needs no iterative solver."""
     none, nan = jnp.zeros((), jnp.int32), jnp.asarray(jnp.nan, dtype)
     return Solve(none, jnp.asarray(Reason.NONE.value, jnp.int8), nan, nan, nan, jnp.zeros(0, dtype))
 
 
 def elementwise(function: Map) -> Map:
-    """Make an elementwise function with a while_loop differentiable in forward and reverse mode.
+    """Make an elementwise function that contains a while_loop differentiable in forward and reverse mode.
 
-    A `while_loop` has no reverse mode in JAX, because its tape would have no fixed size. But a function that
-    treats each ball separately has a diagonal Jacobian, whatever ends its loop: a few tangents propagated in
-    the same loop give all entries, and nothing is stored per iteration. The derivative is that of the actual
-    iterations, with every decision held fixed. The record and the inputs in `rest` carry no derivative.
+    JAX has no reverse mode for a `while_loop`, because the required memory is not known in advance. However,
+    a function that treats each ball separately has a diagonal Jacobian. A few tangents that are propagated in
+    the same loop give all entries, and no iteration is stored. The result is the derivative of the actual
+    iterations, with every decision fixed. The record and the inputs in `rest` have no derivative.
 
     Args:
         function: a function whose outputs for ball b depend only on the inputs for ball b (and on `rest`).
 
     Returns:
-        the same function, forward and reverse differentiable.
+        the same function, differentiable in forward and reverse mode.
 
-    Error: tangents are propagated in the dtype of the inputs, with one rounding per operation.
+        Error: tangents are propagated in the dtype of the inputs, with one rounding error per operation.
     """
 
     @jax.custom_jvp

@@ -1,4 +1,4 @@
-"""The bouncing ball as a program that separates making decisions from acting on them."""
+"""Model of the bouncing ball, in which decisions (contact, stop) can be recorded, replaced and imposed."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ _MOST_ITERATIONS = 2**31 - 1  # iterations are counted in 32 bits
 
 
 class World(eqx.Module):
-    """Balls above a floor at height 0: everything that a step depends on, except the state.
+    """Model of balls above a floor at height 0: all settings of a time step except the state.
 
-    `World.create` makes a world, checks ranges and casts every number to its role's dtype. Pass a world to
-    jitted code as an argument, not by closure: a compiler may remove operations with a known zero.
+    `World.create` checks ranges and casts every number to the dtype of its role. Pass a `World` to jitted
+    code as an argument, not by closure, because the compiler may remove operations with a known zero.
 
     Attributes:
         contact: contact model of the floor.
         integrator: integration scheme.
-        gravity: m/s², downward positive.
+        gravity: gravitational acceleration, m/s², downward positive.
         control: additional acceleration in each step, m/s², shape (steps,) or (steps, balls); or None.
-        lift: height, m, at which a contact that began below 0 ends; None for no hysteresis.
-        rounding: fence that forces intermediate rounding.
+        lift: height, m, above which a contact that began below 0 ends; None for no hysteresis.
+        rounding: function that forces the rounding of intermediate results.
         policy: dtype by role.
     """
 
@@ -72,7 +72,7 @@ class World(eqx.Module):
         policy: RolePrecision | None = None,
         hysteresis: float | None = None,
     ) -> World:
-        """Create a world, check its numbers and cast them to their dtypes.
+        """Create a bouncing-ball model: check all numbers, and cast them to the dtypes of their roles.
 
         Args:
             contact, integrator: contact model and integration scheme with plain numbers as parameters.
@@ -105,12 +105,12 @@ class World(eqx.Module):
         return None
 
     def has(self, name: str) -> bool:
-        """Return True if this world has a parameter of this name."""
+        """Return True if this model has a parameter of this name."""
         return self._place(name) is not None
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters of this world."""
+        """Names of the parameters of this bouncing-ball model."""
         return tuple(name for name in PARAMETERS if self.has(name))
 
     def _known(self, name: str) -> str:
@@ -125,15 +125,15 @@ class World(eqx.Module):
         """Return the value of a parameter.
 
         Raises:
-            InputError: this world has no such parameter.
+            InputError: the model has no such parameter.
         """
         return attrgetter(self._known(name))(self)
 
     def with_values(self, values: Mapping[str, Any]) -> World:
-        """Return the world with other parameter values; they are not checked, so they may be traced.
+        """Return the model with other parameter values; values are not checked, so jax tracers are allowed.
 
         Raises:
-            InputError: this world has no such parameter.
+            InputError: the model has no such parameter.
         """
         world = self
         for name, value in values.items():
@@ -146,7 +146,7 @@ class World(eqx.Module):
     # -- decide ----------------------------------------------------------------------------------------
 
     def touches(self, height: Balls, before: Bool[Array, "balls"]) -> Bool[Array, "balls"]:
-        """Decide contact: height < 0; with hysteresis, a contact continues until height > lift."""
+        """Return whether a ball is in contact: height < 0; with hysteresis, until height > lift."""
         height = height.astype(self.policy.dtype("decision"))
         enter = Threshold(jnp.zeros((), height.dtype), "<", "height")
         if self.lift is None:
@@ -157,7 +157,7 @@ class World(eqx.Module):
     # -- act -------------------------------------------------------------------------------------------
 
     def start(self, y: Any, v: Any = 0.0) -> BallState:
-        """Create the state at step 0.
+        """Create the state of all balls at step 0.
 
         Args:
             y: heights, m, a number or shape (balls,).
@@ -168,10 +168,10 @@ class World(eqx.Module):
     def advance(
         self, state: BallState, *, imposed: BallDecisions | None = None, history: bool = False
     ) -> tuple[BallState, BallRecord]:
-        """Make one step: decide which balls touch, and act on these decisions.
+        """Make one time step: decide which balls touch the floor, and compute heights and velocities.
 
         Args:
-            imposed: decisions that replace all or some of the world's own (see `BallDecisions`).
+            imposed: decisions that replace all or some of the model's own (see `BallDecisions`).
             history: whether a solver records the residual of every decision.
 
         Returns:
@@ -209,7 +209,7 @@ class World(eqx.Module):
         return lambda height: jnp.where(contact < 0, self.touches(height, state.touching), contact > 0)
 
     def free(self, step: Int[Array, ""], shape: tuple[int, ...]) -> Balls:
-        """Return the acceleration without contact (control minus gravity, m/s²) of each ball in a step."""
+        """Return the acceleration of each ball without contact (control minus gravity) in a step, m/s²."""
         free = -self.gravity
         if self.control is not None:
             # a control that ends before the run does stays at its last value
@@ -238,7 +238,7 @@ def _start(world: World, y: Array, v: Array) -> BallState:
 
 
 def _check(world: World) -> None:
-    """Raise an error if a number is out of range or the components are incompatible."""
+    """Raise an error if a number is out of range, or if contact and integration scheme are incompatible."""
     contact: Any = world.contact
     integrator: Any = world.integrator
     for name in world.parameters:
@@ -267,7 +267,7 @@ def _check(world: World) -> None:
 
 
 def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
-    """Raise an error if a stopping rule is out of range or its tolerance cannot be met in these dtypes."""
+    """Raise an error if a stopping rule is invalid, or if its tolerance cannot be met in these dtypes."""
     _count("max_iter", rule.max_iter)
     if isinstance(rule, stopping.FixedCount):
         return
