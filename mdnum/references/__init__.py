@@ -1,6 +1,6 @@
-"""Reference implementations by ASE, other neighbor searches and plain numpy, and mdnum as an ASE calculator.
+"""Reference results from ASE, other neighbor searches and plain numpy, and mdnum as an ASE calculator.
 
-Every module is imported at first use, since ASE, MDAnalysis and jax each take a second or more to import.
+Modules are imported at first use, since importing ASE, MDAnalysis or jax takes a second or more.
 """
 
 from __future__ import annotations

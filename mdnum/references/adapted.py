@@ -1,4 +1,4 @@
-"""ASE's calculators, adapted to a simulation's cutoff, species and neighbor list."""
+"""ASE calculators, adapted to the cutoff, the species and the neighbor list of a simulation."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class StepAtCutoff(ClassicalCalculator):
     """An ASE calculator with a constant energy added for each pair inside the cutoff.
 
     Args:
-        inner: the calculator.
-        form: defines which pairs are inside.
-        step: energy added per pair.
+        inner: the ASE calculator.
+        form: pair interaction that defines which pairs are inside the cutoff.
+        step: energy added per pair, energy unit of `inner`.
     """
 
     def __init__(self, inner: Calculator, form: PairForm, step: float, **kwargs: Any):
@@ -46,9 +46,9 @@ class SpeciesSum(ClassicalCalculator):
     """A mixture of single-species calculators; the a-b energy is that of all pairs minus a-a and b-b pairs.
 
     Args:
-        parts: (calculator, species a, species b) for every pair of species present.
-    Error: the subtraction costs the digits by which the sum over like pairs exceeds that over unlike pairs;
-        about one digit for the mixtures shipped.
+        parts: (calculator, species a, species b) for every pair of species in the structure.
+    Error: the subtraction loses the digits by which the sum over like pairs exceeds the sum over unlike
+        pairs; about one digit for the mixtures of mdnum.
     """
 
     def __init__(self, parts: Sequence[tuple[Calculator, str, str]], **kwargs: Any):
@@ -87,7 +87,7 @@ def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, An
 
 
 def evaluate(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
-    """Return energy, forces, stress (3, 3) and atomic energies; None for unavailable quantities."""
+    """Return energy, forces, stress (3, 3) and atomic energies of a structure; None for missing values."""
     # ASE gives a stress for a molecule in a box, of the box's volume
     results = _results(calculator, atoms, atoms.cell.rank == 3 and bool(atoms.pbc.all()))
     if "stress" in results:
@@ -102,7 +102,7 @@ def lennard_jones(form: PairForm, **options: Any) -> Calculator:
 
 
 def _inside_list(form: PairForm) -> Callable[..., Any]:
-    """Return a neighbor list for ASE's MorsePotential with only the pairs inside the system file's cutoff."""
+    """Return a neighbor list for ASE's MorsePotential with only the pairs inside the file's cutoff."""
 
     def listed(quantities: str, atoms: Atoms, cutoff: float) -> tuple[ndarray, ...]:
         edges = edges_of(atoms, form.r_cut)
@@ -122,7 +122,7 @@ def morse(form: PairForm, begin: float, end: float) -> Calculator:
 
 
 def short_listed_eam(file: Path) -> Calculator:
-    """Return ASE's EAM with a shorter neighbor list; ASE's reaches 2 (cutoff + skin) and takes minutes."""
+    """Return ASE's EAM with a neighbor list shorter than ASE's 2 (cutoff + skin), which takes minutes."""
     from ase.calculators.eam import EAM
     from ase.neighborlist import NeighborList
 
@@ -139,10 +139,10 @@ def short_listed_eam(file: Path) -> Calculator:
 
 
 class EnergyOnNeighborList(ClassicalCalculator):
-    """ASE calculator for an energy function on ASE's neighbor list, compiled separately.
+    """ASE calculator for an energy function, compiled separately and evaluated on ASE's neighbor list.
 
-    This reference tests neighbor lists, cutoff decisions and the rollout, but not the energy function and its
-    derivatives, which jax evaluates here too.
+    This reference tests neighbor lists, cutoff decisions and time steps, but neither the energy function nor
+    its derivatives, since jax also evaluates these for the reference.
     """
 
     implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012

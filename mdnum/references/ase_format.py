@@ -1,6 +1,6 @@
-"""Run folders of mdnum as a file format of ASE, which imports this module together with its own formats.
+"""The file format "mdnum" of ASE, for run folders; ASE imports this module together with its own formats.
 
-The format is not part of `ase_plugin`, because ASE's plugins import its formats while that module is still
+The format is not in `ase_plugin`, because the plugins of ASE import its formats while that module is still
 empty.
 """
 

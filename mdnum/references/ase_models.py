@@ -1,6 +1,6 @@
-"""Choose the reference calculator for a simulation, which is the corresponding ASE class or else plain numpy.
+"""Choose the reference calculator for a simulation: the corresponding ASE class, or else plain numpy.
 
-Differences between the two codes, and the conversions that remove them:
+Differences between mdnum and ASE, with the conversions that remove these differences:
 
 | system file | ASE | conversion |
 |---|---|---|
@@ -15,8 +15,8 @@ Differences between the two codes, and the conversions that remove them:
 | an energy function | no ASE class | the function on ASE's neighbor list, and labeled so |
 | all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), and labeled so |
 
-ASE's LennardJones keeps a pair at r == rc (r² > rc² is dropped); its neighbor lists do not (r < rc). In the
-shifted and switched forms a pair at r == rc has no energy, so only its force can differ.
+LennardJones of ASE keeps a pair at r == rc (only r² > rc² is dropped); ASE's neighbor lists do not (r < rc).
+The energy of a pair at r == rc is zero for shifted and switched cutoffs, so only its force can differ.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ ITSELF, ENERGY = (
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference calculator, with its label and the conversions it needs."""
+    """A reference calculator, with its label and the conversions applied to its results."""
 
     label: str  # what it is, for people: "ASE LennardJones" or "plain numpy on ASE's neighbor list"
     is_ase: bool  # whether the numbers come from a class of ASE
@@ -71,10 +71,10 @@ class Reference:
 
 
 def reference(subject: Simulation | System) -> Reference:
-    """Return the best available reference for a simulation, an ASE class if there is one, else plain numpy.
+    """Return the best available reference for a simulation: an ASE class if there is one, else plain numpy.
 
     Args:
-        subject: a `Simulation`; or a `System`, also one whose box is too small for its skin.
+        subject: a `Simulation`, or a `System`, whose box may be too small for its skin.
     """
     simulation = _objects(subject)
     species, model = simulation.symbols, simulation.model
@@ -101,7 +101,7 @@ def reference(subject: Simulation | System) -> Reference:
 
 
 def independent(subject: Simulation | System) -> Reference:
-    """Return a plain-numpy reference for any potential except eam: a third calculation, next to ASE."""
+    """Return a plain-numpy reference, in addition to ASE, for any potential except eam."""
     simulation = _objects(subject)
     model, compare = simulation.model, simulation.decider.compare
     if isinstance(model, EnergyFunction):

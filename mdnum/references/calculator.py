@@ -31,7 +31,7 @@ _SAID = {"potential", "cutoff", "terms", "units"}
 
 
 class _Recipe(NamedTuple):
-    """Recipe for building a simulation of given atoms."""
+    """Recipe that builds a simulation for given atoms."""
 
     make: Callable[[Atoms], Simulation]  # without a skin: the evaluator keeps what the box has room for
     skin: float  # length
@@ -48,7 +48,7 @@ def _of_system(system: Simulation | System) -> _Recipe:
 
 
 def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
-    """Return a simulation recipe for potential objects, or for the tables of a system file."""
+    """Return a recipe for simulations with potential objects, or with the tables of a system file."""
     if isinstance(potential, Mapping):
         made = interaction(potential, cutoff)
         end, model = made.cutoff, lambda atoms: model_of(made, atoms, Path())
@@ -74,22 +74,22 @@ def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
 
 
 class MdnumCalculator(ClassicalCalculator):
-    """ASE calculator that evaluates an mdnum potential.
+    """ASE calculator that evaluates a potential with mdnum.
 
     Use this calculator to relax structures with ase.optimize, to compute stress and equations of state, and
-    to compare mdnum's forces with ASE's own tools. A Verlet list is kept between calls until motion and box
-    strain exceed what its skin allows; for molecular dynamics use mdnum's rollout, which records its flips.
+    to compare mdnum's forces with ASE's own tools. A Verlet list is kept between calls as long as motion and
+    box strain do not exceed its skin; for molecular dynamics use mdnum's rollout, which records its flips.
 
     Args:
-        system: a `Simulation`, a `System`, or the name or path of a system file; the atoms may differ from
-            it.
+        system: a `Simulation`, a `System`, or the name or path of a system file; the evaluated atoms may
+            differ from those of the system.
         overrides: keys of the system file to change, as `--set` does.
         potential, cutoff: instead of a system: objects as for `mdnum.simulation`, or the tables of a system
             file as dictionaries.
         units: "metal" (Å, eV) or "lj".
     Raises:
-        InputError: neither or both of system and potential; invalid tables. At the first use: species without
-            constants, a cell narrower than two cutoffs, a coordinate that is not finite.
+        InputError: both system and potential are given, or neither; or the tables are invalid. At the first
+            use: species without constants, a cell narrower than two cutoffs, a coordinate that is not finite.
         NumericalError: an energy or a force that is not finite, such as that of two atoms at one place.
         TypeError: an unknown keyword.
 
@@ -129,11 +129,11 @@ class MdnumCalculator(ClassicalCalculator):
 
     @property
     def simulation(self) -> Simulation | None:
-        """The simulation evaluated last, or None before the first call."""
+        """The simulation evaluated by the last call; None before the first call."""
         return None if self._evaluator is None else self._evaluator.simulation
 
     def set(self, **changes: Any) -> dict[str, Any]:
-        """Reject any change of parameters; another potential needs another calculator.
+        """Reject any change of parameters; create another calculator for another potential.
 
         Raises:
             TypeError: a parameter was given.
@@ -168,7 +168,7 @@ class MdnumCalculator(ClassicalCalculator):
         return results
 
     def _made_for(self, atoms: Atoms) -> Evaluator:
-        """Return an evaluator for the given atoms, at any positions and in any cell."""
+        """Return an evaluator for the given atoms, which accepts any positions and any cell."""
         # only what the forces depend on: constraints and the like stay with ASE
         bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
         if self._given is not None:

@@ -63,12 +63,12 @@ class FrameComparison:
 
     @property
     def energy_roundings(self) -> float:
-        """Energy difference in units of the expected rounding error."""
+        """Energy difference between mdnum and the reference, in units of the expected rounding error."""
         return _over(abs(self.energy - self.energy_reference), self.energy_expected)
 
     @property
     def force_roundings(self) -> float:
-        """Largest force difference in units of the expected rounding error."""
+        """Largest force difference between mdnum and the reference, in units of expected rounding error."""
         return _over(self.force_max, self.force_expected)
 
 
@@ -92,7 +92,7 @@ class EnergyReport:
 
     @property
     def worst(self) -> dict[str, Any]:
-        """Largest deviations over all frames, under the names used by `ase` in summary.json."""
+        """Largest deviations over all frames, under the names in the entry `ase` of summary.json."""
         stress = [frame.stress_max for frame in self.frames if frame.stress_max is not None]
         names = ("energy_rel", "force_max", "force_scale")
         worst = {name: max(getattr(frame, name) for frame in self.frames) for name in names}
@@ -100,7 +100,7 @@ class EnergyReport:
         return worst if self.sampled is None else {**worst, "sampled": self.sampled}
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return one table row per compared frame."""
+        """Return a table row for each compared frame."""
         narrow = {"energy, roundings": "energy_roundings", "force, roundings": "force_roundings"}
         columns = {
             "energy": "energy", "energy, relative": "energy_rel", "force, largest": "force_max",
@@ -122,19 +122,19 @@ def check_energy(
     judge: Reference | None = None,
     lammps: bool = False,
 ) -> EnergyReport:
-    """Compare energies, forces and stresses with those of an ASE calculator (or of a plain numpy
-    implementation where ASE has no calculator for the potential).
+    """Compare energies, forces and stresses with those of an ASE calculator (or of plain numpy if ASE has no
+    calculator for the potential).
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
         frames: positions and cells to compare, by name or in order, or an iterator of names and frames;
-            default the initial frame and a later one, since the forces of a perfect crystal vanish.
+            default the initial frame and a later one, since forces vanish in a perfect crystal.
         judge: reference to use instead of the one chosen by `ase_models.reference`.
-        lammps: also evaluate a user's pair function by LAMMPS, if installed; the results must agree.
+        lammps: also evaluate a user's pair function with LAMMPS, if installed; the results must agree.
 
-    For a pair potential with more than `SAMPLED` atoms, only energies and forces of a few hundred atoms are
-    compared, chosen at random places by `neighborhoods`; for these atoms the comparison is exact. Each frame
-    has its own random places, so that two frames cover twice as many atoms.
+    For a pair potential with more than `SAMPLED` atoms, the energies and forces of only a few hundred atoms
+    are compared, in clusters at random positions (`neighborhoods`); for these atoms the comparison is exact.
+    Each frame has different random positions, so that two frames cover twice as many atoms.
 
     Raises:
         InputError: the system cannot be built.
@@ -174,13 +174,13 @@ def check_energy(
 
 
 def narrowest(simulation: Simulation, roles: Sequence[str] = ("state", "force", "accumulate")) -> str:
-    """Return the narrowest float type of several roles, by default those of energies and forces."""
+    """Return the narrowest float type of several roles, by default of the roles energy and force."""
     kinds = (carrier(getattr(simulation.policy, role)) for role in roles)
     return max(map(str, kinds), key=unit_roundoff)
 
 
 def _places(simulation: Simulation) -> str:
-    """Return the narrowest float type of positions; 16-bit forces use the decision's displacements."""
+    """Return the narrowest float type of positions; for 16-bit forces, that of state and decision only."""
     wide = simulation.policy.force in WIDE
     return narrowest(simulation) if wide else narrowest(simulation, ("state", "decision"))
 
@@ -203,7 +203,7 @@ def _named(frames: Any, simulation: Any) -> Iterable[tuple[str, Atoms]]:
 
 
 def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Evaluation]:
-    """Return a frame rounded to the precision of the state, and mdnum's evaluation of it."""
+    """Round a frame to the precision of the state; return the rounded frame and mdnum's results for it."""
     positions = atoms.get_positions()
     if simulation.policy.state == "float32":
         positions = positions.astype(np.float32).astype(np.float64)  # both are to see what the state can hold
@@ -212,7 +212,7 @@ def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Eval
 
 
 def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:
-    """Return the evaluation of a cluster's first atoms in the whole system, with the cluster's pairs."""
+    """Return mdnum's results for the first atoms of a cluster, as part of the whole system."""
     edges = edges_of(cluster, r_cut)
     once = edges.i < edges.j
     pairs = edges.i[once], edges.j[once], edges.r[once]
@@ -266,13 +266,13 @@ def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
 
 
 def _over(difference: float, scale: float) -> float:
-    """Return difference / scale, and 0 for a zero difference at any scale."""
+    """Return difference / scale; a zero difference gives 0 for any scale."""
     return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
 
 
 @dataclass(frozen=True)
 class _Scales:
-    """Scales by which energy, force and stress differences are divided.
+    """Scales by which differences of energy, force and stress are divided.
 
     energy: sum of |energies|; force: largest force on an atom or along a pair; stress: sum of absolute virial
     terms over the volume; *_expected: differences expected from rounding.
@@ -287,7 +287,7 @@ class _Scales:
 
     @classmethod
     def of(cls, simulation: Simulation, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]) -> _Scales:
-        """Return the scales of a frame, summed over pairs for a pair potential, else from the totals."""
+        """Return the scales of a frame: sums over pairs for a pair potential, else values from the totals."""
         unit, places = unit_roundoff(narrowest(simulation)), unit_roundoff(_places(simulation))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
@@ -331,7 +331,7 @@ class _Scales:
 
 
 def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
-    """Return the number of pairs within rounding error of their cutoff, inside or outside."""
+    """Return the number of pairs whose distance is within rounding error of the cutoff, on either side."""
     bound = rounding_bound(atoms.get_positions(), np.asarray(atoms.cell), model.reach, unit_roundoff=unit)
     # as the judges asked for it, where that has the room: the list is made once
     edges = edges_of(atoms, model.reach + (bound if bound > SLACK / 2 * model.reach else 0.0))
@@ -344,7 +344,7 @@ def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
 
 
 def _rollout(simulation: Any, steps: int) -> Iterator[tuple[ndarray, ndarray, float]]:
-    """Yield unwrapped positions, velocities (atoms, 3) and potential energy of every step from 0 on."""
+    """Yield unwrapped positions, velocities (atoms, 3) and potential energy at every step, from step 0 on."""
     from mdnum.rollout.engine import Engine, unwrapped
 
     for segment in Engine(simulation, steps).segments():
@@ -385,7 +385,7 @@ class DynamicsReport:
     ok: bool  # within tolerance at the last step
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return table rows for about ten of the time steps."""
+        """Return table rows for about ten of the compared time steps."""
         shown = np.unique(np.linspace(0, self.steps, 11).round().astype(int)).tolist()
         return [
             {
@@ -397,14 +397,14 @@ class DynamicsReport:
 
 
 def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
-    """Compare a rollout with ASE's velocity Verlet, from the same positions and velocities.
+    """Compare a run with ASE's velocity Verlet, starting from the same positions and velocities.
 
     A thermostat is switched off. A hard cutoff gives the same forces as ASE's shifted potential, so the
-    trajectories must agree although the zeros of energy differ.
+    trajectories must agree although the energies differ by constants.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
-        judge: source of the forces; default ASE, or plain numpy where ASE has no calculator or takes minutes.
+        judge: calculator of the forces; default ASE, or plain numpy if ASE has none or takes minutes.
     """
     # its optimizers come with it, and a run that is only compared needs none
     from ase.md.verlet import VelocityVerlet
@@ -436,7 +436,7 @@ def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = 
 
 
 def _forces(simulation: Simulation) -> Reference:
-    """Return ASE's class as the reference if it is fast enough; Tersoff and mixtures use plain numpy."""
+    """Return ASE's class as the reference if it is fast enough; for Tersoff and mixtures, plain numpy."""
     judge = reference(simulation)
     slow = isinstance(simulation.model, Tersoff) or len(simulation.symbols) > 1
     return independent(simulation) if slow and not isinstance(simulation.potential, EmbeddedAtom) else judge
@@ -448,7 +448,7 @@ def _sudden(position: Sequence[float], floor: float) -> int | None:
 
 
 def _growth(position: Sequence[float]) -> float:
-    """Return the growth factor of the deviation per step, from a line fit to its logarithm."""
+    """Return the factor by which the deviation grows per step, from a line fitted to its logarithm."""
     tail = np.array(position[len(position) // 2 :])
     if len(tail) < 3 or not (tail > 0).all():
         return 1.0
@@ -463,20 +463,20 @@ PLACES, ATOMS = 8, 32  # places at random, and atoms nearest to each whose energ
 def neighborhoods(
     atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
 ) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
-    """Yield free clusters at random places: each a group of atoms with all atoms within reach of the group.
+    """Yield free clusters at random positions: each is a group of atoms plus all atoms within `reach` of it.
 
-    For a pair potential of that reach, the chosen atoms have the same energies and forces in the cluster as
-    in the whole system, so a difference in the cluster is a difference in the whole. Neighbors are found by
-    distance among the atoms and their images, without mdnum's cell lists.
+    For a pair potential with range `reach`, the atoms of the group have the same energies and forces in the
+    cluster as in the whole system, so a difference in the cluster is a difference in the whole system.
+    Neighbors are found from distances between atoms and images, without mdnum's cell lists.
 
     Args:
         atoms: the whole system, with any cell; coordinates may lie outside the cell.
         reach: largest range of an interaction, length.
         places, count: number of groups, and largest number of atoms in each, all within reach of its center.
-        seed: random seed for the centers, each an atom.
+        seed: random seed for the centers; each center is an atom.
 
     Yields:
-        (a cluster without periodicity, whose first atoms are the chosen ones; their indices in the whole).
+        (a nonperiodic cluster, which begins with the group; indices of the group in the whole system).
     """
     x, origin = with_images(atoms, reach)
     # coordinates as they are after a lattice vector is added carry rounding: a little more does no harm

@@ -1,11 +1,11 @@
-"""Energies, forces and stress in plain numpy on ASE's neighbor list, from the formulas alone.
+"""Energies, forces and stress in plain numpy on ASE's neighbor list, computed from the formulas alone.
 
-This code is independent of the code used in a run (each cutoff has its own numpy `reference`): it serves as
-the reference if ASE has no class for a potential or a cutoff, and as a third calculation if ASE has one.
+This code is independent of the code used in a run (each cutoff has its own numpy `reference`). It is the
+reference if ASE has no class for a potential or a cutoff, and an additional reference otherwise.
 
 A model takes directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
-the total energy with respect to every d. Forces and stress follow from this gradient g in one function, by
-F_i += g, F_j -= g, stress = sum(g outer d) / volume.
+the total energy with respect to every d. Forces and stress are computed from this gradient g: F_i += g, F_j
+-= g, stress = sum(g outer d) / volume.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from mdnum.md.potentials import Channels, CutPotential, LennardJones, Morse, Pai
 
 @dataclass(frozen=True)
 class Edges:
-    """A full neighbor list, with both directions of every pair."""
+    """A full neighbor list, with each pair in both directions."""
 
     symbols: ndarray  # chemical symbol of each atom
     i: ndarray  # atom an edge starts from, ascending
@@ -47,8 +47,8 @@ def edges_of(atoms: Atoms, reach: float) -> Edges:
     """Return the pairs within slightly more than `reach`, in both directions, from ASE's neighbor list.
 
     ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster at 500 atoms than its
-    neighbor_list. ASE's comparison is strict (r < reach), while the model decides whether the cutoff itself
-    is inside, so the list reaches slightly farther, by SLACK.
+    neighbor_list. ASE lists only pairs with r < reach, while the model decides whether r = reach is inside,
+    so the list reaches slightly farther, by SLACK.
     """
     arrays = (atoms.positions, atoms.numbers, atoms.cell.array, atoms.pbc)
     key = (*(array.tobytes() for array in arrays), reach)
@@ -80,12 +80,12 @@ def _edges(atoms: Atoms, reach: float) -> Edges:
 
 
 class Model(ABC):
-    """Interaction model that `OnNeighborList` evaluates."""
+    """Interaction model that `OnNeighborList` can evaluate."""
 
     @property
     @abstractmethod
     def reach(self) -> float:
-        """Length beyond which an edge (a directed pair) has no effect."""
+        """Length beyond which an edge (a directed pair) does not contribute to the energy."""
 
     @abstractmethod
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
@@ -93,7 +93,7 @@ class Model(ABC):
 
 
 class ClassicalCalculator(Calculator):
-    """An ASE calculator for energies, forces and stress without electrons: the free energy is the energy."""
+    """An ASE calculator for energies, forces and stress; energy and free energy are equal."""
 
     implemented_properties = ["energy", "energies", "free_energy", "forces", "stress"]  # noqa: RUF012
     nolabel = True
@@ -105,7 +105,7 @@ class ClassicalCalculator(Calculator):
         self.results = {"free_energy": results["energy"], **results}
 
     def evaluated(self, atoms: Atoms, changes: Sequence[str]) -> dict[str, Any]:
-        """Return energy, forces and stress of a structure, given its changes since the last call."""
+        """Return energy, forces and stress of a structure; `changes` are the changes since the last call."""
         raise NotImplementedError
 
 
@@ -131,7 +131,7 @@ class OnNeighborList(ClassicalCalculator):
 
 @dataclass(frozen=True)
 class PairForm:
-    """Interaction of one pair of species."""
+    """Interaction between two species."""
 
     species: tuple[str, str]  # the two symbols
     potential: PairPotential  # of all pairs
@@ -142,34 +142,34 @@ class PairForm:
     compare: str  # what inside means: "r2 <", "r2 <=", "r <" or "r <="
 
     def inside(self, distance: Float[ndarray, "pairs"]) -> Bool[ndarray, "pairs"]:
-        """Return whether distances are inside the cutoff, by the comparison of the system file."""
+        """Return whether distances are inside the cutoff, by the comparison (< or <=) in the system file."""
         space, comparison = self.compare.split()
         quantity, threshold = (distance**2, self.r_cut**2) if space == "r2" else (distance, self.r_cut)
         return quantity <= threshold if comparison == "<=" else quantity < threshold
 
     def bare(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
-        """Return u(r) and u'(r) without a cutoff."""
+        """Return the pair energy u(r) and its derivative u'(r) without a cutoff."""
         # by class: a function of somebody's own may be called like one of them
         return _BARE.get(type(self.potential), self.potential.reference)(r, **self.constants)
 
     def __call__(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
-        """Return the cut-off energy of pairs inside, and its derivative with respect to r."""
+        """Return the energies of pairs with the cutoff applied, and their derivatives with respect to r."""
         at = AtCutoff(self.r_cut, self.r_onset, *self.at_cutoff)
         return CUTOFFS.parse(self.cutoff).reference(r, *self.bare(r), at)
 
     @property
     def at_cutoff(self) -> tuple[float, float]:
-        """Values u and u' of the bare potential at the cutoff."""
+        """Energy u and derivative u' of the potential without cutoff, at the cutoff distance."""
         u, du = self.bare(np.array([self.r_cut]))
         return float(u[0]), float(du[0])
 
 
 def pair_forms(model: CutPotential, symbols: Sequence[str], compare: str) -> dict[tuple[str, str], PairForm]:
-    """Return the interaction of every two species, in both orders.
+    """Return the interaction for every two species, in both orders.
 
     Args:
         symbols: symbols of the species, sorted.
-        compare: comparison that defines which pairs are inside, as in a system file.
+        compare: comparison (< or <=) that defines which pairs are inside, as in a system file.
     """
     forms = {}
     for kind, (a, b) in enumerate(combinations_with_replacement(symbols, 2)):
@@ -217,7 +217,7 @@ class PairModel(Model):
 
     @classmethod
     def of(cls, model: CutPotential | Channels, symbols: Sequence[str], compare: str) -> PairModel:
-        """Return the model of a cut potential, with arguments as for `pair_forms`."""
+        """Return the model of a potential with cutoff; arguments as for `pair_forms`."""
         parts = model.terms.values()
         weights = [np.asarray(part.weights[0]) if part.weights else None for part in parts]
         forms = [pair_forms(part, symbols, compare) for part in parts]
@@ -228,7 +228,7 @@ class PairModel(Model):
         return max(form.r_cut for forms, _ in self.terms for form in forms.values())
 
     def groups(self, edges: Edges) -> Iterator[tuple[PairForm, ndarray, Any]]:
-        """Yield the edges inside the cutoff for each form: (form, edge indices, factors)."""
+        """Yield the edges inside the cutoff for each interaction: (interaction, edge indices, factors)."""
         first, second = edges.symbols[edges.i], edges.symbols[edges.j]
         for forms, weights in self.terms:
             for a, b in product(sorted(set(edges.symbols.tolist())), repeat=2):
@@ -261,7 +261,7 @@ def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
 
 
 def _cosines(edges: Edges, e: ndarray, f: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Return cosines of the angles between edges e and f, with gradients with respect to d_e and d_f."""
+    """Return cosines of the angles between edges e and f, and gradients with respect to d_e and d_f."""
     re, rf = edges.r[e], edges.r[f]
     ne, nf = edges.d[e] / re[:, None], edges.d[f] / rf[:, None]
     cosine = np.einsum("ta,ta->t", ne, nf)
@@ -274,7 +274,7 @@ def _add_rows(target: ndarray, rows: ndarray, values: ndarray) -> None:
 
 
 class _OneSpecies(Model):
-    """A model that includes all edges within its reach, regardless of species."""
+    """A model that includes all edges shorter than its reach, whatever the species."""
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:

@@ -1,7 +1,7 @@
 """LAMMPS as a reference for pair functions, evaluated and differentiated by its pair style `lepton`.
 
-The function traced by jax is written as an expression that LAMMPS parses and differentiates symbolically, so
-pairs, sums, energies and derivatives are computed by an independent program.
+The function traced by jax is translated to an expression that LAMMPS parses and differentiates symbolically,
+so an independent program computes pairs, sums, energies and derivatives.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _LARGEST = 100_000
 
 
 class Untranslated(Exception):
-    """Raised for an operation that lepton does not support; the message names the operation."""
+    """Raised for an operation that lepton does not support; the message names this operation."""
 
 
 def installed() -> bool:
@@ -49,7 +49,7 @@ def installed() -> bool:
 
 
 def expression(function: Any) -> str:
-    """Return a scalar function as a lepton expression of `r`.
+    """Return a scalar function as a lepton expression in the variable `r`.
 
     Raises:
         Untranslated: lepton does not support an operation, or the expression is too long.
@@ -95,7 +95,7 @@ def expression(function: Any) -> str:
 
 
 def expressions(simulation: Simulation) -> list[str]:
-    """Return the cut energy of each pair type of a user's pair function, as lepton expressions.
+    """Return the cut energy of a user's pair function as lepton expressions, one for each pair type.
 
     Raises:
         Untranslated: the model is not a single pair function, or lepton does not support it.
@@ -119,7 +119,7 @@ def expressions(simulation: Simulation) -> list[str]:
 
 
 class Lepton(ClassicalCalculator):
-    """ASE calculator that evaluates a pair function with LAMMPS, in a separate process for each call.
+    """ASE calculator that evaluates a pair function with LAMMPS, in a new process for each call.
 
     Args:
         simulation: a simulation with a user's pair function.
@@ -176,7 +176,7 @@ class Lepton(ClassicalCalculator):
 
 
 def _ran(script: str, data: str) -> tuple[np.ndarray, np.ndarray]:
-    """Run LAMMPS; return the total energy and pressures, and a table with a row for each atom."""
+    """Run LAMMPS; return the total energy, the pressures, and a table with a row for each atom."""
     with TemporaryDirectory() as place:
         folder = Path(place)
         (folder / "in.data").write_text(data)

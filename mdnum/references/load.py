@@ -1,7 +1,7 @@
 """Load a Python object named by `package.module:thing(argument=value)` or `file.py:thing(argument=value)`.
 
-A module is imported or a file executed, the name is looked up, and the named object is called if arguments
-are given. Arguments are literals; nothing else is evaluated.
+A module is imported or a file is executed, the object is looked up by its name, and is called if arguments
+are given. Arguments must be literals; nothing else is evaluated.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class NamedObject:
 
     @property
     def is_file(self) -> bool:
-        """Whether `home` is a Python file, which is executed, and not a module, which is imported."""
+        """True if `home` is a Python file, which is executed, and not a module, which is imported."""
         return self.home.endswith(".py")
 
     @property
     def name(self) -> str:
-        """Last part of the object's dotted name, without arguments; the stem of the file without a name."""
+        """Last part of the object's dotted name, without arguments; without a name, the stem of the file."""
         return self.call.partition("(")[0].rpartition(".")[2].strip() or Path(self.home).stem
 
     def find(self, defaults: Sequence[str] = (), anew: bool = False) -> Any:
@@ -46,10 +46,10 @@ class NamedObject:
 
         Args:
             defaults: names to look for in a file given without a name.
-            anew: execute a file again, so that two of its objects share nothing.
+            anew: execute a file again, so that two of its objects share no data.
 
         Raises:
-            InputError: there is no such module, file or name, an argument is not a literal, or importing or
+            InputError: the module, file or name does not exist, an argument is not a literal, or importing or
                 calling failed; the message gives the correct form.
         """
         module = self._module(anew)
@@ -77,7 +77,7 @@ class NamedObject:
             ) from error
 
     def source(self) -> tuple[str, str]:
-        """Return import lines and an expression for the object, for a script without mdnum."""
+        """Return import statements and an expression for the object, for a script without mdnum."""
         first = self.call.partition("(")[0].partition(".")[0].strip()
         if not self.is_file:
             return f"from {self.home} import {first}\n", self.call
@@ -121,7 +121,7 @@ class NamedObject:
         raise InputError(f"{self.home} is a file{lacks}", remedy=has)
 
     def _attribute(self, node: ast.expr, module: ModuleType) -> Any:
-        """Return the object that a dotted name refers to."""
+        """Return the object with the given dotted name in a module."""
         parts: list[str] = []
         while isinstance(node, ast.Attribute):
             parts.append(node.attr)
@@ -152,7 +152,7 @@ class NamedObject:
 
 
 def place(text: str) -> NamedObject | None:
-    """Parse the location of an object; return None if the text names neither a file nor `module:`."""
+    """Parse the location of an object; return None if the text contains neither a file nor `module:`."""
     text = text.strip()
     head, separator, call = text.partition(".py:")
     if separator:
@@ -164,6 +164,6 @@ def place(text: str) -> NamedObject | None:
 
 
 def public(scope: Any) -> list[str]:
-    """Return the names of the public callables in a module or a class."""
+    """Return the names of the public callables of a module or a class."""
     scope = scope if isinstance(scope, ModuleType | type) else type(scope)
     return [name for name in vars(scope) if name[0] != "_" and callable(getattr(scope, name, None))]

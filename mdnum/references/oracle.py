@@ -22,7 +22,7 @@ _BLOCK = 2_000_000  # pairs and images looked at in one go: 48 MB of displacemen
 
 @dataclass(frozen=True)
 class PairSet:
-    """Pairs of atoms, including periodic images, with each pair listed once."""
+    """Pairs of atoms, including periodic images; each pair is listed once."""
 
     i: Int[ndarray, "pairs"]  # first atom; i <= j
     j: Int[ndarray, "pairs"]  # second atom; i == j for an atom and an image of itself
@@ -49,15 +49,15 @@ def widths(cell: Vectors) -> Float[ndarray, "3"]:
 def rounding_bound(
     positions: Positions, cell: Vectors, r_cut: float, *, unit_roundoff: float = 2.0**-53
 ) -> float:
-    """Upper bound on the rounding error of a computed distance near r_cut, in the length unit.
+    """Upper bound on the rounding error of a computed distance close to r_cut, length.
 
-    The bound holds for a code that wraps the coordinates, adds a lattice vector, subtracts and takes the
-    norm: each operation acts on numbers no larger than the coordinates plus the cell and rounds each once or
-    twice. Typical errors are ten times smaller than this bound.
+    The bound is valid for a code that wraps the coordinates, adds a lattice vector, subtracts and takes the
+    norm: each operation acts on numbers no larger than the coordinates plus the cell, and rounds each number
+    once or twice. Typical errors are a tenth of this bound.
 
     Args:
-        positions: coordinates as given to the code.
-        cell: cell vectors as rows; zero rows for directions without one.
+        positions: coordinates as passed to the code.
+        cell: cell vectors as rows; zero rows for directions without a cell vector.
         r_cut: cutoff radius.
         unit_roundoff: 2**-53 for float64, 2**-24 for float32.
     Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1.
@@ -71,7 +71,7 @@ def exactly_inside(
 ) -> bool:
     """Decide in exact arithmetic whether a pair is inside r_cut; `closed` counts r == r_cut as inside.
 
-    In exact arithmetic r < r_cut and r² < r_cut² are equivalent: they differ only through rounding.
+    In exact arithmetic, r < r_cut and r² < r_cut² are equivalent; only rounding can make them differ.
     """
     squared, threshold = Fraction(0), Fraction(float(r_cut)) ** 2
     for axis in range(3):
@@ -91,24 +91,24 @@ def all_pairs(
     closed: bool = False,
     reach: float | None = None,
 ) -> PairSet:
-    """Find every pair within reach by brute force, and decide exactly whether it is inside r_cut.
+    """Find every pair within a distance by brute force, and decide exactly whether each is inside r_cut.
 
-    No cell list or skin is used: all atom pairs are tested with every lattice vector that could bring them
-    together, so the result is valid for triclinic cells, periodicity per axis, atoms outside the cell and
-    cells smaller than the cutoff (a pair then appears once per image). The cost is proportional to the square
-    of the number of atoms, by design.
+    All pairs of atoms are tested with every lattice vector that could bring the atoms together, without cell
+    list or skin. The result is therefore valid for triclinic cells, periodicity along some axes, atoms
+    outside the cell, and cells smaller than the cutoff (a pair then appears once per image). The cost is
+    deliberately proportional to the square of the number of atoms.
 
     Args:
         positions: coordinates, wrapped or not.
         cell: cell vectors as rows; rows of directions that are not periodic are ignored.
-        pbc: which directions are periodic.
+        pbc: whether each of the three directions is periodic.
         r_cut: cutoff radius.
         closed: whether r == r_cut counts as inside.
         reach: list pairs out to this distance (default: r_cut plus the rounding bound).
     Raises:
         InputError: a periodic direction without a cell vector, or positions that are not finite.
-    Error: `inside` is exact: within the rounding bound of r_cut it is decided with `fractions.Fraction`,
-        beyond it float64 cannot be wrong.
+    Error: `inside` is exact: within the rounding bound of r_cut it is decided with `fractions.Fraction`;
+        beyond this bound float64 cannot be wrong.
     """
     positions = np.ascontiguousarray(positions, dtype=np.float64)
     pbc = np.asarray(pbc, dtype=bool)
@@ -131,7 +131,7 @@ def all_pairs(
 
 
 def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
-    """Return the completed cell, after verifying that every periodic direction has a vector."""
+    """Check that every periodic direction has a cell vector, and return the completed cell."""
     lengths = np.linalg.norm(cell, axis=1)
     for axis in np.flatnonzero(pbc):
         if not lengths[axis] > 0.0:
@@ -144,7 +144,7 @@ def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
 
 
 def completed(cell: Vectors, pbc: Axes) -> Vectors:
-    """Return the cell with each nonperiodic vector replaced by a unit normal to the other vectors."""
+    """Return the cell with each nonperiodic vector replaced by a unit vector normal to the other vectors."""
     if pbc.all():
         return cell
     free = np.flatnonzero(~pbc)
@@ -155,7 +155,7 @@ def completed(cell: Vectors, pbc: Axes) -> Vectors:
 
 
 def _within(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):
-    """Yield (i, j, shift, distance) of the pairs within reach, block by block."""
+    """Yield (i, j, shift, distance) of the pairs within `reach`, block by block."""
     n, stored, width = len(positions), np.where(pbc[:, None], cell, 0.0), widths(cell)
     fractional = np.linalg.solve(cell.T, positions.T).T
     # |normal component| <= reach, so when reach is under half a width the image in reach can only be

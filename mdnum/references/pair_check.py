@@ -42,12 +42,12 @@ class Search:
 
     @property
     def ours(self) -> bool:
-        """Whether the search is mdnum's own, so that a run depends on its result."""
+        """True if the neighbor search belongs to mdnum, so that a run depends on its result."""
         return self.listed.package == "mdnum"
 
     @property
     def unit(self) -> float:
-        """Unit roundoff of the search's arithmetic."""
+        """Unit roundoff of the arithmetic of the neighbor search."""
         return self.listed.unit or 2.0**-53
 
     @cached_property
@@ -56,7 +56,7 @@ class Search:
 
     @cached_property
     def _full(self) -> bool:
-        """Whether the search lists every pair twice, once from each atom."""
+        """True if the neighbor search lists every pair twice, once from each atom."""
         if self.listed.full is not None:
             return self.listed.full
         pair, cell, pbc = np.array([[0.0, 0, 0], [0.5, 0, 0]]), 4.0 * np.eye(3), np.ones(3, bool)
@@ -65,14 +65,14 @@ class Search:
         return len(read(self._call(pair, cell, pbc, 1.0))) > 1
 
     def refusal(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> str | None:
-        """Return why the search does not support a structure, or None if the structure is supported."""
+        """Return the reason if the neighbor search does not support a structure; None if it does."""
         if self.listed.version is None:
             return "not installed"
         positions, cell = self._placed(positions, cell, pbc)
         return self.listed.limits.refusal(once("", "few", positions, cell, pbc.tolist(), r_cut))
 
     def pairs(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> tuple[ndarray, ndarray]:
-        """Return arrays i and j of the pairs within r_cut, one entry for each image, i <= j."""
+        """Return arrays i and j of the pairs within r_cut, with one entry for each periodic image, i <= j."""
         positions, cell = self._placed(np.asarray(positions, float), np.asarray(cell, float), pbc)
         answer = read(self._call(positions, cell, np.array(pbc), float(r_cut)))
         i, j = np.minimum(answer.i, answer.j), np.maximum(answer.i, answer.j)
@@ -107,7 +107,7 @@ class Search:
 
 
 def all_searches(system: Simulation) -> tuple[Search, ...]:
-    """Return mdnum's own neighbor searches, with the comparison of a system, and those of other libraries."""
+    """Return the neighbor searches of mdnum, with the comparison (< or <=) of a system, and of libraries."""
     own = own_searches(system)
     return (*own, *(Search(one) for one in known() if not one.kept and one.package != "mdnum"))
 
@@ -116,7 +116,7 @@ def own_searches(system: Simulation) -> tuple[Search, ...]:
     """Return the neighbor searches of mdnum, set up for this system.
 
     "mdnum force loop" is the cutoff decision of the force evaluation, outside jit. "mdnum, host list" and
-    "mdnum, jax-md list" are mdnum's list builders with the same cutoff decision made on the host.
+    "mdnum, jax-md list" are mdnum's two list builders, with the same cutoff decision made on the host.
     """
     compare, dtype = system.decider.compare, system.policy.decision
     unit = _SINGLE if "float32" in (dtype, system.policy.state) else 2.0**-53
@@ -215,11 +215,11 @@ class PairsReport:
 
     @property
     def ok(self) -> bool:
-        """Whether mdnum's own searches agree with brute force, except within rounding error."""
+        """True if mdnum's neighbor searches agree with brute force, except within rounding error."""
         return all(one.verdict in (AGREES, AT_THE_CUTOFF, NOT_TESTED) for one in self.results if one.ours)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return one table row per neighbor search."""
+        """Return a table row for each neighbor search."""
         counts = ("pairs", "missing", "extra", "borderline")
         return [
             {"search": one.name, "version": one.version}
@@ -242,14 +242,14 @@ def check_pairs(
 ) -> PairsReport:
     """Compare the pairs that every neighbor search finds inside the cutoff with brute force.
 
-    A search runs once for each cutoff radius of the species pairs. Brute force uses the comparison of the
-    system file, in rational arithmetic near the cutoff; a search that decides only such pairs differently
-    "differs at the cutoff", which is rounding or convention and not an error.
+    Each neighbor search runs once for each cutoff radius of the species pairs. Brute force uses the
+    comparison (< or <=) of the system file, in rational arithmetic near the cutoff. A search whose decisions
+    differ only for such pairs "differs at the cutoff", which is rounding or convention and not an error.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
-        searches: default: mdnum's own and those of every installed library.
-        effective: also bisect each search's effective cutoff.
+        searches: neighbor searches; default those of mdnum and of every installed library.
+        effective: also find the effective cutoff of each search by bisection.
     """
     system = systems.build(subject)
     x, species = system.positions, system.species
@@ -299,14 +299,14 @@ def check_pairs(
 
 
 def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: float) -> tuple[int, int, int]:
-    """Return (missing, extra, borderline) counts of a search's pairs relative to brute force.
+    """Return (missing, extra, borderline) counts of the pairs from a neighbor search against brute force.
 
     Args:
-        i, j: the search's pairs, i <= j, one row per image.
-        right: pairs found by brute force, listed slightly beyond the cutoff.
-        r_cut: cutoff.
-        bound: rounding error of the search's distances; differing decisions on pairs this close to r_cut
-            are borderline.
+        i, j: pairs from the neighbor search, i <= j, one row per periodic image.
+        right: pairs from brute force, listed slightly beyond the cutoff.
+        r_cut: cutoff radius.
+        bound: rounding error of distances in the neighbor search; differing decisions on pairs this close to
+            r_cut are borderline.
     """
 
     def counted(i: ndarray, j: ndarray) -> Counter[tuple[int, int]]:
@@ -323,7 +323,7 @@ def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: f
 
 @dataclass(frozen=True)
 class EffectiveCutoff:
-    """The cutoff that a search actually applies when r_cut is requested."""
+    """The cutoff that a neighbor search actually applies when r_cut is requested."""
 
     r_cut: float  # the cutoff asked for
     last_counted: float  # largest distance along x at which the pair is still counted
@@ -343,17 +343,17 @@ class EffectiveCutoff:
 def effective_cutoff(
     search: Search, r_cut: float, *, periodic: bool = True, oriented: int | None = None
 ) -> EffectiveCutoff:
-    """Bisect two-atom configurations to the last double that a search counts as inside r_cut.
+    """Find the largest distance (double) of two atoms that a neighbor search counts as inside r_cut.
 
-    The two atoms differ along x only and the first has x = 0, so their distance is the coordinate itself and
-    the result depends on the search alone; in a periodic box (5 r_cut wide) this includes the search's own
-    wrapping.
+    The two atoms differ only in x and the first has x = 0, so that their distance is exactly the coordinate
+    of the second and the result depends on the search alone; in a periodic box (5 r_cut wide) this includes
+    wrapping by the search.
 
     Args:
-        periodic: use a periodic box, as in a simulation; else free atoms.
-        oriented: number of randomly oriented pairs within 3 ulps of r_cut; default by the cost of the search.
-    Error: none, since the bisection ends at neighboring doubles; it assumes that a search which counts a
-        distance counts the smaller ones (checked at relative distances of 1e-5).
+        periodic: use a periodic box, as in a simulation; otherwise atoms without a box.
+        oriented: number of randomly oriented pairs within 3 ulps of r_cut; default by cost of the search.
+    Error: none, since the bisection ends at adjacent doubles; it is assumed that a search that counts a
+        distance also counts smaller ones (checked at relative distances of 1e-5).
     """
     oriented = round(min(100, 1200 * search.listed.affords)) if oriented is None else oriented
     cell, pbc = np.eye(3) * (5.0 * r_cut if periodic else 0.0), np.full(3, periodic)
@@ -387,7 +387,7 @@ def effective_cutoff(
 
 
 def borderline_pairs(r_cut: float, count: int) -> ndarray:
-    """Return randomly oriented pairs within 3 ulps of r_cut: (count, 2, 3); the first atom is the origin."""
+    """Return randomly oriented pairs within 3 ulps of r_cut: (count, 2, 3); the first atom at the origin."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
@@ -396,7 +396,7 @@ def borderline_pairs(r_cut: float, count: int) -> ndarray:
 
 
 def _ordinal(x: float) -> int:
-    """Return the ordinal number of a positive double among the doubles."""
+    """Return the ordinal number of a positive double among all doubles."""
     return int(np.float64(x).view(np.int64))
 
 

@@ -1,1 +1,1 @@
-"""Output that all verbs share: findings, sections, figures, and the page."""
+"""Output shared by all commands of mdnum: findings, sections, figures, and the page."""

@@ -1,4 +1,4 @@
-"""Statistics of a run's tables: chatter, residence times, busiest pairs, margins per bound, and energies."""
+"""Statistics of a run's tables: flip reversals, residence times, most frequent pairs, margins, energies."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _LEAST_ROWS, _BLOCKS = 40, 10
 
 @dataclass(frozen=True)
 class Stays:
-    """Residence times of pairs inside and outside, in steps, between two flips of the same pair."""
+    """Residence times of pairs inside and outside the cutoff, between two flips of a pair, in steps."""
 
     inside: Int[np.ndarray, "lengths"]  # from entering to leaving: how many stays last 0, 1, 2, ... steps
     outside: Int[np.ndarray, "lengths"]  # from leaving to entering again, likewise
 
     @property
     def total(self) -> int:
-        """Number of stays of both kinds."""
+        """Number of stays inside or outside the cutoff."""
         return int(self.inside.sum() + self.outside.sum())
 
     def undone_within(self, steps: int) -> int:
@@ -39,7 +39,7 @@ class Stays:
 
 
 def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
-    """Return the median stay from the number of stays of 0, 1, 2, ... steps; None if there are no stays."""
+    """Return the median stay, given the numbers of stays of 0, 1, 2, ... steps; None without any stays."""
     total = int(counts.sum())
     if not total:
         return None
@@ -58,7 +58,7 @@ class PairCounts:
     terms: np.ndarray  # names of the terms whose decisions they are; "" where there are none
 
     def rows(self, most: int) -> list[dict[str, Any]]:
-        """Return the first pairs as plain values."""
+        """Return the first pairs as rows of plain values."""
         columns = {name: values[:most].tolist() for name, values in vars(self).items()}
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
@@ -66,12 +66,12 @@ class PairCounts:
 class Scan:
     """Statistics of a table of flips that may be larger than memory, read block by block.
 
-    A scan stores one row per pair, one count per step and per length of a stay, the rows nearest to their
-    threshold, and the margin of every flip.
+    A scan stores one row per pair, one count for each step and for each length of a stay, the flips nearest
+    to their threshold, and the margin of every flip.
 
     Args:
-        steps: number of steps in the run's series; flips are at the steps 0 to steps - 1.
-        nearest: number of rows nearest to their threshold that are kept.
+        steps: number of steps in the run's series; flips happen at the steps 0 to steps - 1.
+        nearest: number of flips nearest to their threshold that are kept.
     """
 
     def __init__(self, steps: int, nearest: int = 0):
@@ -95,10 +95,10 @@ class Scan:
         self.nearest: dict[str, np.ndarray] = {}
 
     def take(self, flips: Flips) -> None:
-        """Process the next rows of the table.
+        """Process the next rows of the table of flips.
 
         Raises:
-            ValueError: a flip is at a step outside the run, or at an earlier step than a flip before it.
+            ValueError: a flip is at a step outside the run, or at an earlier step than a previous flip.
         """
         step, steps = flips["step"], len(self.entered)
         self.total += len(step)
@@ -126,7 +126,7 @@ class Scan:
 
     @property
     def alternates(self) -> bool:
-        """True if every pair enters and leaves alternately; otherwise a flip is missing."""
+        """True if every pair enters and leaves the cutoff alternately; otherwise a flip is missing."""
         self._follow()
         return self._alternates
 
@@ -138,17 +138,17 @@ class Scan:
 
     @property
     def stays(self) -> Stays:
-        """Residence times of pairs on either side of the cutoff.
+        """Residence times of pairs inside and outside the cutoff.
 
-        The stays before a pair's first flip and after its last one are incomplete and not counted, so long
-        stays are underrepresented in a run that is not much longer than they are.
+        The stays before a pair's first flip and after its last flip are incomplete and not counted, so long
+        stays are underrepresented in runs that are not much longer than these stays.
         """
         self._follow()
         return Stays(inside=self._lengths[1], outside=self._lengths[0])
 
     @property
     def pairs(self) -> int:
-        """Number of pairs that flipped."""
+        """Number of pairs that flipped at least once."""
         self._follow()
         return len(self._key)
 
@@ -164,7 +164,7 @@ class Scan:
         )
 
     def matches(self, series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
-        """Return, for each step, True if the table has as many flips as the series counted."""
+        """Return, for each step, True if the table contains as many flips as the series counted."""
         return (self.entered == series["entered"]) & (self.left == series["left"])
 
     def _follow(self) -> None:
@@ -202,7 +202,7 @@ def scan(flips: Flips, steps: int | None = None, nearest: int = 0) -> Scan:
 
 
 def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
-    """Return the ratio of |margin| to the rounding bound of each flip; a flip is ambiguous up to ratio 1.
+    """Return |margin| / rounding bound for each flip; a flip is ambiguous if this ratio is at most 1.
 
     If the bound is zero (an exact comparison), the ratio of any nonzero margin is infinite.
     """
@@ -214,11 +214,11 @@ def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
 
 
 def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
-    """Return the expected number of flips within their rounding bound, for margins spread evenly near zero.
+    """Return the expected number of ambiguous flips (ratio up to 1), for margins spread evenly near zero.
 
-    Margins are spread evenly if atoms move freely through the cutoff. The density is taken from the lower
-    quarter of the margins; many more ambiguous flips mean that pairs are held at the cutoff, for example by
-    the shell of a crystal.
+    Margins are spread evenly if atoms move freely through the cutoff distance. The density is taken from the
+    lower quarter of the margins. If many more flips are ambiguous, pairs stay near the cutoff, for example
+    because a neighbor shell of a crystal is at this distance.
     """
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) < 4:
@@ -228,7 +228,7 @@ def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
 
 
 def closest(ratio: Float[np.ndarray, "flips"], most: int) -> Int[np.ndarray, "nearest"]:
-    """Return the rows of the flips nearest to their threshold, in units of rounding, nearest first."""
+    """Return the rows of the flips with the smallest |margin| / rounding bound, the smallest first."""
     if len(ratio) > most:
         rows = np.argpartition(ratio, most)[:most]
     else:
@@ -258,15 +258,16 @@ class Conservation:
         kinetic: Float[np.ndarray, "rows"],
         least: float,
     ) -> Conservation | None:
-        """Compute energy conservation from one value per step; None for few values or without motion.
+        """Compute energy conservation from one value per step; None if values are few or atoms do not move.
 
-        The linear trend is removed before the fluctuation is computed, since drift is reported separately.
-        The first half is left out, because a run that starts from a lattice turns half of its kinetic energy
-        into potential energy.
+        The linear trend is removed before the fluctuation is computed, since the drift is reported
+        separately. The first half of the run is omitted, because a run that starts from a lattice turns half
+        of its kinetic energy into potential energy.
 
         Args:
-            conserved: the energy that should not change. kinetic: the kinetic energy.
-            least: lower limit of the kinetic fluctuation; atoms in free flight keep their kinetic energy.
+            conserved: the energy that should be constant. kinetic: the kinetic energy.
+            least: lower limit of the kinetic fluctuation, since atoms in free flight keep their kinetic
+                energy.
         """
         rows = len(conserved)
         if rows < _LEAST_ROWS or not np.isfinite(conserved).all():
@@ -284,11 +285,11 @@ class Conservation:
 
 
 def range_table(label: Callable[[str], str], *tables: Mapping[str, np.ndarray]) -> Table:
-    """Tabulate the ranges of quantities, and the first steps at which narrower formats cannot hold them.
+    """Tabulate the ranges of quantities, and the first step at which each narrower format fails to hold them.
 
     Args:
         label: function that returns the label of a quantity from its name.
-        tables: columns `step`, and the extremes of quantities at each step (`ranges.columns`).
+        tables: columns `step`, and smallest and largest values of quantities at each step (`ranges.columns`).
     """
     rows, forms = [], ("float32", "bfloat16", "float16")
     held = ((table, key) for table in tables for key in table if "largest_" in key and np.any(table[key]))

@@ -1,4 +1,4 @@
-"""Tables that can be sorted, searched and paged in the browser, and are readable without a script."""
+"""Tables that can be sorted, searched and paged in the browser, and that are readable without a script."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STATIC_ROWS = 20
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a searchable table."""
+    """A column of a table that can be searched in the browser."""
 
     # name, unit: its heading
     name: str
@@ -37,12 +37,12 @@ class Column:
 
     @property
     def missing(self) -> str:
-        """Text shown for a missing value."""
+        """Text shown instead of a missing value."""
         return "∞" if self.kind == "ratio" else "–"
 
     @property
     def plain(self) -> list[list[Any]]:
-        """Values of the column as lists of plain values; None for values that are not finite."""
+        """Values of the column as lists of plain values; None instead of values that are not finite."""
         if self.kind == "pair":
             return [np.asarray(values).astype(int).tolist() for values in self.of]
         values = np.asarray(self.of)
@@ -55,7 +55,7 @@ class Column:
         return [[float(f"{x:.{kept}g}") if np.isfinite(x) else None for x in values.astype(float).tolist()]]
 
     def text(self, row: Sequence[Any], at: int) -> str:
-        """Return the text of a cell from its row and the index of its value in the row."""
+        """Return the text of a table cell from its row and the index of its value in the row."""
         value = row[at]
         if self.kind == "pair":
             return f"{value}–{row[at + 1]}"
@@ -85,7 +85,7 @@ class Browse:
 
     @cached_property
     def rows(self) -> list[list[Any]]:
-        """Rows of the table as plain values; None for unknown values."""
+        """Rows of the table as plain values; None instead of unknown values."""
         return [list(row) for row in zip(*(each for one in self.columns for each in one.plain), strict=True)]
 
     def is_ambiguous(self, row: Sequence[Any]) -> bool:
@@ -95,7 +95,7 @@ class Browse:
 
     @cached_property
     def search(self) -> dict[str, Any]:
-        """Keywords of the search box, and the column that each of them searches."""
+        """Keywords for the search box, each with the column to search."""
         found: dict[str, Any] = {"words": {}, "ranges": {}, "subjects": [], "nouns": [], "ambiguous": None}
         for at, one in self.placed:
             if one.kind == "word":
@@ -129,5 +129,5 @@ class Browse:
 
 
 def _script_safe(value: Any) -> Markup:
-    """Return JSON that is safe in a script element, which "</script>" inside a string would end."""
+    """Return JSON that is safe in a script element, which the string "</script>" would otherwise end."""
     return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))

@@ -1,7 +1,8 @@
-"""Findings of all verbs, their sentences, and the verdict that summarizes them.
+"""Findings of all commands, with their sentences, and the verdict that summarizes the findings.
 
-A verb determines a finding by its code and its values; a text file next to the verb has the sentences.
-`mdnum/verbs/__init__.toml` explains what such a file contains, and what the format of a field determines.
+The module of a command determines code and values of a finding; a text file next to it has the sentences.
+`mdnum/verbs/__init__.toml` explains the content of such a file, and how the format of a field affects the
+text.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _ORDER = ("error", "warning", "info")
 
 @dataclass(frozen=True)
 class Finding:
-    """A result that the reader should know about."""
+    """A result of a calculation that the reader should know about."""
 
     code: str  # stable name, for scripts
     # error: do not use the numbers; warning: look before you do; info: good to know, which changes neither
@@ -73,11 +74,11 @@ class _Fields(string.Formatter):
 
 
 class Texts:
-    """Sentences of a verb, read from its text file.
+    """Sentences of a command, read from the text file of its module.
 
     Args:
-        module: `__file__` of the module; its text file lies next to it, with the suffix .toml.
-        units: unit system that provides the names for fields such as `{units.energy}`.
+        module: `__file__` of the module; the text file is in the same folder, with the suffix .toml.
+        units: unit system that provides the unit names for fields such as `{units.energy}`.
     """
 
     def __init__(self, module: str | Path, units: Units | None = None):
@@ -93,15 +94,15 @@ class Texts:
         cause: str = "",
         **values: Any,
     ) -> Finding:
-        """Return the finding with a code, with its sentences filled in.
+        """Return the finding with the given code, with values inserted into its sentences.
 
         Args:
             variants: alternatives to title, text and remedy, and further sentences (see the module).
-            severity, section: values that replace those in the text file.
-            values: values of the fields.
+            severity, section: replace the severity and section in the text file.
+            values: values inserted into the fields of the sentences.
 
         Raises:
-            KeyError: the text file lacks the code, or a field has no value.
+            KeyError: the text file does not contain the code, or a field has no value.
         """
         entry = self.entries[code]
         values = {name: value if isinstance(value, str) else _plain(value) for name, value in values.items()}
@@ -121,7 +122,7 @@ class Texts:
         )  # fmt: skip
 
     def __call__(self, name: str, /, **values: Any) -> str:
-        """Return a sentence of the table [sentences], with its fields filled in."""
+        """Return a sentence from the table [sentences], with values inserted into its fields."""
         return fill(self.entries["sentences"][name], {"units": self.units, **values})
 
     def plot(
@@ -132,18 +133,18 @@ class Texts:
         horizontals: Iterable[tuple[float, str]] = (),
         **values: Any,
     ) -> Plot:
-        """Return the figure with this name in the table [plots], with its fields filled in."""
+        """Return the figure with this name in the table [plots], with values inserted into its texts."""
         told: Any = {part: fill(text, values) for part, text in self.entries["plots"][name].items()}
         marks = {"verticals": tuple(verticals), "horizontals": tuple(horizontals)}
         return Plot(name, series=tuple(series), **marks, **told)
 
     def rows(self, table: str, /, **values: Any) -> list[tuple[str, str]]:
-        """Return the names and texts of a table, with fields filled in, without rows that would show None."""
+        """Return names and texts of a table, with values inserted, except rows that have a missing value."""
         rows = ((_first(name, values), _first(text, values)) for name, text in self.entries[table].items())
         return [(name, text) for name, text in rows if name is not None and text is not None]
 
     def keys(self, table: str = "keys", /, **values: Any) -> list[Key]:
-        """Return the key numbers of a page from a table of values and notes, without those that are None."""
+        """Return the key numbers of a page from a table of values and notes; missing numbers are left out."""
         keys = []
         for label, texts in self.entries[table].items():
             for value, note in [texts] if isinstance(texts[0], str) else texts:
@@ -163,9 +164,9 @@ class Texts:
         """Return the searchable table with this name in [browse], with the columns present in `rows`.
 
         Args:
-            rows: equally long columns; a "pair" uses two of them.
-            choices: words that occur in columns of words, by column, if the text file does not list them.
-            values: values of fields in names and units of columns.
+            rows: columns of equal length; a column "pair" is made from two of these columns.
+            choices: possible words of each column of words, if the text file does not list them.
+            values: values inserted into the names and units of columns.
         """
         entry, columns = self.entries["browse"][name], []
         for column in entry["columns"]:
@@ -183,13 +184,13 @@ def _plain(value: Any) -> Any:
 
 
 def _first(texts: str | Sequence[str], values: Mapping[str, Any]) -> str | None:
-    """Return the first text whose fields all have a value, with its fields filled in; None if none has."""
+    """Return the first text whose fields all have values, with the values inserted; or None."""
     several = [texts] if isinstance(texts, str) else texts
     return next((fill(text, values) for text in several if _known(text, values)), None)
 
 
 def _known(text: str, values: Mapping[str, Any]) -> bool:
-    """Return True if all fields of a text have a value; an attribute of a missing value is missing too."""
+    """Return True if all fields of a text have values; attributes of a missing value count as missing."""
     names = (name for _, name, _, _ in string.Formatter().parse(text) if name)
     with suppress(TypeError):
         return all(_Fields().get_field(name, (), values)[0] is not None for name in names)
@@ -197,7 +198,7 @@ def _known(text: str, values: Mapping[str, Any]) -> bool:
 
 
 def fill(text: str, values: Mapping[str, Any]) -> str:
-    """Return a sentence with its fields filled in.
+    """Return a sentence with values inserted into its fields.
 
     Raises:
         KeyError: a field has no value.
@@ -217,11 +218,11 @@ class Verdict:
 
     @property
     def text(self) -> str:
-        """Headline and evidence as one text."""
+        """Headline and evidence of the verdict as one text."""
         return " ".join((self.headline, *self.evidence))
 
     def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a summary with headline, findings and verdict; an empty one if the folder is unfinished."""
+        """Return a summary with headline, findings and verdict; an empty one for an unfinished folder."""
         usual = {"status": "complete" if summary else "unfinished", "seconds": None}
         found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
         return headed(kind, {**usual, **summary, **found})
@@ -235,14 +236,14 @@ def conclude(
     best: Tone = "info",
     judged: bool = False,
 ) -> Verdict:
-    """Return the verdict on findings: the most severe one sets its tone and is named in the headline.
+    """Return the verdict on findings: the most severe finding sets its tone and is named in the headline.
 
     Args:
-        found: findings in the order in which they are to be read, whatever their severity.
+        found: findings in the order in which they are to be read, regardless of severity.
         evidence: facts on which the verdict is based, one sentence each.
-        headline: the answer to the verb's question.
-        best: the tone if there is neither an error nor a warning.
-        judged: True if the headline follows from the findings already.
+        headline: the answer to the question of the command.
+        best: the tone of the verdict if there is neither an error nor a warning.
+        judged: True if the headline already takes the findings into account.
     """
     findings = tuple(sorted(found, key=lambda finding: _ORDER.index(finding.severity)))
     worst = findings[0] if findings else None

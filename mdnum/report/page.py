@@ -1,4 +1,4 @@
-"""Parts that all pages share: template environment, style, and figures for wide and narrow screens."""
+"""Elements shared by all report pages: template environment, style, figures for wide and narrow screens."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _HERE = files("mdnum.report")
 
 
 def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
-    """Write report.html and figures/*.svg of a folder.
+    """Write report.html and the figures (figures/*.svg) into a folder.
 
     Returns:
         the path of report.html.
@@ -86,7 +86,7 @@ _LINKED = (".parquet", ".py", ".json", ".toml", ".extxyz", ".npz", ".traj")
 
 
 def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Finding]]]:
-    """Return the findings that no other finding causes, each with the findings that it causes."""
+    """Return the findings not caused by another finding, each with the findings caused by it."""
     findings = list(findings)
     codes = {finding.code for finding in findings}
     below: dict[str, list[Finding]] = {}
@@ -123,7 +123,7 @@ def _render(template: str, **content: Any) -> str:
 
 
 def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
-    """Describe a table of a system file by a phrase: its kind, then name and value of the other entries."""
+    """Describe a table of a system file in a phrase: its kind, then name and value of the other entries."""
     parts = []
     for key, value in table.items():
         if isinstance(value, Mapping):
@@ -141,7 +141,7 @@ def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -
 
 
 def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield (name, text) for all entries of nested tables; plain values of a table share one line."""
+    """Yield (name, text) for all entries of nested tables; all plain values of a table are in one line."""
     for key, item in value.items():
         name = f"{prefix}{key}".replace("_", " ")
         if isinstance(item, Mapping):

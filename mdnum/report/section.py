@@ -1,6 +1,6 @@
-"""Building blocks of every page and terminal output: sections of text, tables and figures.
+"""Building blocks of all pages and terminal output: sections with text, tables and figures.
 
-Drawing and printing happen elsewhere: `page` renders sections as HTML, `cli.output` prints them.
+This module neither draws nor prints: `page` renders sections as HTML, and `cli.output` prints them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Role = Literal["first", "second", "third", "bad", "muted", "ink"]
 
 @dataclass(frozen=True)
 class Table:
-    """Table of values under named columns."""
+    """Table of values in named columns."""
 
     # names, with their unit in parentheses; all empty for a table without a head, whose first column then
     # names its rows
@@ -38,7 +38,7 @@ class Table:
 
     @cached_property
     def numeric(self) -> tuple[bool, ...]:
-        """Whether each column holds only numbers, which are right-aligned."""
+        """True for each column that contains only numbers, which are then right-aligned."""
         columns = [[row[k] for row in self.rows] for k in range(len(self.columns))]
         return tuple(
             any(map(_is_number, values)) and all(value is None or _is_number(value) for value in values)
@@ -47,7 +47,7 @@ class Table:
 
 
 def records(rows: Sequence[Mapping[str, Any]], title: str = "", shown: int = 20) -> Table:
-    """Build a table from dictionaries, with columns in the order of their first occurrence."""
+    """Build a table from dictionaries; columns are in the order of their first occurrence."""
     columns = tuple(dict.fromkeys(name for row in rows for name in row))
     return Table(columns, [[row.get(name) for name in columns] for row in rows], title, shown)
 
@@ -63,8 +63,8 @@ def table_of(
 
     Args:
         rows: records, as mappings.
-        columns: for each column heading, the key of its value or a function of the record.
-        bad: function that returns True if the row of a record is marked.
+        columns: for each column heading, the key of the column's value or a function of the record.
+        bad: function that returns True for records whose row is to be marked.
     """
     rows = list(rows)
     getters = [itemgetter(get) if isinstance(get, str) else get for get in columns.values()]
@@ -74,7 +74,7 @@ def table_of(
 
 
 def pairs(rows: Sequence[tuple[str, Any]], title: str = "") -> Table:
-    """Build a table of names and values, without a header."""
+    """Build a table of names and values, without a header row."""
     return Table(("", ""), rows, title, shown=1000)
 
 
@@ -97,7 +97,7 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Code:
-    """A file or a command to copy, folded under its title."""
+    """A file or a command for copying, hidden under its title until unfolded."""
 
     title: str  # what it is
     text: str  # word for word
@@ -121,7 +121,7 @@ ROLES: tuple[Role, ...] = ("first", "second", "third", "bad", "ink", "muted")
 
 
 def positive(values: np.ndarray) -> np.ndarray:
-    """Return values with NaN for those that a logarithmic axis cannot show: values ≤ 0 or not finite."""
+    """Return values with NaN in place of values that a logarithmic axis cannot show (≤ 0 or not finite)."""
     values = np.asarray(values, float)
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
@@ -129,12 +129,12 @@ def positive(values: np.ndarray) -> np.ndarray:
 def curves(
     x: np.ndarray, lines: Mapping[str, np.ndarray], mark: Mark = "line", log: bool = True
 ) -> tuple[Series, ...]:
-    """Build the series of several lines, with the roles in their order.
+    """Build the series of several lines, with the roles in the order of the lines.
 
     Args:
         x: positions shared by all lines.
         lines: values of each line, by label.
-        log: True for a logarithmic axis; values ≤ 0, and lines with no other values, are left out.
+        log: True for a logarithmic axis; values ≤ 0 are left out, and so are lines with only such values.
     """
     if log:
         lines = {label: positive(y) for label, y in lines.items() if np.any(np.nan_to_num(y) > 0)}
@@ -145,7 +145,7 @@ def curves(
 
 
 def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.ndarray]:
-    """Return the table of the points in a folder's figures, with a row for each point.
+    """Return a table of the points in the figures of a folder, with a row for each point.
 
     Args:
         lines: part, curve, label, x and y of each line.
@@ -160,7 +160,7 @@ def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.n
 
 @dataclass(frozen=True)
 class Region:
-    """Map over a grid: an integer class in each cell, with a word for each class (a stability map, say)."""
+    """Map over a grid: an integer class in each cell, and a word for each class (such as "stable")."""
 
     # x, y: centers of the cells, shapes (columns,) and (rows,)
     x: np.ndarray
@@ -172,7 +172,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure declared as data: values plotted against values."""
+    """A figure described by data: values plotted against values."""
 
     name: str  # of figures/<name>.svg, unique on its page
     title: str  # what is seen, a phrase
@@ -193,7 +193,7 @@ class Plot:
 
     @property
     def alt(self) -> str:
-        """Text alternative of the figure, in words and numbers, for readers who cannot see it."""
+        """Text alternative of the figure, for readers who cannot see it."""
         parts = [f"{self.title}: {self.y_label} against {self.x_label}."]
         for series in self.series:
             y = np.asarray(series.y, float)
@@ -219,7 +219,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class Figure:
-    """Figure drawn by a function that uses matplotlib."""
+    """Figure drawn by a function with matplotlib."""
 
     name: str  # of figures/<name>.svg, unique on its page
     caption: str  # what to see in it
@@ -244,7 +244,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Key:
-    """A headline number shown at the top of a page."""
+    """A key number shown at the top of a page, with a label and a note."""
 
     label: str
     value: str
@@ -253,7 +253,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Page:
-    """Complete page with the answer of a verb."""
+    """Complete page with the result of a command."""
 
     title: str  # heading
     about: str = ""  # one line below it

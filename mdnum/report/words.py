@@ -12,15 +12,15 @@ MINUS = "\N{MINUS SIGN}"
 
 
 def power(exponent: int) -> str:
-    """Return the text 10ⁿ for an exponent n."""
+    """Return the text 10ⁿ for a given exponent n."""
     return "10" + str(exponent).translate(_RAISED)
 
 
 def number(value: float | None, digits: int = 3, signed: bool = False, whole: bool = True) -> str:
-    """Format a number with significant digits, as a power of ten if it is far from 1; "–" for None.
+    """Format a number with significant digits, as a power of ten if far from 1; "–" for None.
 
     Args:
-        whole: True to write numbers up to a million in full, with digits beyond the significant ones.
+        whole: True to write numbers up to a million in full, even with digits beyond the significant ones.
     """
     if value is None or math.isnan(value):
         return "–"
@@ -49,18 +49,18 @@ def count(value: float | None) -> str:
 
 
 def plain(value: float | None, digits: int = 4) -> str:
-    """Format a number as `number` does, without trailing zeros, for values that were chosen, not measured."""
+    """Format a number as `number` does, without trailing zeros: for chosen values, not for measured ones."""
     text = number(value, digits)
     return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
 
 
 def pair_name(pair: Mapping[str, Any]) -> str:
-    """Return the labels of a pair of atoms, with the term of the potential that decides, if there is one."""
+    """Return the labels of a pair of atoms, and the potential term that decides, if there is one."""
     return f"{pair['i']}–{pair['j']}" + (f" ({pair['terms']})" if pair.get("terms") else "")
 
 
 def many(value: float | None, noun: str, plural: str | None = None) -> str:
-    """Return a number with its noun: 1 pair, 2 pairs, no pairs."""
+    """Return a number with its noun, for example 1 pair, 2 pairs, no pairs."""
     plural = plural or noun + "s"
     if not value:
         return f"no {plural}"
@@ -68,7 +68,7 @@ def many(value: float | None, noun: str, plural: str | None = None) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Format a share in percent, never rounded to 0 % or 100 %; None stands for an infinite share."""
+    """Format a fraction in percent, never rounded to 0 % or 100 %; None stands for an infinite fraction."""
     if share is None or 0 < share < 0.001:
         return "under 0.1 %" if share else "an unbounded share"
     if 0.999 < share < 1:
@@ -77,7 +77,7 @@ def percent(share: float | None) -> str:
 
 
 def typeset(text: str) -> str:
-    """Typeset numbers written by programs: -1.5e-16 and 2^15 become −1.5 × 10⁻¹⁶ and 2¹⁵."""
+    """Typeset numbers in the notation of programs: -1.5e-16 and 2^15 become −1.5 × 10⁻¹⁶ and 2¹⁵."""
     text = re.sub(r"(?<![\w.])(\d+(?:\.\d+)?)[eE]([+-]?\d+)(?![\w.]*\w)", _as_power, text)
     text = re.sub(r"(?<=\w)(?:\^|\*\*)(-?\d+)", lambda found: found[1].translate(_RAISED), text)
     text = re.sub(r"\bsqrt\((\w+)\)", r"√\1", text)
@@ -89,12 +89,12 @@ def _as_power(found: re.Match[str]) -> str:
 
 
 def heading(text: str) -> str:
-    """Capitalize a heading, unless its first word is the name of a program or the letter of a formula."""
+    """Capitalize a heading, unless its first word is the name of a program or the symbol of a quantity."""
     first = text.split(" ", 1)[0]
     plain = first == "a" or (len(first) > 1 and first.isalpha() and first.islower())
     return text[:1].upper() + text[1:] if plain else text
 
 
 def listed(items: Sequence[str]) -> str:
-    """Join words as "a, b and c"."""
+    """Join words in the form "a, b and c"."""
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"

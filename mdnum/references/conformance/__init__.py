@@ -1,8 +1,8 @@
 """A conformance suite that compares any neighbor list with an exact brute-force search.
 
-`examine` tests a neighbor list with all test cases; `load` finds a neighbor list by name;
-`NeighborListConformance` is a class to subclass in a library's own tests; `cases` and `boxes` are hypothesis
-strategies for custom tests.
+`examine` runs all test cases on a neighbor list; `load` finds a neighbor list by name;
+`NeighborListConformance` is a class to subclass in the tests of a library; `cases` and `boxes` are hypothesis
+strategies for further tests.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The conformance suite for a library's own tests: a class to subclass, with one test per topic.
+"""The conformance suite for the tests of a library: a class to subclass, with one test per topic.
 
     from mdnum.references.conformance import ListLimits, NeighborListConformance
     from mylibrary import neighbor_list
@@ -7,7 +7,7 @@
         pairs = staticmethod(neighbor_list)
         limits = ListLimits(minimum_image=True)
 
-A failed test prints the error and a script with a few atoms that reproduces the error.
+A failed test prints the error and a script with a few atoms that reproduces this error.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ class NeighborListConformance:
     large: ClassVar[bool] = False  # ask about 5,000 atoms, too, and 100,000 unless that would take too long
 
     def subject(self) -> PairList:
-        """Return the neighbor list with the properties declared in the class."""
+        """Return the neighbor list under test, with the properties declared in the class."""
         if self.pairs is None:
             pytest.skip("no list: set `pairs` in a subclass")
         found = load(self.pairs) if isinstance(self.pairs, str) else from_object(self.pairs)
         return found.with_options(full=self.full, unit=self.unit, superset=self.superset, limits=self.limits)
 
     def asked(self, tested: PairList, area: str) -> list[Case]:
-        """Return the cases of one area."""
+        """Return the test cases of one area, such as "rule"."""
         if area == "large":
             return list(questions.lattices()) if self.large else []
         count = self.cases if area == "random" else 0

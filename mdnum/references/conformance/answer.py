@@ -23,12 +23,12 @@ _ROWS = "pairs one by one are to be tuples (i, j) in a list, or rows of an array
 
 
 class Malformed(Exception):
-    """Raised if a returned value is not a list of pairs; the message gives the reason."""
+    """Raised if a neighbor list returns a value that is not a list of pairs; the message has the reason."""
 
 
 @dataclass(frozen=True)
 class ListAnswer:
-    """Pairs returned by a neighbor list, one per row."""
+    """Pairs returned by a neighbor list, one pair per row."""
 
     # i, j: atoms, shape (rows,)
     i: np.ndarray
@@ -43,7 +43,7 @@ class ListAnswer:
         return len(self.i)
 
     def same(self, other: ListAnswer) -> bool:
-        """Return whether another answer has the same rows in the same order."""
+        """Return whether another list of pairs has the same rows in the same order."""
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
 
@@ -51,12 +51,12 @@ def read(given: Any) -> ListAnswer:
     """Return the pairs in a neighbor list's return value as a `ListAnswer`.
 
     A neighbor list may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance,
-    vector), or any of these without the parts in between: a part with one number per row is a distance, the
-    first part with three integers per row is the shift, another part with three numbers per row is the
-    vector. A neighbor list may return a mapping with the keys i, j, shift, distance and vector, or an object
-    with attributes of these names. A neighbor list may also return single pairs: a list of tuples (i, j), or
-    one array with a row (i, j) for each pair. A Python list of lists is always read as parts, not as pairs,
-    since some such lists would be ambiguous.
+    vector), or fewer of these arrays. An array with one number per row is a distance, the first array with
+    three integers per row is the shift, and another array with three numbers per row is the vector. A mapping
+    with the keys i, j, shift, distance and vector, or an object with attributes of these names, is also
+    accepted. Single pairs are accepted too: a list of tuples (i, j), or one array with a row (i, j) for each
+    pair. A Python list of lists is always read as arrays, not as pairs, since some such lists would be
+    ambiguous.
 
     Raises:
         Malformed: the value has none of these forms.
@@ -79,7 +79,7 @@ def read(given: Any) -> ListAnswer:
 
 
 def parts(given: Any) -> dict[str, Any]:
-    """Return the parts of a neighbor list's answer under the names of `ListAnswer`, with at least i and j.
+    """Return the arrays of a neighbor list's result, named as in `ListAnswer`, with at least i and j.
 
     Raises:
         Malformed: the value is not a list of pairs.
@@ -101,7 +101,7 @@ def parts(given: Any) -> dict[str, Any]:
 
 
 def _one_by_one(given: Any) -> dict[str, Any]:
-    """Return the arrays i and j from rows (i, j)."""
+    """Return the arrays i and j from rows that contain pairs (i, j)."""
     table = _array(given, "the answer")
     if table.size == 0 and table.ndim:
         table = np.zeros((0, 2), np.int64)
@@ -114,7 +114,7 @@ def _one_by_one(given: Any) -> dict[str, Any]:
 
 
 def _in_order(arrays: list[np.ndarray]) -> dict[str, Any]:
-    """Identify the parts of a returned tuple by their position and shape."""
+    """Identify the arrays of a returned tuple by their position and shape."""
     if not 2 <= len(arrays) <= 5:
         raise Malformed(f"it returned {len(arrays)} parts, not (i, j), (i, j, shift), ...; {_ROWS}")
     first, second = arrays[:2]

@@ -1,4 +1,4 @@
-"""Test cases for neighbor lists, with atoms in a box at one moment or in a sequence."""
+"""Test cases for neighbor lists: atoms in a box, for a single call or for a sequence of calls."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ Length = Annotated[FiniteFloat, Ge(0)]
 
 @dataclass(frozen=True)
 class Still:
-    """Positions of the atoms at one moment."""
+    """Positions of the atoms, with cell and skin, at one call of a neighbor list."""
 
     positions: Rows  # length, shape (atoms, 3)
     cell: Vectors  # lattice vectors as rows, length; rows of axes that do not repeat may hold anything finite
@@ -61,7 +61,7 @@ class Still:
 
 @dataclass(frozen=True)
 class Case:
-    """A test case: atoms in a box at one or several moments, and a cutoff."""
+    """A test case: atoms in a box at one call or several, and a cutoff."""
 
     name: str  # what is special, in words
     area: str  # a key of `AREAS`
@@ -77,20 +77,20 @@ class Case:
 
     @property
     def atoms(self) -> int:
-        """Number of atoms in the case, the largest number if it changes."""
+        """Number of atoms in the test case; the largest number if the number changes between calls."""
         return max(len(still.positions) for still in self.stills)
 
     @property
     def steps(self) -> int:
-        """Number of calls of the neighbor list in the case."""
+        """Number of calls of the neighbor list in the test case."""
         return len(self.stills)
 
     def until(self, steps: int) -> Case:
-        """Return the test case with only its first `steps` steps."""
+        """Return the test case with only its first `steps` calls."""
         return replace(self, stills=self.stills[:steps])
 
     def only(self, atoms: ndarray) -> Case:
-        """Return the test case with only some atoms, in the given order, where they exist."""
+        """Return the test case with only some atoms, in the given order, at every call where these exist."""
         stills = tuple(
             replace(still, positions=still.positions[atoms[atoms < len(still.positions)]])
             for still in self.stills
@@ -98,7 +98,7 @@ class Case:
         return replace(self, stills=stills, known=None if self.known is None else _among(self.known, atoms))
 
     def changed(self, positions: Any = None, cell: Any = None, **other: Any) -> Case:
-        """Return the test case with functions applied to the positions and to the cell at every step."""
+        """Return the test case with functions applied to the positions and to the cell at every call."""
         same = lambda rows: rows  # noqa: E731
         x, box = positions or same, cell or same
         stills = tuple(replace(one, positions=x(one.positions), cell=box(one.cell)) for one in self.stills)
@@ -132,7 +132,7 @@ def once(
     r_cut: float = 1.0,
     known: PairSet | None = None,
 ) -> Case:
-    """Return a test case with the atoms at one moment; without a cell, the atoms are free."""
+    """Return a test case with a single call; without a cell, the atoms are not in a box."""
     if cell is None:
         cell, pbc = np.zeros((3, 3)), False
     return Case(name, area, (Still(positions, matrix(cell)),), _axes(pbc), float(r_cut), known=known)
@@ -147,14 +147,14 @@ def sequence(
     skin: float = 0.3,
     pbc: bool | Sequence[bool] = True,
 ) -> Case:
-    """Return a test case with several successive moments, each given by positions or (positions, cell)."""
+    """Return a test case with successive calls, each given by positions or by (positions, cell)."""
     places = (place if isinstance(place, tuple) else (place, cell) for place in path)
     stills = tuple(Still(positions, matrix(box)) for positions, box in places)
     return Case(name, area, stills, _axes(pbc), float(r_cut), float(skin))
 
 
 def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
-    """Return the pairs among some of the atoms, with the indices of these atoms in the smaller case."""
+    """Return the pairs among some of the atoms, with the indices of these atoms in the smaller test case."""
     most = int(max(atoms.max(initial=-1), pairs.i.max(initial=-1), pairs.j.max(initial=-1))) + 1
     new = np.full(most, -1)
     new[atoms] = np.arange(len(atoms))
@@ -170,5 +170,5 @@ def gas(count: int, cell, seed: int, low: float = 0.0, high: float = 1.0) -> nda
 
 
 def grid(count: int) -> ndarray:
-    """Return all integer coordinates of a cube with `count` points along each edge."""
+    """Return all integer coordinates in a cube with `count` points along each edge."""
     return np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), -1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Compare the pairs from a neighbor list with the exact pairs, classify the errors, and count the results."""
+"""Compare the pairs from a neighbor list with the exact pairs, classify errors, and count the results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SILENT = ("CRASHED", "NO_ANSWER", "RAISED")  # those of cases in which nothing c
 
 @dataclass(frozen=True)
 class Truth(PairSet):
-    """Exact pairs at one step of a test case, inside the cutoff and out to the requested reach."""
+    """Exact pairs at one call in a test case, inside the cutoff and out to a larger distance."""
 
     # positions, cell: as the list was given them; rows of axes that do not repeat are zero
     positions: ndarray
@@ -46,21 +46,21 @@ class Truth(PairSet):
     reach: float  # pairs as far as this may be listed, length; the cutoff unless a list holds a skin
 
     def needed(self, unit: float) -> ndarray:
-        """Return a mask of the pairs that a list with this unit roundoff must contain."""
+        """Return a mask of the pairs that a neighbor list with this unit roundoff must contain."""
         return self.distance < self.r_cut - unit * self.scale
 
     def allowed(self, unit: float) -> ndarray:
-        """Return a mask of the pairs that a list with this unit roundoff may contain."""
+        """Return a mask of the pairs that a neighbor list with this unit roundoff may contain."""
         return self.distance <= self.reach + unit * self.scale
 
 
 def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DOUBLE) -> Truth:
-    """Compute the exact pairs of a test case at one of its steps.
+    """Compute the exact pairs of a test case at one of its calls.
 
     Args:
-        reach: largest distance of listed pairs, length; the cutoff by default.
-        unit: the largest unit roundoff that will be used.
-    Error: decisions within rounding of the cutoff use rational arithmetic; see `all_pairs`.
+        reach: largest distance of the pairs, length; the cutoff by default.
+        unit: the largest unit roundoff of a neighbor list that is compared with these pairs.
+    Error: decisions within rounding error of the cutoff use rational arithmetic; see `all_pairs`.
     """
     still, pbc = case.stills[step], np.array(case.pbc)
     positions, r_cut = still.positions, case.r_cut
@@ -81,7 +81,7 @@ def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DO
 
 
 def conditioning(cell: ndarray, pbc: ndarray) -> float:
-    """Factor by which conversion to fractional coordinates and back can amplify rounding errors; at least 1.
+    """Factor (at least 1) by which conversion to fractional coordinates and back amplifies rounding errors.
 
     Source: Higham, Accuracy and Stability, 2nd ed., section 7.1: the condition number of the periodic lattice
     vectors, each scaled to length 1 because lengths alone have no effect.
@@ -93,9 +93,9 @@ def conditioning(cell: ndarray, pbc: ndarray) -> float:
 
 
 def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tuple) -> list[ndarray]:
-    """Return an integer key for each row (i, j, shift), of these rows and of `others`, equal for equal rows.
+    """Return an integer key for each row (i, j, shift) and each row of `others`; equal rows have equal keys.
 
-    `count` is the number of atoms; without shifts, rows are identified by their atoms alone.
+    `count` is the number of atoms; without shifts, rows with the same two atoms have equal keys.
     """
     sets = [(i, j, shift), *others]
     lengths = np.cumsum([0, *(len(rows[0]) for rows in sets)])
@@ -118,7 +118,7 @@ def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tup
 
 @dataclass(frozen=True)
 class Conventions:
-    """Conventions of a neighbor list, none of which counts as an error."""
+    """Conventions of a neighbor list; no choice among these conventions counts as an error."""
 
     full: bool = True  # every pair from both of its atoms (True), or once (False)
     sign: int = 1  # +1 where shifts are added to atom j, -1 where they are added to atom i
@@ -128,7 +128,7 @@ class Conventions:
 
 @dataclass(frozen=True)
 class Failure:
-    """One error in an answer."""
+    """One error in the pairs returned by a neighbor list."""
 
     code: Code  # one of `CODES`
     text: str  # what was seen, with atoms and numbers
@@ -136,25 +136,25 @@ class Failure:
 
     @property
     def kind(self) -> tuple[str, str]:
-        """Error code, and message of an exception or crash, which a smaller case must reproduce."""
+        """Error code and exception message; a reduced test case must reproduce both."""
         text = self.text if self.code in ("RAISED", "CRASHED", "MALFORMED") else ""
         return self.code, without_numbers(text)
 
 
 def without_numbers(text: str) -> str:
-    """Replace the numbers in a message, so that messages with different numbers compare equal."""
+    """Replace the numbers in a message by a symbol, so that messages that differ in numbers compare equal."""
     return re.sub(r"[-+\d.e]+", "#", text)
 
 
 def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Return all errors in the pairs from a neighbor list; empty if the pairs conform.
+    """Return all errors in the pairs from a neighbor list; empty if the list conforms.
 
-    A pair within rounding error of the cutoff (`Truth.scale` times the unit roundoff of the list) may be
-    present or absent, but in the same way for both of its atoms.
+    A pair within rounding error of the cutoff (`Truth.scale` times the list's unit roundoff) may be present
+    or absent, but must be listed consistently from both of its atoms.
 
     Args:
-        truth: exact pairs, listed as far as the answer may reach.
-        how: conventions of the list.
+        truth: exact pairs, including all distances at which pairs may be listed.
+        how: conventions of the neighbor list.
     """
     n = len(truth.positions)
     outside = (answer.i < 0) | (answer.i >= n) | (answer.j < 0) | (answer.j >= n)
@@ -246,14 +246,14 @@ def _through(shift: ndarray) -> str:
 
 
 def _both(truth: Truth) -> tuple[ndarray, ndarray, ndarray]:
-    """Return every exact pair twice, once from each of its atoms."""
+    """Return every exact pair twice, once from each of its two atoms."""
     columns = (truth.i, truth.j), (truth.j, truth.i), (truth.shift, -truth.shift)
     i, j, shift = map(np.concatenate, columns)
     return i, j, shift
 
 
 def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Orient every pair so that i < j or, for equal atoms, so that the first nonzero shift is positive."""
+    """Orient every pair so that i < j or, for i = j, so that the first nonzero shift is positive."""
     a, b, c = shift.T if len(shift) else np.zeros((3, 0), np.int64)
     leading = (a > 0) | ((a == 0) & ((b > 0) | ((b == 0) & (c > 0))))
     turn = (i > j) | ((i == j) & ~leading)
@@ -261,7 +261,7 @@ def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, 
 
 
 def _shift_hint(answer: ListAnswer, truth: Truth, how: Conventions) -> str:
-    """Return a hint at the convention that would explain wrong shifts, as text."""
+    """Return a hint, as text, at a shift convention that would explain wrong shifts."""
     assert answer.shift is not None
     if not _compare(answer, truth, replace(how, sign=-how.sign)):
         return "; added to the other atom they are right"
@@ -273,7 +273,7 @@ def _shift_hint(answer: ListAnswer, truth: Truth, how: Conventions) -> str:
 
 
 def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Return the errors of listed distances and vectors, for an answer whose pairs are correct."""
+    """Return the errors of distances and vectors in a neighbor list whose pairs are correct."""
     if answer.distance is None and answer.vector is None:
         return []
     # a bound for a length near the cutoff; a code may form it from squares of its coordinates' differences
@@ -309,7 +309,7 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """Return the rounding error of an answer if correct in float32, as in `CaseResult.single`, else None."""
+    """Return the rounding error (`CaseResult.single`) of a result that is correct in float32, else None."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))
@@ -356,7 +356,7 @@ class CaseResult:
 
 @dataclass(frozen=True)
 class Failed:
-    """A failed test case, reduced to a few atoms if it was shrunk."""
+    """A failed test case, reduced to a few atoms if possible."""
 
     case: Case  # up to the step that failed; its name and area are those of the question
     failures: tuple[Failure, ...]  # what was wrong at that step
@@ -371,7 +371,7 @@ class Failed:
 
     @property
     def worst(self) -> Failure:
-        """The most severe failure of the test case, which is the one reported."""
+        """The most severe failure of the test case, which is reported."""
         return min(self.failures, key=lambda failure: CODES.index(failure.code))
 
     @property
@@ -382,16 +382,16 @@ class Failed:
 
 @dataclass
 class CaseAnswers:
-    """Results of all test cases, by number of the case, and the failures reduced to a few atoms.
+    """Results of all test cases, by number of the test case, and failures reduced to a few atoms.
 
-    A resumed examination draws the same test cases from the same seed, so the test cases are not stored.
+    When an examination is resumed, the same seed gives the same test cases, so these are not stored.
     """
 
     cases: dict[str, CaseResult] = field(default_factory=dict)
     shrunk: dict[str, Failed] = field(default_factory=dict)
 
     def of(self, number: int, case: Case) -> CaseResult | None:
-        """Return the result of a test case or None; raise InputError if the stored case differs."""
+        """Return the stored result of a test case or None; raise InputError if the stored case differs."""
         result = self.cases.get(str(number))
         if result is None:
             return None
@@ -408,7 +408,7 @@ class CaseAnswers:
 
 @dataclass(frozen=True)
 class RefusalKind:
-    """A kind of test case that a neighbor list rejects."""
+    """A kind of test case that a neighbor list rejects with an exception."""
 
     exception: str  # in words
     case: Case  # the smallest question that met it, up to the step that was refused
@@ -421,7 +421,7 @@ class RefusalKind:
 
 @dataclass
 class AreaTally:
-    """Counts of the test results in one area of the suite."""
+    """Numbers of test cases in one area of the suite, by result."""
 
     # asked, refused, skipped: cases; refused by the list itself, skipped because of its limits
     asked: int = 0
@@ -432,23 +432,23 @@ class AreaTally:
 
     @property
     def failed(self) -> int:
-        """Number of test cases with a wrong answer, or without any answer."""
+        """Number of test cases with wrong pairs, or with an error instead of pairs."""
         return sum(self.codes.values())
 
     @property
     def silent(self) -> int:
-        """Number of failed test cases in which the neighbor list returned nothing."""
+        """Number of failed test cases in which the neighbor list returned no pairs."""
         return sum(self.codes.get(code, 0) for code in SILENT)
 
     @property
     def passed(self) -> int:
-        """Number of test cases answered correctly."""
+        """Number of test cases in which the pairs are correct."""
         return self.asked - self.failed - self.refused
 
 
 @dataclass
 class Report:
-    """Results of the conformance suite for one list."""
+    """Results of the conformance suite for one neighbor list."""
 
     tested: PairList  # the list
     how: Conventions = field(default_factory=Conventions)  # its conventions, as declared or found out
@@ -512,34 +512,34 @@ class Report:
             tally.why[result.refused[1]] = tally.why.get(result.refused[1], 0) + 1
 
     def reach(self, case: Case) -> float:
-        """Return the largest pair distance allowed for a list that includes pairs beyond the cutoff, length.
+        """Return the largest pair distance (length) allowed in a list with pairs beyond the cutoff.
 
-        Both atoms of a listed pair may have moved as far as the skin allows since the list was built.
+        Since the list was built, both atoms of a pair may have moved as far as the skin allows.
         """
         usual = case.r_cut + 2 * case.skin if case.skin else 1.5 * case.r_cut
         own = 0.3 * (self.padding or 1.0)  # asked with a skin of 0.3 cutoffs
         return usual if own < 0.31 else max(usual, (1 + 2 * own) * case.r_cut)
 
     def total(self, count: str) -> int:
-        """Return the sum of a count over all areas of the suite."""
+        """Return the sum of one of the counts over all areas of the suite."""
         return sum(getattr(tally, count) for tally in self.areas.values())
 
     @property
     def asked(self) -> int:
-        """Number of cases that ran."""
+        """Number of test cases that were run."""
         return self.total("asked")
 
     @property
     def left(self) -> int:
-        """Number of test cases that neither ran nor were skipped."""
+        """Number of test cases that were neither run nor skipped."""
         return self.questions - self.asked - self.total("skipped")
 
     @property
     def wrong(self) -> int:
-        """Number of failed cases."""
+        """Number of failed test cases."""
         return self.total("failed")
 
     @property
     def conforms(self) -> bool:
-        """Whether the neighbor list was tested and no test case failed."""
+        """True if the neighbor list was tested and no test case failed."""
         return self.wrong == 0 and self.asked > self.total("refused")

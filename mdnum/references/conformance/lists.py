@@ -1,4 +1,4 @@
-"""Interfaces of neighbor lists under test: calls, declared limits and creation."""
+"""Neighbor lists under test: how they are called, their declared limits, and their creation from objects."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from mdnum.registry import Registry
 
 
 class KeptList(Protocol):
-    """A neighbor list that is kept and updated; both methods return pairs that `answer.read` accepts.
+    """A neighbor list that is kept and updated; both methods return pairs in a form that `answer.read` takes.
 
-    `allocate` builds a new list and may be called again on the same object; `update` gets the current
-    positions. The returned pairs must include every pair within r_cut at the positions of this call, and may
-    include pairs slightly farther apart, within the skin. A neighbor list with its own padding, independent
-    of the given skin, states this padding in an attribute `skin` (length), which is read after each
-    `allocate`.
+    `allocate` builds a new list and may be called again on the same object; `update` receives the current
+    positions. The returned pairs must include every pair within r_cut at the current positions, and may
+    include pairs that are farther apart by less than the skin. If a neighbor list uses its own padding
+    instead of the given skin, an attribute `skin` must contain this padding (length); the attribute is read
+    after each `allocate`.
     """
 
     def allocate(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float, skin: float) -> Any:
@@ -35,7 +35,7 @@ class KeptList(Protocol):
     def update(self, positions: ndarray, cell: ndarray) -> Any:
         """Update the neighbor list to new positions and return its pairs.
 
-        The arguments may be the arrays of the previous call with new contents: store copies, not references.
+        The arguments may be the arrays of the previous call with new contents: store copies of the arguments.
         """
         ...
 
@@ -48,7 +48,7 @@ _WANTED = f"Give a function of ({', '.join(_GIVEN)}) that returns (i, j)"
 
 @dataclass(frozen=True)
 class ListLimits:
-    """Limits of a neighbor list; test cases beyond them are skipped and counted."""
+    """Limits of a neighbor list; test cases beyond these limits are skipped and counted."""
 
     minimum_image: bool = False  # one image of a pair at most: no cell narrower than two cutoffs (and skins)
     orthorhombic: bool = False  # no cell with other than right angles
@@ -69,7 +69,7 @@ class ListLimits:
     roomy: float = np.inf  # no box of more cells of r_cut than this along all axes together
 
     def refusal(self, case: Case) -> str | None:
-        """Return why a test case is beyond these limits, or None if it is within them."""
+        """Return the limit that a test case exceeds, as text; None if the test case is within all limits."""
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
@@ -144,7 +144,7 @@ class PairList:
 
     @property
     def lacks(self) -> list[str]:
-        """Python distributions that the neighbor list requires and that are not installed."""
+        """Python distributions that the neighbor list requires but that are not installed."""
         needed = (*((self.package,) if self.package else ()), *self.needs)
         return [name for name in needed if version(name) is None]
 
@@ -159,7 +159,7 @@ LISTS: Registry[PairList] = Registry("neighbor list", "mdnum.neighbor_lists")
 
 
 def source_of(made: Any) -> str:
-    """Return the source of a function or class without decorators; empty if it is not available."""
+    """Return the source code of a function or class without decorators; empty if not available."""
     try:
         lines = inspect.getsource(made).splitlines(keepends=True)
     except (OSError, TypeError):
@@ -169,13 +169,13 @@ def source_of(made: Any) -> str:
 
 
 def from_object(made: Any, name: str | None = None, source: str | None = None) -> PairList:
-    """Return a `PairList` for a function, for a class of kept lists, or for a kept list.
+    """Return a `PairList` for a function, for a class of updatable lists, or for an instance of one.
 
     Declared properties are read from the attributes `full` (bool), `unit` (roundoff), `superset` (bool) and
     `limits` (`ListLimits`) of the object, if present.
 
     Raises:
-        InputError: the object is none of these.
+        InputError: the object is neither a function nor a neighbor list.
     """
     if isinstance(made, PairList):
         return made
@@ -204,7 +204,7 @@ def from_object(made: Any, name: str | None = None, source: str | None = None) -
 
 
 def _check_signatures(made: Any, name: str, kept: bool) -> None:
-    """Raise InputError if the signature of a neighbor list does not accept the suite's arguments."""
+    """Raise InputError if a neighbor list cannot be called with the suite's arguments."""
     is_class = inspect.isclass(made)
     calls: list[tuple[str, Any, tuple[str, ...]]] = []
     if is_class or not kept:

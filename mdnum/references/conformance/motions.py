@@ -1,12 +1,12 @@
-"""Motion sequences that test kept neighbor lists, with the smallest motions that require a rebuild.
+"""Motion sequences that test updatable neighbor lists with the smallest motions that require a rebuild.
 
-A pair that was just beyond r_cut + padding when the list was built is inside the cutoff once its two atoms
-have approached by the padding; the smallest motion that achieves this is along the line between them. A rule
-that tests whether two atoms could have approached by the padding rebuilds the list in time, for any
-direction, any division of the motion between the two atoms and any motion of the other atoms. Each sequence
-of `motions` therefore brings a pair closer by slightly more than the padding: along axes, diagonals and
-random directions; by both atoms or one, in any proportion; alone, among atoms at rest, among hundreds that
-move little, among others with the same motion or a common drift; in one step, slowly, and back and forth.
+A pair that is just beyond r_cut + padding when the list is built enters the cutoff when its two atoms have
+approached by the padding; the smallest motion that achieves this is along the line between the two atoms. The
+list is rebuilt in time, for any direction and any motion of other atoms, if the rebuild criterion tests
+whether two atoms could have approached by the padding. Each sequence of `motions` therefore brings a pair
+closer by slightly more than the padding: along axes, diagonals and random directions; by moving both atoms or
+one, in any proportion; alone, among atoms at rest, among hundreds of atoms that move little, among others
+with the same motion or a common drift; in one step, slowly, and back and forth.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _GOLDEN = 0.6180339887498949  # its multiples, modulo 1, are spread evenly
 
 
 def movers() -> Iterator[Case]:
-    """Yield motion sequences for a kept neighbor list, short sequences first."""
+    """Yield motion sequences for an updatable neighbor list, short sequences first."""
     areas = {_pairs: "motion", _many: "motion", _wrapping: "wrapping", _strain: "strain"}
     for scripts, area in areas.items():
         yield from (sequence(name, area, path, *rest) for name, path, *rest in scripts())
@@ -47,7 +47,7 @@ def movers() -> Iterator[Case]:
 
 
 def sequences() -> Iterator[Case]:
-    """Yield sequences for a list that is built anew at each call, to test that no internal state matters."""
+    """Yield sequences for a list that is rebuilt at each call, to test that it keeps no internal state."""
     for case in _reuse():
         yield replace(case, skin=0.0)
 
@@ -58,7 +58,7 @@ def _two(apart: float) -> ndarray:
 
 
 def _beside(apart: float) -> ndarray:
-    """Return positions of two atoms at a given distance along x, the first atom fixed in the middle."""
+    """Return positions of two atoms at a given distance along x; the first atom is always at `_MIDDLE`."""
     return np.array([_MIDDLE, _MIDDLE + np.array([apart, 0, 0])])
 
 
@@ -166,7 +166,7 @@ def _strain() -> Script:
 
 
 def _narrow() -> Iterator[Case]:
-    """Yield boxes so narrow that pairs have several images within the cutoff, and so do single atoms."""
+    """Yield boxes so narrow that several images of a pair, or images of one atom, are inside the cutoff."""
     skewed = np.array([[0.9, 0, 0], [0.5, 0.8, 0], [-0.4, 0.3, 0.85]])
     for word, count, cell, pbc in (
         ("an atom alone, edges of 0.8 cutoffs", 1, 0.8, True),
@@ -216,8 +216,8 @@ def motions(padding: float | None = None) -> Iterator[Case]:
     """Yield sequences of small motions, short sequences first; `Case.motions` counts the motions.
 
     Args:
-        padding: measured or stated padding of the list, in units of the given skin; None if unknown: the
-            given skin is tried first, then a series of other values.
+        padding: measured or declared padding of the list, in units of the given skin; if None, the given skin
+            is tried first, then a series of other values.
     """
     room = _SKIN * (padding or 1.0)
     edge = max(6.0, 2.6 * (_R + room))
@@ -267,7 +267,7 @@ def motions(padding: float | None = None) -> Iterator[Case]:
 
 
 def _ways() -> list[ndarray]:
-    """Return unit vectors along axes, along diagonals of faces and of the cube, and in random directions."""
+    """Return unit vectors along axes, along face and body diagonals, and in random directions."""
     ways = [np.array(way, float) for way in itertools.product((-1, 0, 1), repeat=3) if way > (0, 0, 0)]
     ways.sort(key=lambda way: (np.count_nonzero(way), tuple(-way)))
     ways += list(np.random.default_rng(140).normal(size=(3, 3)))
@@ -280,7 +280,7 @@ def _closing(room: float) -> float:
 
 
 def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
-    """Return pairs that start just beyond the padding, with all first atoms before all second atoms."""
+    """Return pairs at a distance just beyond the padding; the first atoms of all pairs come first."""
     half = (_R + (1 + HAIR) * room) / 2 * way
     return np.vstack([middle - half, middle + half])
 
@@ -295,9 +295,9 @@ def _walk(
 
 
 def _squeezed(room: float, way: ndarray, edge: float, n: int, along: bool) -> list[tuple[ndarray, ndarray]]:
-    """Return a path in which the strain of the box alone brings two atoms together.
+    """Return a path on which only the strain of the box brings two atoms together.
 
-    The box shrinks along the direction between the atoms only, or along all axes.
+    The box shrinks along the direction between the two atoms, or along all axes.
     """
     (start, _), cell = _walk(room, way, 0.5, edge, n), edge * np.eye(3)
     loss = _closing(room) / (_R + (1 + HAIR) * room)
@@ -306,10 +306,10 @@ def _squeezed(room: float, way: ndarray, edge: float, n: int, along: bool) -> li
 
 
 def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
-    """Return a path in which two of many atoms approach each other, and the others rest or move little.
+    """Return a path on which two of many atoms approach each other; the others rest or move slightly.
 
-    The division of the motion between the two atoms depends on `n`. The index of the atom that moves most
-    varies evenly over all indices; the index of its partner is random.
+    The fraction of the motion made by each of the two atoms depends on `n`. The index of the atom that moves
+    most varies evenly over all indices; its partner's index is random.
     """
     rng = np.random.default_rng(170 + n)
     most = int(count * (1.0 - (n + 1) * _GOLDEN % 1.0))
@@ -323,7 +323,7 @@ def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: f
 
 
 def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:
-    """Return a path of a pair among ten atoms that all drift, across or along the pair's motion."""
+    """Return a path of a pair among ten atoms that all drift, across or along the motion of the pair."""
     start, end = _with(gas(12, edge, 180 + n), [4, 5], _walk(room, way, 0.5, edge, n))
     across = np.cross(way, np.roll(way, 1) + np.array([0.3, -0.2, 0.1]))
     across /= np.linalg.norm(across)
@@ -331,7 +331,7 @@ def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:
 
 
 def _with(others: ndarray, atoms: list[int], path: list[ndarray]) -> list[ndarray]:
-    """Return a path of some atoms among others at rest."""
+    """Return a path of some atoms among other atoms at rest."""
     stills = [others.copy() for _ in path]
     for still, place in zip(stills, path, strict=True):
         still[atoms] = place
@@ -339,14 +339,14 @@ def _with(others: ndarray, atoms: list[int], path: list[ndarray]) -> list[ndarra
 
 
 def _dozen(room: float, way: ndarray, share: float, n: int) -> list[ndarray]:
-    """Return a path of twelve pairs at different places that all make the same motion."""
+    """Return a path on which twelve pairs at different positions make the same motion."""
     start = _around(_places(12, 12.0, n), room, way)
     moves = _closing(room) * np.repeat([share * way, (share - 1.0) * way], 12, axis=0)
     return [start, start + moves]
 
 
 def _in_turn(room: float, ways: list[ndarray]) -> Case:
-    """Return a test case of 25 pairs whose 50 atoms move in turn, to detect atoms that a rule ignores."""
+    """Return a test case in which 50 atoms (25 pairs) move in turn, to find atoms ignored by a criterion."""
     count = 25
     way = np.array([ways[n % len(ways)] for n in range(count)])
     start = _around(_places(count, 15.0, 0), room, way)
@@ -364,7 +364,7 @@ def _in_turn(room: float, ways: list[ndarray]) -> Case:
 
 
 def _ladder(room: float, way: ndarray, n: int) -> Case:
-    """Return a test case in which pairs from various distances approach until each is inside the cutoff."""
+    """Return a test case in which pairs at different distances approach until each is inside the cutoff."""
     start = _around(_places(len(_RUNGS), 12.0, n), room * _RUNGS[:, None], way)
     inward = np.repeat([0.5 * way, -0.5 * way], len(_RUNGS), axis=0)
     path = [start + _closing(room) * closed * inward for closed in (0.0, *_RUNGS)]
@@ -373,7 +373,7 @@ def _ladder(room: float, way: ndarray, n: int) -> Case:
 
 
 def _one_by_one(room: float, way: ndarray, share: float, n: int) -> Case:
-    """Return a test case in which pairs from various distances approach and return, one pair at a time."""
+    """Return a test case in which pairs at different distances approach and return, one pair at a time."""
     count = len(_RUNGS)
     start = _around(_places(count, 12.0, n + 1), room * _RUNGS[:, None], way)
     path = [start]
@@ -394,13 +394,13 @@ def _direction(way: ndarray) -> str:
 
 
 def _places(count: int, edge: float, n: int) -> ndarray:
-    """Return separate positions for pairs, in random order."""
+    """Return positions for pairs, far from one another and in random order."""
     side = int(np.ceil(count ** (1 / 3)))
     return edge * np.random.default_rng(200 + n).permutation((grid(side) + 0.5) / side)[:count]
 
 
 def _sequence(name: str, paths: Iterable[list[Any]], cell: float | ndarray, skin: float = _SKIN) -> Case:
-    """Return a test case of successive motions, with far moves in between that make any rule rebuild."""
+    """Return a test case of successive motions, separated by large moves that make any criterion rebuild."""
     paths = list(paths)
     case = sequence(name, "rule", [still for path in paths for still in path], cell, _R, skin)
     return replace(case, motions=len(paths))

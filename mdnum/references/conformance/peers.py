@@ -1,8 +1,8 @@
-"""Neighbor searches of libraries, by name, and lookup of any list by name or `module:function`.
+"""Neighbor searches of libraries, and lookup of any neighbor list by name or `module:function`.
 
-Every function and class in this module imports what it needs and uses nothing defined outside it, because its
-source is printed in scripts that reproduce a failure without mdnum. Each of them calls its library as a user
-would and corrects nothing: atoms outside the box, unusual cells and few atoms are passed on unchanged.
+Every function and class in this module imports what it requires and uses nothing else from this module, since
+its source is copied into scripts that reproduce a failure without mdnum. Each function calls its library as a
+user would and corrects nothing: atoms outside the box, unusual cells and few atoms are passed on unchanged.
 """
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalCall=false
@@ -34,11 +34,11 @@ def _declared(name: str) -> dict[str, Any]:
 
 
 def peer(*names: str, helpers: Sequence[Any] = ()) -> Callable[[Any], Any]:
-    """Return a decorator that registers a function, or a class of kept lists, in `LISTS` under these names.
+    """Return a decorator that registers a function or a class of updatable lists in `LISTS` under some names.
 
     Args:
-        names: of peers.toml.
-        helpers: other objects that its source needs, for a script without mdnum.
+        names: names listed in peers.toml.
+        helpers: other objects used in the source of the decorated object, for scripts without mdnum.
     """
 
     def register(made: Any) -> Any:
@@ -65,7 +65,7 @@ def peer(*names: str, helpers: Sequence[Any] = ()) -> Callable[[Any], Any]:
 
 @peer("numpy-r2", "numpy")
 def numpy_pairs(positions, cell, pbc, r_cut, squared=False):
-    """Brute-force search in plain numpy, one image of every pair."""
+    """Brute-force search in plain numpy that tests one image of every pair."""
 
     import numpy as np
 
@@ -94,7 +94,7 @@ def ase_neighbor_list(positions, cell, pbc, r_cut):
 
 @peer("ase-skin")
 class AseSkinList:
-    """ASE's class ase.neighborlist.NeighborList, with a skin that each of two atoms may use up."""
+    """The class ase.neighborlist.NeighborList of ASE, with a skin that each of two atoms may use up."""
 
     kept = pbc = None
 
@@ -129,13 +129,13 @@ class AseSkinList:
 
 @peer("ase-primitive", helpers=[AseSkinList])
 def ase_primitive_list(positions, cell, pbc, r_cut):
-    """ASE's PrimitiveNeighborList, used by its LennardJones, EAM and Tersoff calculators."""
+    """The class PrimitiveNeighborList of ASE, used by its calculators LennardJones, EAM and Tersoff."""
     return AseSkinList("PrimitiveNeighborList").allocate(positions, cell, pbc, r_cut, 0.0)
 
 
 @peer("vesin", "vesin-half")
 def vesin_cells(positions, cell, pbc, r_cut, half=False):
-    """The cell list of vesin, with every pair listed from both atoms."""
+    """The cell list of vesin, in which every pair is listed from both atoms."""
 
     from vesin import NeighborList
 
@@ -180,7 +180,7 @@ def pymatgen_points(positions, cell, pbc, r_cut):
 
 @peer("mdanalysis", "mdanalysis-brute")
 def mdanalysis_pairs(positions, cell, pbc, r_cut, method="nsgrid"):
-    """MDAnalysis's nsgrid search."""
+    """The nsgrid search of MDAnalysis."""
 
     import numpy as np
     from MDAnalysis.lib.distances import self_capped_distance
@@ -193,7 +193,7 @@ def mdanalysis_pairs(positions, cell, pbc, r_cut, method="nsgrid"):
 
 @peer("scipy")
 def scipy_tree(positions, cell, pbc, r_cut):
-    """SciPy's k-d tree search, scipy.spatial.KDTree.query_pairs."""
+    """The k-d tree search of SciPy, scipy.spatial.KDTree.query_pairs."""
 
     import numpy as np
     from scipy.spatial import KDTree
@@ -260,7 +260,7 @@ def nvalchemi_pairs(positions, cell, pbc, r_cut, room=64):
 
 @peer("jax-md-kept")
 class JaxMdList:
-    """The function partition.neighbor_list of jax-md, used with updates as in its documentation."""
+    """The function partition.neighbor_list of jax-md, with updates as shown in its documentation."""
 
     found = neighbor = step = None
     skewed = free = False
@@ -331,7 +331,7 @@ def jax_md_pairs(positions, cell, pbc, r_cut):
 
 @peer("mdnum-verlet")
 class MdnumVerletList:
-    """The Verlet list of mdnum, rebuilt before motion and box strain use up its skin."""
+    """The Verlet list of mdnum, rebuilt before motion and box strain exceed the skin."""
 
     listed = built = pbc = None
 
@@ -359,7 +359,7 @@ class MdnumVerletList:
 
 @peer("mdnum", helpers=[MdnumVerletList])
 def mdnum_host_list(positions, cell, pbc, r_cut):
-    """Cell list of mdnum."""
+    """The cell list of mdnum."""
     return MdnumVerletList().allocate(positions, cell, pbc, r_cut, 0.0)
 
 
@@ -367,7 +367,7 @@ def mdnum_host_list(positions, cell, pbc, r_cut):
 
 
 def known() -> tuple[PairList, ...]:
-    """Return every named neighbor list, whether its package is installed or not."""
+    """Return all neighbor lists that have a name, even if their packages are not installed."""
 
     def named(name: str) -> PairList:
         listed = LISTS[name]
@@ -380,7 +380,7 @@ def known() -> tuple[PairList, ...]:
 
 
 def installed() -> tuple[PairList, ...]:
-    """Return the named neighbor lists whose packages are installed."""
+    """Return the neighbor lists that have a name and whose packages are installed."""
     return tuple(listed for listed in known() if not listed.lacks)
 
 
@@ -390,11 +390,11 @@ def load(word: str) -> PairList:
     Args:
         word: a name from `known()`, `package.module:function`, or `path/to/file.py:function`; see
             `mdnum.references.load`. The function takes (positions, cell, pbc, r_cut) and returns pairs in a
-            form that `answer.read` accepts; a class or an object with `allocate` and `update` is a kept list
-            (`KeptList`).
+            form that `answer.read` accepts; a class or an object with `allocate` and `update` is an updatable
+            list (`KeptList`).
 
     Raises:
-        InputError: there is no such list, or it cannot be imported.
+        InputError: the neighbor list does not exist, or cannot be imported.
     """
     by_name = {listed.name: listed for listed in known()}
     if word in by_name:

@@ -1,7 +1,7 @@
-"""Test cases for neighbor lists: named cases that lists have failed, crowds, lattices, and random cases.
+"""Test cases for neighbor lists: named cases from past failures, dense clusters, lattices, random cases.
 
-For a library's own tests: `@given(cases())` draws test cases with boxes of every kind, atoms at all positions
-and cutoffs on and off the neighbor shells; `boxes()` draws only (cell, pbc, description).
+For the tests of a library: `@given(cases())` draws test cases with all kinds of boxes and positions, and with
+cutoffs at and between neighbor shells; `boxes()` draws only (cell, pbc, description).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _TURN = np.array([[2.0, -2.0, 1.0], [1.0, 2.0, 2.0], [2.0, 1.0, -2.0]]) / 3.0
 
 
 def catalog() -> Iterator[Case]:
-    """Yield every named test case at one moment, including those from questions.toml."""
+    """Yield every named test case with a single call, including those in questions.toml."""
     computed = {"boxes": _boxes(), "axes": _axes(), "outside": _outside(), "ties": _ties()}
     for area in ("few", "boxes", "axes", "images", "outside", "ties", "coincident"):
         yield from (once(name, area, *rest) for name, *rest in computed.get(area, ()))
@@ -48,7 +48,7 @@ def catalog() -> Iterator[Case]:
 
 
 def crowds() -> Iterator[Case]:
-    """Yield test cases with very many neighbors per atom, as isolated clusters and in a dilute gas."""
+    """Yield test cases with very many neighbors per atom, in isolated clusters and in a dilute gas."""
     return (once(name, "crowded", *rest) for name, *rest in _crowds())
 
 
@@ -120,10 +120,10 @@ def _outside() -> Named:
 
 
 def _across_walls() -> ndarray:
-    """Return pairs along x, one atom just below a multiple of the cutoff and the other almost a cutoff lower.
+    """Return pairs along x: one atom just below a multiple of the cutoff, the other almost a cutoff lower.
 
-    A search that assigns one of these atoms to the next cell, as rounding to float32 does, finds the pair two
-    cells apart.
+    If one of these atoms is assigned to the next cell, as after rounding to float32, its partner is two cells
+    away.
     """
     hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
     pairs = []
@@ -164,9 +164,9 @@ def _crowds() -> Named:
 
 
 def vast() -> Iterator[Case]:
-    """Yield test cases with few atoms in a volume so large that a cell grid exceeds memory or 32-bit indices.
+    """Yield few atoms in a volume so large that a cell grid exceeds the memory or 32-bit indices.
 
-    These cases are for lists in a separate process, since a list that allocates such a grid terminates its
+    These test cases are for neighbor lists in a separate process, since allocating such a grid terminates the
     process.
     """
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
@@ -176,14 +176,14 @@ def vast() -> Iterator[Case]:
 
 
 def lattice(edge: int, seed: int = 0) -> Case:
-    """Return a cubic lattice of integers with gaps, with atoms in random order and random images.
+    """Return a cubic lattice with vacancies at integer positions; atom order and images are random.
 
-    The neighbors of each atom are on the 26 sites around it, found by indices modulo the edge, without search
-    or rounding.
+    The neighbors of each atom are on the 26 sites around it, and are found by indices modulo the edge,
+    without search or rounding.
 
     Args:
-        edge: sites along an edge.
-        seed: random seed for gaps, order and images.
+        edge: number of sites along an edge.
+        seed: random seed for vacancies, order and images.
     """
     rng = np.random.default_rng(seed)
     places = grid(edge)
@@ -242,7 +242,7 @@ def boxes(draw: Any, r_cut: float = 1.0) -> tuple[ndarray, Pbc, str]:
     """Draw a random box as (cell, pbc, description), with lattice vectors as rows.
 
     Args:
-        r_cut: cutoff that sizes are relative to, length.
+        r_cut: cutoff (length) to which the size of the box is relative.
     """
     shape, size = draw(st.sampled_from(SHAPES)), draw(st.sampled_from(SIZES))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
@@ -284,7 +284,7 @@ def _edges(size: str, rng: np.random.Generator) -> ndarray:
 
 @st.composite
 def cases(draw: Any, most: int = 40) -> Case:
-    """Draw a random test case at one moment with at most `most` atoms."""
+    """Draw a random test case with a single call and at most `most` atoms."""
     scale = draw(st.sampled_from((1.0, 1.0, 1.0, 2.5, 6.0, 0.1, 3.405)))
     cell, pbc, words = draw(boxes(scale))
     place = draw(st.sampled_from(PLACES))
@@ -300,7 +300,7 @@ def cases(draw: Any, most: int = 40) -> Case:
 
 
 def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
-    """Return the number of lattice vectors by which a pair may be inside the cutoff."""
+    """Return the largest number of lattice vectors between atoms of a pair inside the cutoff."""
     if not any(pbc):
         return 1
     width = widths(completed(cell, np.array(pbc)))
@@ -310,7 +310,7 @@ def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
 def _positions(
     place: str, count: int, cell: ndarray, pbc: ndarray, r_cut: float, rng: np.random.Generator
 ) -> tuple[ndarray, float]:
-    """Return coordinates and the cutoff, which equals a pair distance for atoms "at the cutoff"."""
+    """Return positions and the cutoff; for atoms "at the cutoff", this is the distance of a pair."""
     full = completed(cell, pbc)
     # free axes have vectors of length 1, which would be no room
     room = np.where(pbc, 1.0, np.maximum(1.0, 3.0 * r_cut / np.linalg.norm(full, axis=1)))
@@ -343,7 +343,7 @@ def _positions(
 
 
 def _rotation(rng: np.random.Generator) -> ndarray:
-    """Return a uniformly distributed random rotation."""
+    """Return a uniformly distributed random rotation matrix."""
     turned, upper = np.linalg.qr(rng.normal(size=(3, 3)))
     turned = turned * np.sign(np.diag(upper))
     return turned if np.linalg.det(turned) > 0 else turned[[1, 0, 2]]
@@ -358,15 +358,15 @@ def plan(
     far: bool = False,
     large: bool = False,
 ) -> list[tuple[int, Iterable[Case]]]:
-    """Return the test cases for a neighbor list in order, as several (number of cases, cases).
+    """Return the test cases for a neighbor list, in order, as several tuples (number of cases, cases).
 
-    The first part has `BREADTH` test cases of each area, except for random cases and thousands of atoms.
+    The first tuple has `BREADTH` test cases of each area, without random cases and thousands of atoms.
 
     Args:
         count: number of random cases.
         seed: seed of the random cases.
-        padding: padding of a kept list, in skins, if known; see `motions`.
-        far: include cases in which a cell grid over all space exceeds memory and ends the process.
+        padding: padding of an updatable list, in skins, if known; see `motions`.
+        far: include cases in which a cell grid over the whole volume exceeds the memory and ends the process.
         large: include cases with 5,000 and 100,000 atoms.
     """
     named = [*movers(), *motions(padding)] if tested.kept else []
@@ -389,7 +389,7 @@ def plan(
 def questions(
     tested: PairList, count: int, seed: int, padding: float | None = None, far: bool = False
 ) -> list[Case]:
-    """Return all test cases of `plan`, except those with thousands of atoms."""
+    """Return all test cases of `plan` except those with thousands of atoms."""
     return [case for _, part in plan(tested, count, seed, padding, far=far) for case in part]
 
 
@@ -399,13 +399,13 @@ def lattices() -> Iterator[Case]:
 
 
 def as_kept(tested: PairList, asked: Iterable[Case]) -> Iterator[Case]:
-    """Yield test cases at one moment, with a skin for a kept neighbor list."""
+    """Yield test cases with a single call; for an updatable neighbor list, a skin is added."""
     for case in asked:
         yield replace(case, skin=0.3 * case.r_cut) if tested.kept else case
 
 
 def drawn(count: int, seed: int) -> list[Case]:
-    """Return test cases drawn by hypothesis, the same for the same seed."""
+    """Return test cases drawn by hypothesis; the same seed gives the same test cases."""
     collected: list[Case] = []
     checks: Any = list(hypothesis.HealthCheck)
 
@@ -427,7 +427,7 @@ def drawn(count: int, seed: int) -> list[Case]:
 
 
 def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
-    """Yield variants of a test case as (description, whether the answer must not change, variant)."""
+    """Yield variants of a test case as (description, whether the pairs must not change, variant)."""
     yield "when it is asked anew", True, case
     if case.atoms > 1:
         yield "with its atoms in reverse order", True, case.only(np.arange(case.atoms)[::-1])
@@ -449,7 +449,7 @@ def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
 
 
 def _wrapped(still: Still, pbc: ndarray) -> Still:
-    """Return one step of a test case with its atoms wrapped into the box."""
+    """Return one call of a test case with the atoms wrapped into the box."""
     if not pbc.any() or not len(still.positions):
         return still
     matrix = completed(still.cell, pbc)

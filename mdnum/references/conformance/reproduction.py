@@ -31,15 +31,15 @@ _LINES = beside(__file__)  # parts of a script
 def script(
     tested: PairList, failed: Failed, how: Conventions, superset: bool = False, reach: float | None = None
 ) -> str:
-    """Return a script that calls the list for a failing case and compares it with brute force.
+    """Return a script that calls the neighbor list for a failing test case and compares it with brute force.
 
-    The script needs only numpy and the list; it prints the error and exits with 1, or with 0 if the list is
-    correct. The script does not catch exceptions of the list.
+    The script requires only numpy and the neighbor list. It prints the error and exits with 1, or with 0 if
+    the list is correct. Exceptions raised by the neighbor list are not caught by the script.
 
     Args:
-        how: conventions of the list.
+        how: conventions of the neighbor list.
         superset: whether pairs beyond the cutoff may be listed.
-        reach: largest distance of such pairs, length; `Report.reach`.
+        reach: largest distance of pairs beyond the cutoff, length; `Report.reach`.
     """
     case, worst = failed.case, failed.worst
     usual = case.r_cut + (2 * case.skin if case.skin else 0.5 * case.r_cut)
@@ -69,7 +69,7 @@ def script(
 
 
 def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
-    """Return the numbers of a failing case as constants in Python source code."""
+    """Return the numbers of a failing test case as constants in Python source code."""
     case, stills = failed.case, []
     several = any(other.skin is not None for other in case.stills)
     for still, fresh, skin in _calls(case):
@@ -100,7 +100,7 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
 
 
 def _calls(case: Case) -> Iterator[tuple[Still, bool, float]]:
-    """Yield (still, whether the list is allocated anew, its skin) at every step of a test case."""
+    """Yield (positions and cell, whether the list is allocated, its skin) at every call of a test case."""
     atoms = None
     for still in case.stills:
         count = len(still.positions)
@@ -118,7 +118,7 @@ _SECONDS = 60.0  # seconds that a script may take
 
 
 def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | None:
-    """Run the script of a failure; return whether the failure appears, None if time runs out."""
+    """Run the script of a failure; return whether the failure appears, or None if the time runs out."""
     tested, code, text = report.tested, failed.code, failed.worst.text
     if not tested.source.strip() or deadline.passed:
         return None

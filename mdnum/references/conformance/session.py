@@ -1,4 +1,4 @@
-"""Call a neighbor list, in this process or a separate one, and return its answers or errors."""
+"""Call a neighbor list, in this process or a separate one, and return its pairs or errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _BORROWED = frozenset({"numpy", "scipy", "numba", "pandas", "torch", "jax", "jax
 
 @dataclass(frozen=True)
 class CallOutcome:
-    """Outcome of one call of a neighbor list."""
+    """Pairs or error from one call of a neighbor list."""
 
     answer: ListAnswer | None = None  # the pairs, or None
     # why there is no answer, or None: it crashed, came too late, raised or returned no pairs
@@ -59,7 +59,7 @@ class CallOutcome:
 
 
 class Session:
-    """Calls of one neighbor list; with `reuse`, the same object is used in all cases."""
+    """Calls of one neighbor list; with `reuse`, the same object is used for all test cases."""
 
     starts, deadline = 0, Deadline()  # of a process; calls in this one have none
 
@@ -69,11 +69,11 @@ class Session:
         self._returned: list[ndarray] = []
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """Return the outcome of the call at every step of a test case, up to the first without an answer."""
+        """Return the outcome of every call in a test case, up to the first call that returns no pairs."""
         return list(self.outcomes(case))
 
     def outcomes(self, case: Case) -> Iterator[CallOutcome]:
-        """Yield the outcome of the call at every step of a test case, up to the first without an answer."""
+        """Yield the outcome of every call in a test case, up to the first call that returns no pairs."""
         if self._made is None or (self.tested.kept and not self.reuse):
             try:
                 self._made = self.tested.make()
@@ -103,7 +103,7 @@ class Session:
     def _call(
         self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, skin: float | None
     ) -> CallOutcome:
-        """Call the neighbor list once; a kept list is allocated if a skin is given, otherwise updated."""
+        """Call the neighbor list once; an updatable list is allocated if a skin is given, else updated."""
         inputs = {"positions": positions, "cell": cell, "pbc": pbc}
         before = {name: array.copy() for name, array in inputs.items()}
         returned, self._returned = self._returned, []
@@ -158,18 +158,17 @@ def _failed(error: Exception | SystemExit, case: Case, package: str | None) -> C
 def meant(error: Exception, package: str | None = None) -> bool:
     """Return whether an exception was raised deliberately for an unsupported input, not by accident.
 
-    An exception that was raised deliberately keeps a program from computing with wrong pairs. An accidental
-    exception, such as a ValueError from `min()` of no distances, only shows that the input was not
-    anticipated.
+    A deliberate exception prevents a calculation with wrong pairs. An accidental exception, such as a
+    ValueError from `min()` of an empty array, only shows that the input was not anticipated.
 
     Args:
-        error: with its traceback.
-        package: distribution of the list; exceptions raised in its own compiled code count as deliberate.
+        error: the exception, with its traceback.
+        package: distribution of the neighbor list; exceptions raised in its compiled code are deliberate.
 
     Returns:
-        True if the innermost frame is the list's own and is at a `raise`, or at a call of a library's
-        compiled code that raised; and if the exception is a ValueError, a RuntimeError or a class of the
-        library's own, with a message. False otherwise, and if this cannot be decided.
+        True if the innermost stack frame belongs to the neighbor list and is at a `raise`, or at a call of a
+        library's compiled code that raised; and if the exception is a ValueError, a RuntimeError or of a
+        class of the library, with a message. False otherwise, or if this cannot be determined.
     """
     own = (package or "").replace("-", "_").lower()
     usual = isinstance(error, ValueError | RuntimeError) or _is_own(type(error).__module__, own)
@@ -233,7 +232,7 @@ def _called_module(place: TracebackType) -> str:
 
 
 def _value(name: ast.expr, place: TracebackType) -> Any:
-    """Return the value of a name, or of its attribute, in the stack frame of an exception, or None."""
+    """Return the value of a variable, or of its attribute, in the stack frame of an exception, or None."""
     if isinstance(name, ast.Attribute):
         return getattr(_value(name.value, place), name.attr, None)
     if not isinstance(name, ast.Name):
@@ -261,10 +260,10 @@ class RemoteSession:
         self._from = 0
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """Return the outcome of the call at every step of a test case, up to the first without an answer.
+        """Return the outcome of every call in a test case, up to the first call that returns no pairs.
 
         Raises:
-            TimeUp: the deadline passed during the call; the process is terminated.
+            TimeUp: the deadline passed during the call; the separate process is terminated.
         """
         outcomes: list[CallOutcome] = []
         try:
@@ -283,7 +282,7 @@ class RemoteSession:
             return [*outcomes, CallOutcome(failure=ended.failure)]
 
     def close(self) -> None:
-        """Terminate the process."""
+        """Terminate the separate process."""
         process, self._process = self._process, None
         if process is not None:
             with process:  # which closes its streams and waits for its end
@@ -335,7 +334,7 @@ class RemoteSession:
 
 
 class _Ended(Exception):
-    """Raised when the separate process has ended; `failure` describes how."""
+    """Raised when the separate process has ended; `failure` describes the way in which it ended."""
 
     def __init__(self, failure: Failure):
         super().__init__(failure.text)
@@ -343,7 +342,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Kill a process that does not answer within its time limit; `late` then describes the delay."""
+    """Kill a process that does not respond within its time limit, and describe the delay in `late`."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):
@@ -381,7 +380,7 @@ def _received(stream: BinaryIO | Any) -> Any:
 
 
 def serve(word: str, parent: int) -> None:
-    """Run test cases from stdin on a named list; the main function of a `RemoteSession` process."""
+    """Run test cases read from stdin on a neighbor list; the main function of a `RemoteSession` process."""
     from mdnum.references.conformance.peers import load
 
     # a list may print: what it writes to stdout must not be taken for an answer

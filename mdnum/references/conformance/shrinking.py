@@ -1,4 +1,4 @@
-"""Reduce a failing test case to a few atoms, few steps and round numbers that fail in the same way."""
+"""Reduce a failing test case to few atoms, few calls and round numbers that fail in the same way."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ Failures = Callable[[Case], Sequence[Failure]]
 
 
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
-    """Return the smallest test case, found before the deadline, that fails with the same code.
+    """Return the smallest test case, among those tried before the deadline, that fails with the same code.
 
-    `failures` runs a test case on the neighbor list, with a new object if the list is kept.
+    `failures` runs a test case on the neighbor list, with a new object if the list is updatable.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)
@@ -73,13 +73,13 @@ def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None)
 
 
 def _only(case: Case, atoms: list[int]) -> Case:
-    """Return the test case with only some atoms; a small case discards its precomputed pairs."""
+    """Return the test case with only some atoms; a small test case discards its precomputed pairs."""
     smaller = case.only(np.array(atoms, int))
     return replace(smaller, known=None) if len(atoms) <= 400 else smaller
 
 
 def _sensible(case: Case) -> bool:
-    """Return whether a test case has finite numbers, a nonsingular box and not too many images."""
+    """Return whether a test case has finite numbers, a nonsingular box and a limited number of images."""
     pbc = np.array(case.pbc)
     if not (0 < case.r_cut < np.inf and all(np.isfinite(still.positions).all() for still in case.stills)):
         return False
@@ -128,10 +128,10 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 
 
 def deepest(failures: Failures, failed: Failed) -> Failed:
-    """Move a missing pair closer together as long as the pair remains missing.
+    """Move the atoms of a missing pair closer together as long as the pair remains missing.
 
-    The pair continues its motion, so that the reported failure has the smallest distance at which the pair is
-    missing.
+    The atoms continue their motion, so that the reported failure has the smallest distance at which the pair
+    is missing.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
@@ -176,7 +176,7 @@ def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadli
 def _needing(
     examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline
 ) -> Failed | None:
-    """Find earlier test cases that a new process must run to show a failure; None if there are none."""
+    """Find earlier test cases that a new process must run first to show a failure; None if not found."""
     session, began = examiner.session, time.perf_counter()
 
     def fails(cases: Sequence[Case]) -> bool:

@@ -50,12 +50,12 @@ _REFUSALS = 6  # refusals that are examined; a list with more kinds of them has 
 
 
 class Examiner:
-    """Runs test cases on a list and judges its answers, after determining its conventions.
+    """Runs test cases on a neighbor list and checks the pairs, after determining the list's conventions.
 
     Args:
-        reuse: use one object in all cases.
-        apart: call the list in a separate process, which may crash.
-        deadline: time at which this process is terminated, with `TimeUp` for the current case.
+        reuse: use one object of the neighbor list for all test cases.
+        apart: call the neighbor list in a separate process, which may crash.
+        deadline: time at which this process is terminated, with `TimeUp` for the current test case.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Examiner:
             self._find_conventions()
 
     def _find_conventions(self) -> None:
-        """Determine from simple cases whether the list is full, and the signs of its shifts and vectors."""
+        """Determine from simple test cases whether the list is full, and the signs of shifts and vectors."""
         tested, report = self.tested, self.report
         full, sign, toward = tested.full, 1, 1
         triple = once("a triple through a face", "few", [[0.2, 2, 2], [3.8, 2.1, 2], [0.5, 2.4, 2.2]], 4.0)
@@ -103,9 +103,9 @@ class Examiner:
             self._find_padding()
 
     def _find_padding(self) -> None:
-        """Determine whether a kept list returns the pairs in its skin, and how far the list is complete.
+        """Determine whether an updatable list returns the pairs within its skin, and up to which distance.
 
-        The padding is the stated one, or the distance from the cutoff to the nearest pair missing from the
+        The padding is the declared one, or the distance from the cutoff to the nearest pair missing from the
         list.
         """
         report = self.report
@@ -137,7 +137,7 @@ class Examiner:
             report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
 
     def unusable(self) -> str | None:
-        """Return why every simple test case raised an exception or gave a malformed answer, or None."""
+        """Return the error if every simple test case raised an exception or gave malformed pairs, or None."""
         reasons = [
             f"asked about {case.name}, {'it raised ' * (why.code == 'RAISED')}{why.text}"
             for case, outcome in self.opening
@@ -146,7 +146,7 @@ class Examiner:
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """Return the errors of a test case within the declared limits, at the first step with an error."""
+        """Return the errors of a test case within the declared limits, at the first call with an error."""
         return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
@@ -172,7 +172,7 @@ class Examiner:
         return result
 
     def take(self, case: Case, result: CaseResult) -> None:
-        """Record the result of a test case, with the smallest rejected case of each kind."""
+        """Record the result of a test case, and the smallest rejected test case of each kind."""
         self.report.take(case, result)
         if result.refused is not None:
             step, words = result.refused
@@ -184,7 +184,7 @@ class Examiner:
     def _judge(
         self, case: Case, step: int, answer: ListAnswer, how: Conventions
     ) -> tuple[list[Failure], tuple[float, float] | None, tuple[int, int]]:
-        """Return the failures, the error if correct only in float32, and counts of pairs at the cutoff."""
+        """Return failures, the error of a result correct only in float32, and counts of pairs at r_cut."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
@@ -209,7 +209,7 @@ class Examiner:
 
 
 def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
-    """Return the numbers of listed and unlisted pairs at exactly the cutoff, for a case without rounding."""
+    """Return the numbers of listed and unlisted pairs exactly at the cutoff, for a case without rounding."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
         return 0, 0  # on small integers no arithmetic rounds
@@ -224,7 +224,7 @@ def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
 
 
 def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
-    """Return the exact pairs at a step, with all pairs listed correctly since the list was built."""
+    """Return the exact pairs at a call, plus all pairs that were exact at a call since the list was built."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
@@ -260,23 +260,23 @@ def examine(
     """Run the conformance suite on a neighbor list.
 
     Args:
-        cases: number of random cases, in addition to the named ones.
-        seed: seed of the random cases.
-        large: include cases with 5,000 and 100,000 atoms.
+        cases: number of random test cases, in addition to the named ones.
+        seed: seed of the random test cases.
+        large: include test cases with 5,000 and 100,000 atoms.
         stop: stop at the first failure.
-        shrink: reduce failures to a few atoms.
-        apart: call the list in a separate process, so that a crash is reported; needs a list from `load`.
-        asked: cases to run instead of all.
-        progress: called with (cases done, cases, words).
-        examiner: existing examiner that knows the list's conventions, instead of a new one.
-        deadline: no case starts after this time; the remaining cases are counted.
-        answers: results of an earlier examination of the same cases, which are not run again; new results are
-            added to it.
-        saved: called at the beginning and after each new result, with True if it must not be lost.
+        shrink: reduce failing test cases to a few atoms.
+        apart: call the list in a separate process, so that a crash is reported; requires a list from `load`.
+        asked: test cases to run instead of all.
+        progress: called with (test cases done, number of test cases, text).
+        examiner: existing examiner in which the list's conventions are known, instead of a new one.
+        deadline: no test case starts after this time; the remaining ones are counted.
+        answers: results of an earlier examination of the same test cases, which are not run again; new
+            results are added.
+        saved: called at the beginning and after each new result, with True if it must be saved at once.
 
     Returns:
-        the cases and their results. A list may raise exceptions, return anything and write to its input:
-        these are reported as failures.
+        the test cases and their results. A neighbor list may raise exceptions, return any value or write to
+        its input: these are reported as failures.
     """
     began = time.perf_counter()
     deadline, answers = deadline or Deadline(), answers or CaseAnswers()
@@ -357,7 +357,7 @@ def examine(
 
 
 def _keeps_order(examiner: Examiner) -> bool | None:
-    """Return whether three identical calls list the same pairs in the same order; None without an answer."""
+    """Return whether three identical calls list the same pairs in the same order; None without pairs."""
     for case in (once("order", "reuse", gas(40, 6.0, 120), 6.0), once("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
@@ -368,7 +368,7 @@ def _keeps_order(examiner: Examiner) -> bool | None:
 
 
 def _too_long(report: Report, case: Case) -> str | None:
-    """Return why a large test case would take too long, estimated from the previous one, or None."""
+    """Return the reason if a large test case would take too long (judged from the previous one), or None."""
     if report.large is None:
         return None
     atoms, seconds = report.large
@@ -378,9 +378,9 @@ def _too_long(report: Report, case: Case) -> str | None:
 
 
 def _refusals(examiner: Examiner) -> list[RefusalKind]:
-    """Return each kind of rejected test case, with those of its variants that the list answers.
+    """Return each kind of rejected test case, with the variants in which the neighbor list returns pairs.
 
-    Each variant of the test case is run in a new process, or with a new object.
+    Each variant of a test case is run in a new process, or with a new object.
     """
     found = []
     for refusal in list(examiner.refused.values())[:_REFUSALS]:
@@ -396,10 +396,10 @@ def _refusals(examiner: Examiner) -> list[RefusalKind]:
 
 
 def distinct(failed: Iterable[Failed]) -> list[Failed]:
-    """Return the smallest failure of each kind, since one error appears in many test cases.
+    """Return the smallest failure of each kind, since one error causes failures in many test cases.
 
-    Failures with the same code and equal numbers of atoms, steps and periodic axes are taken for one error;
-    exceptions and malformed answers are compared by message, ignoring numbers.
+    Failures with the same code and equal numbers of atoms, calls and periodic axes are taken for one error;
+    exceptions and malformed results are compared by message, ignoring numbers.
     """
 
     def size(failure: Failed) -> tuple[bool, bool, int, int, int]:
