@@ -1,8 +1,8 @@
-"""User-defined energies over a neighbor list: calling conventions, and a uniform way to call them.
+"""User-defined energies over a neighbor list, and a common way to call functions of different conventions.
 
-Functions written for jax-md differ in the positions of the arguments for list and parameters, the form of the
-box, real or fractional positions, lists with or without images, and the return value. The signature
-determines the order of the arguments; trial calls (`mdnum.systems.admission`) determine the rest.
+Functions written for jax-md differ in the order of the arguments, the form of the box, real or fractional
+positions, neighbor lists with or without images, and the return value. The signature determines the order of
+the arguments; all other properties are determined by trial calls (`mdnum.systems.admission`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ENERGIES: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class Convention:
-    """Calling convention of a function; the fields after `keywords` are determined by trial calls."""
+    """Calling convention of an energy function; trial calls determine the fields after `keywords`."""
 
     native: bool = False  # (parameters, positions, neighbor, cell)
     parameters: bool = False  # they come first
@@ -56,7 +56,7 @@ class Convention:
 
     @property
     def label(self) -> str:
-        """Readable name of the convention."""
+        """Name of the calling convention for messages and reports."""
         base = (
             "mdnum's own" if self.native
             else "multi-image list" if self.images
@@ -69,7 +69,7 @@ class Convention:
 
 @dataclass(frozen=True)
 class Call:
-    """A function of any convention that is called with (parameters, positions, neighbor, cell)."""
+    """An energy function of any convention, called with (parameters, positions, neighbor, cell)."""
 
     function: Callable[..., Any]
     how: Convention
@@ -78,7 +78,7 @@ class Call:
     name: str = "energy function"
 
     def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
-        """Return the energy in the units of the function; its whole return value if `returns` is empty.
+        """Return the energy in the units of the function; if `returns` is empty, return the unchanged result.
 
         Args:
             given: the keywords of the convention; for mdnum's own convention, "cell".
@@ -100,7 +100,7 @@ class Call:
         return jnp.sum(out if how.returns in ("number", "atoms") else out[how.returns])
 
     def __call__(self, parameters: Any, x: Array, neighbor: Any, cell: Array, strain: Any = None) -> Array:
-        """Return the energy.
+        """Return the potential energy in the units of the simulation.
 
         Args:
             cell: lattice vectors as rows. strain: a further deformation of box and positions, near 1.
@@ -130,7 +130,7 @@ class Call:
 
 @jax.custom_jvp
 def _real_slope(x: Array, inverse: Array) -> Array:
-    """Return fractional coordinates with the tangents of real coordinates, as jax-md's transforms do."""
+    """Return fractional coordinates, with the derivatives of real coordinates as in jax-md's transforms."""
     return x @ inverse
 
 
@@ -140,7 +140,7 @@ def _real_slope_jvp(primals, tangents):
 
 
 class EnergyFunction(ManyBody):
-    """Energy function over a jax-md neighbor list, with parameters in any pytree.
+    """Potential defined by an energy function over a jax-md neighbor list, with parameters in any pytree.
 
     Attributes:
         parameters: a pytree of arrays; the name of each parameter is its path, `potential.parameters...`.
@@ -149,11 +149,11 @@ class EnergyFunction(ManyBody):
             convention.
         species: chemical symbols that the function supports; empty if unknown.
         start: a function of (key, positions, neighbor) that makes the parameters; None if they are given.
-        lists: (allocate, update) of its neighbor functions, with which the trial calls compare; None without
-            any.
+        lists: (allocate, update) of the function's own neighbor lists, used for comparison in trial calls; or
+            None.
         unit: declared units of length and energy; empty if they are those of the simulation.
         noise: rounding error of the energy at the trial calls, a power of ten, energy.
-        notes: findings of the trial calls, (code, values as JSON); None before the trial calls.
+        notes: findings of the trial calls as pairs (code, values in JSON); None before the trial calls.
     """
 
     parameters: Any
@@ -169,14 +169,14 @@ class EnergyFunction(ManyBody):
 
     @property
     def call(self) -> Call:
-        """The function together with its calling convention."""
+        """The energy function together with its calling convention."""
         if isinstance(self.function, Call):
             return self.function
         return Call(self.function, Convention(native=True, box="cell"), name=self.name)
 
     @property
     def fixed_box(self) -> bool:
-        """True if the function always uses the box with which it was created."""
+        """True if the box of the function was fixed when the function was created."""
         return any(self.pbc) and not self.call.how.box
 
     def energy(self, positions, neighbor, cell):
@@ -199,12 +199,12 @@ def energy_function(
 ) -> EnergyFunction:
     """Make a potential from an energy function over a neighbor list, with any jax-md convention.
 
-    Supported are `energy_fn(R, neighbor, **kw)`, `energy_fn(params, R, neighbor, **kw)`, `energy_fn(R, *,
-    box=, neighbor=, perturbation=)`, and mdnum's own form `f(parameters, positions, neighbor, cell)`. A
+    Supported forms are `energy_fn(R, neighbor, **kw)`, `energy_fn(params, R, neighbor, **kw)`, `energy_fn(R,
+    *, box=, neighbor=, perturbation=)`, and mdnum's own form `f(parameters, positions, neighbor, cell)`. A
     function may be given alone or with its neighbor functions, as returned by jax-md's `*_neighbor_list`, and
-    may use multi-image lists. It returns a number, a number per atom, or a dictionary with "total" or
-    "energy". Properties that the signature does not determine (box vectors in rows or columns, real or
-    fractional positions) are determined by trial calls when a simulation is made.
+    may use multi-image lists. The energy function returns a number, a number per atom, or a dictionary with
+    key "total" or "energy". Properties that the signature does not determine (box vectors in rows or columns,
+    real or fractional positions) are determined by trial calls when a simulation is made.
 
     Example:
         >>> made = jax_md.energy.lennard_jones_neighbor_list(displacement, box)
@@ -259,10 +259,10 @@ def energy_function(
 
 
 def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Convention:
-    """Return the calling convention of a function, derived from its signature.
+    """Derive the calling convention of an energy function from its signature.
 
     Args:
-        parameters: whether the function has parameters, or a function that makes them.
+        parameters: True if there are parameters, or a function that creates parameters.
     """
     try:
         given = list(inspect.signature(function).parameters.values())

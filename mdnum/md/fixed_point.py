@@ -1,13 +1,13 @@
-"""Runs with fixed-point numbers: positions, momenta and pair forces are integer multiples of fixed units.
+"""Simulations with fixed-point numbers: positions, momenta and pair forces are multiples of fixed units.
 
-All units are powers of two, so that doubles represent integer multiples of a unit exactly, and the rest of
-the rollout processes them like other positions. Sums of integers do not depend on their order, squared
-distances of decisions have no rounding error, and a step that adds an integer is reversed by subtracting it.
+All units are powers of two, so that integer multiples of a unit are stored exactly as doubles, in the same
+arrays as floating-point positions. Sums of integers do not depend on the order of summation, squared
+distances in pair decisions have no rounding error, and a step that adds an integer is reversed by subtracting
+this integer.
 
-The force of a pair is computed in float64 from the exact integer distance, by operations that every compiler
-rounds in the same way, and is then rounded to the unit of force. The forces on the two atoms are exactly
-opposite, so momentum is conserved to the last bit. The result does not depend on the labels of the atoms or
-on the list.
+A pair force is computed in float64 from the exact integer distance, by operations that every compiler rounds
+in the same way, and is then rounded to the unit of force. The forces on both atoms are exactly opposite, so
+that momentum is conserved to the last bit. The result does not depend on atom labels or on the neighbor list.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ _FEWEST = 1024
 
 
 def power_of_two(x: float) -> float:
-    """Return the smallest power of two that is at least x."""
+    """Return the smallest power of two that is greater than or equal to x."""
     mantissa, exponent = math.frexp(x)
     return math.ldexp(1.0, exponent - 1 if mantissa == 0.5 else exponent)
 
 
 @dataclass(frozen=True)
 class FixedPointUnits:
-    """The units of a run in fixed-point numbers."""
+    """Units of positions, forces and energies in a simulation with fixed-point numbers."""
 
     spacing: float  # of positions, length, the same along all axes
     force: float  # of pair forces, energy/length
@@ -78,11 +78,11 @@ class FixedPointUnits:
         kT: float,
         timestep: float,
     ) -> FixedPointUnits:
-        """Choose the units for a box, a list and a potential.
+        """Choose the fixed-point units for a box, a neighbor list radius and a potential.
 
-        The spacing is the finest for which squared distances of listed pairs are exact. The unit of force is
-        the finest for which momenta and forces stay in the range of exact sums in every valid run. The unit
-        of momentum follows from the unit of force and the time step.
+        The position spacing is the smallest power of two for which squared distances of listed pairs are
+        exact. The unit of force is the smallest for which momenta and forces stay in the range of exact sums
+        in every valid run. The unit of momentum is the unit of force times half a time step.
 
         Args:
             r_list: radius of the neighbor lists, length.
@@ -106,7 +106,7 @@ class FixedPointUnits:
         return cls(made.spacing, made.force, made.energy, stretch)
 
     def cell(self, cell: Cell) -> Cell:
-        """Return the box with its edges rounded to whole multiples of the grid spacing.
+        """Return the box with edges rounded to integer multiples of the position spacing.
 
         Raises:
             InputError: the box is not orthorhombic, or too large.
@@ -131,15 +131,15 @@ class FixedPointUnits:
         return eqx.tree_at(lambda one: one.inverse, made, inverse)
 
     def positions(self, x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "atoms 3"]:
-        """Return positions rounded to integer multiples of the spacing."""
+        """Return positions rounded to integer multiples of the position spacing."""
         return np.round(np.asarray(x, np.float64) / self.spacing) * self.spacing
 
     def total(self, terms: Float[Any, "*shape"]) -> Float[Any, ""]:
-        """Return the sum of energies, each rounded to the unit first: independent of order (inside jit)."""
+        """Round each energy to the unit of energy, and return the sum, independent of order (inside jit)."""
         return jnp.sum(jnp.round(terms * (1 / self.energy))) * self.energy
 
     def to_dict(self, timestep: float) -> dict[str, float]:
-        """Summary of the fixed-point units, expressed in the units of the system."""
+        """Return the fixed-point units in the units of the system, by name."""
         return {
             "spacing": self.spacing,
             "force": self.force,
@@ -150,7 +150,7 @@ class FixedPointUnits:
 
 
 def _depth(model: CutPotential) -> float:
-    """Return an energy scale of a pair potential: its depth or, if it is repulsive, its value halfway in."""
+    """Return an energy scale of a pair potential: its depth or, if repulsive, its value near 0.6 r_cut."""
     r_cut = np.asarray(model.r_cut, np.float64)
     r = r_cut * np.linspace(0.2, 1.0, 400)[:, None]
     energy = np.asarray(model.potential.evaluate(jnp.asarray(r * r))[0])
@@ -163,23 +163,23 @@ def _depth(model: CutPotential) -> float:
 
 @dataclass(frozen=True)
 class FixedPointDecider(PairDecider):
-    """Decision whether a pair is inside, by a comparison of two integers.
+    """Decision whether a pair is inside the cutoff, by comparison of two integers.
 
     The squared distance is an integer in units of the squared spacing. Each convention is converted to `r2 <
-    limit` with an integer limit; margins are relative to the threshold half a unit below the limit, so that
-    no margin is zero or has a rounding error.
+    limit` with an integer limit. A margin is the difference to a threshold half a unit below the limit, so
+    that margins are never zero and have no rounding error.
     """
 
     spacing: float = 1.0  # of positions, length
 
     @property
     def space(self) -> str:
-        """The compared quantity: always the squared distance, since all conventions are equivalent."""
+        """Name of the compared quantity: always "r2", the squared distance."""
         return "r2"
 
     @property
     def limits(self) -> tuple[int, ...]:
-        """Smallest squared distances (in squared spacings) at which a pair is outside, by pair type."""
+        """Smallest squared distance of a pair outside the cutoff, in squared spacings, by pair type."""
         unit = Fraction(self.spacing) ** 2
         square = self.compare.startswith("r2")
         exact = [(Fraction(r * r) if square else Fraction(r) ** 2) / unit for r in self.r_cut]
@@ -187,31 +187,31 @@ class FixedPointDecider(PairDecider):
 
     @property
     def thresholds(self) -> tuple[Threshold, ...]:
-        """Thresholds, half a squared spacing below the limits, as doubles."""
+        """Thresholds of squared distances by pair type, half a squared spacing below `limits`, as doubles."""
         unit = self.spacing * self.spacing
         return tuple(Threshold((limit - 0.5) * unit, "<", "r2") for limit in self.limits)
 
     @cached_property
     def bounds(self) -> tuple[float, ...]:
-        """Bounds on the errors of margins: all zero, because margins are exact and never zero."""
+        """Error bounds of margins by pair type: all zero, because margins are exact."""
         return (0.0,) * len(self.r_cut)
 
     def inside(self, quantity, value):
         return quantity < value
 
     def host_squares(self, dx, dy, dz) -> Int[np.ndarray, "..."]:
-        """Return squared distances in squared spacings."""
+        """Return squared distances as integers, in units of the squared spacing."""
         edge = float(2**REACH_BITS)
         parts = (np.round(np.asarray(c, np.float64) / self.spacing) for c in (dx, dy, dz))
         whole = [np.clip(c, -edge, edge).astype(np.int64) for c in parts]
         return whole[0] * whole[0] + whole[1] * whole[1] + whole[2] * whole[2]
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
-        """Return squared distances on the host, rounded once."""
+        """Return squared distances on the host, in units of length², exact except for one rounding."""
         return self.host_squares(dx, dy, dz).astype(np.float64) * (self.spacing * self.spacing)
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
-        """Return margins, which are exact before the conversion to doubles."""
+        """Return margins of squared distances on the host, computed exactly and then rounded to doubles."""
         left = np.asarray(self.limits, np.int64)[kind] - self.host_squares(*displacement)
         return (left - 0.5) * (self.spacing * self.spacing)
 
@@ -226,7 +226,7 @@ _ROOM = 62 - _SHIFT
 
 
 class FixedPointStep(Integrator):
-    """Base class of fixed-point integrators, whose kicks and drifts add integers."""
+    """Base class of integrators in fixed-point numbers, whose kicks and drifts add integers."""
 
     units: FixedPointUnits = eqx.field(static=True, kw_only=True)  # the units
     # unit of momentum: that of force times half a time step
@@ -236,15 +236,15 @@ class FixedPointStep(Integrator):
     zero: Int[Array, ""] = eqx.field(kw_only=True)  # an integer zero that XLA must not know
 
     def momentum(self, v: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
-        """Return momenta in units of the impulse; the conversion is exact for velocities of this run."""
+        """Return momenta as integers, in units of momentum; exact for velocities of this simulation."""
         return jnp.round(v * (masses / self.impulse))
 
     def velocity(self, p: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
-        """Return the velocities of momenta; NaN if a momentum is too large to be recovered."""
+        """Return velocities from integer momenta; NaN if a momentum is too large for an exact conversion."""
         return jnp.where(jnp.abs(p) < _LARGEST, p * (self.impulse / masses), jnp.nan)
 
     def kick(self, v, time, acceleration, masses):
-        """Return velocities after an acceleration has acted for a time; momenta are rounded to integers."""
+        """Return velocities after an acceleration has acted for a time, with momenta rounded to integers."""
         push = jnp.round(time * acceleration * (masses / self.impulse))
         return self.velocity(self.momentum(v, masses) + push, masses)
 
@@ -257,24 +257,24 @@ class FixedPointStep(Integrator):
 
     @abstractmethod
     def drift(self, x, v, extra, masses, step, order):
-        """Advance as in `begin`, after the kick."""
+        """Advance positions, velocities and extra state as in `begin`, after the kick."""
 
     @abstractmethod
     def undrift(self, x, v, extra, masses, step, order):
-        """Return positions, velocities and extra state before the drift that follows a step."""
+        """Reverse the drift of a step: return positions, velocities and extra state before the drift."""
 
     def kinetic(self, v, masses):
-        """Return the kinetic energy, independent of the order of the atoms."""
+        """Return the kinetic energy, which does not depend on the order of the atoms."""
         return self.units.total(0.5 * (masses * squared_norm(v[0], v[1], v[2], self.zero)))
 
     def glide(self, x, p, masses, share: float, direction: int):
-        """Return positions after a fraction of a step at given momenta; direction -1 reverses the step."""
+        """Move positions at constant momenta for a `share` of a step, backward if direction is -1."""
         moved = jnp.round(p * (share * self.stride / masses))
         return x + direction * self.units.spacing * moved
 
 
 class FixedPointVerlet(FixedPointStep):
-    """Velocity Verlet at constant energy, with fixed-point numbers."""
+    """Velocity Verlet integrator at constant energy, in fixed-point numbers."""
 
     name = "nve"
 
@@ -287,7 +287,7 @@ class FixedPointVerlet(FixedPointStep):
 
 
 class FixedPointLangevin(FixedPointStep):
-    """BAOAB with fixed-point numbers; the extra state stores the information that friction removes."""
+    """BAOAB Langevin integrator in fixed-point numbers; the extra state stores the bits lost to friction."""
 
     name = "langevin"
     keeps_momentum = False
@@ -299,7 +299,7 @@ class FixedPointLangevin(FixedPointStep):
     pause: Int[Array, ""] = eqx.field(kw_only=True)  # steps after which the bath is put aside
 
     def noise(self, step, masses, order) -> Float[Array, "3 atoms"]:
-        """Return the momentum that noise adds after a step, in integer units; it depends only on the step."""
+        """Return the momentum added by noise, in integer units, as a function of the step number."""
         low = np.nextafter(-1.0, 0.0)
         shape = (3, masses.shape[0])
         # the numbers that jax.random.normal makes its deviates of
@@ -334,7 +334,7 @@ class FixedPointLangevin(FixedPointStep):
 
 
 def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPointStep:
-    """Return the fixed-point version of an integrator.
+    """Return the fixed-point version of an integrator (velocity Verlet or Langevin).
 
     Raises:
         InputError: the friction is too small or too large for the time step, or the integrator has no
@@ -378,7 +378,7 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
 
 
 def _period(kept: int) -> int:
-    """Return the number of steps until a bath that grows by 2^24/kept per step may overflow."""
+    """Return the number of steps before an integer that grows by 2^24/kept per step may overflow."""
     if not 0 < kept < 2**_SHIFT:
         return 0
     growth = 2**_SHIFT / kept
@@ -387,7 +387,7 @@ def _period(kept: int) -> int:
 
 
 def forgotten_bits(integrator: Integrator) -> float:
-    """Return the bits that friction removes per step from each momentum component; 0 without thermostat."""
+    """Return the bits per step that friction removes from a momentum component; 0 without a thermostat."""
     if isinstance(integrator, Langevin):
         return float(integrator.friction) * float(integrator.timestep) / math.log(2)
     return 0.0
@@ -402,7 +402,7 @@ _ROUND_BITS = int(np.float64(_ROUND).view(np.int64))
 
 @jax.custom_jvp
 def counted(x: Float[Array, "*shape"], zero: jax.Array) -> jax.Array:
-    """Return the nearest integer of numbers below 2^51, plus `_ROUND_BITS`, by a single addition."""
+    """Return the integers nearest to numbers below 2^51, plus `_ROUND_BITS`, by a single addition."""
     return lax.bitcast_convert_type(fence(x, zero) + _ROUND, jnp.int64)
 
 
@@ -417,7 +417,7 @@ def _counted_jvp(primals, tangents):
 
 
 class FixedPointJudge(SlotJudge):
-    """Version of `SlotJudge` that compares integers, in fixed-point units."""
+    """Pair decisions in fixed-point units; this version of `SlotJudge` compares integers."""
 
     def __init__(
         self, decider: FixedPointDecider, limits, cell: Cell, zero, positions, units: FixedPointUnits
@@ -431,11 +431,11 @@ class FixedPointJudge(SlotJudge):
         self.value = limits
 
     def start(self) -> jax.Array:
-        """Return the initial value of the nearest margin of each atom, in squared spacings."""
+        """Return the initial value of the smallest |margin| of each atom, in squared spacings."""
         return jnp.full(self.atoms, jnp.iinfo(jnp.int64).max, jnp.int64)
 
     def group(self, j, types):
-        """Return displacement in spacings, squared distance, decision and limit of neighbors of each atom."""
+        """Return displacement, squared distance, decision and limit for neighbors j, in spacing units."""
         d = displacements(self.components, self.cell, j)
         edge = float(2**REACH_BITS)
         # what is further away than any listed pair is outside; its square might not fit
@@ -450,7 +450,7 @@ class FixedPointJudge(SlotJudge):
         return d, r2, r2 < limit, limit
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Decisions of a group as the low bits of a byte per atom, and the nearest margin so far."""
+        """Return decisions of a group as the low bits of a byte per atom, and the smallest |margin| yet."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         left = threshold - quantity
         away = jnp.maximum(left, 1 - left)
@@ -460,7 +460,7 @@ class FixedPointJudge(SlotJudge):
         return bits, nearest
 
     def finish(self, nearest, halves) -> Decisions:
-        """Decisions of the complete pass, two groups per byte."""
+        """Return the decisions of a complete pass over the list, two groups per byte."""
         unit = self.units.spacing * self.units.spacing
         closest = jnp.min(nearest, initial=jnp.iinfo(jnp.int64).max)
         margin = jnp.where(closest < _NOWHERE, (closest.astype(jnp.float64) - 0.5) * unit, jnp.inf)
@@ -478,7 +478,7 @@ class FixedPointForce(PairForce):
     def on(
         cls, units: FixedPointUnits, model: CutPotential, cell: Cell, decider, policy, reduction
     ) -> FixedPointForce:
-        """Make the force with parameters in float64; sums are exact, so the reduction has no effect."""
+        """Make the force with parameters in float64; `reduction` has no effect, since sums are exact."""
         return cls(
             model.astype(np.float64),
             cell.astype(np.float64),
@@ -493,22 +493,22 @@ class FixedPointForce(PairForce):
 
     @property
     def law(self) -> Guarded:
-        """The potential, evaluated with the same bits by every compiler."""
+        """The cut potential, evaluated with the same bits by every compiler."""
         return Guarded(self.model, self.zero, reproducible)
 
     def judge(self, positions: Float[Array, "3 atoms"]) -> FixedPointJudge:
-        """Return the pair decider at these positions."""
+        """Return the pair decisions at the given positions, as a `FixedPointJudge`."""
         assert isinstance(self.decider, FixedPointDecider)
         return FixedPointJudge(self.decider, self.thresholds, self.cell, self.zero, positions, self.units)
 
     def decide(self, positions, tables):
-        """Return decisions like `PairForce.decide`, from integer distances."""
+        """Return the decisions of a neighbor list from integer distances."""
         return self.judge(positions).decide(tables)
 
     def __call__(self, positions, tables, *, decisions, tensor=False, given=None, where=None):
-        """Return forces like `PairForce`, as integer multiples of the unit of force.
+        """Return forces, rounded per pair to integer multiples of the unit of force.
 
-        If a pair is so close that its force exceeds the range of exact sums, the energy is NaN.
+        If the force of a close pair exceeds the range of exact sums, the energy is NaN.
         """
         judge, units = self.judge(positions), self.units
         law, zero = self.law, self.zero

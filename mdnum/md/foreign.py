@@ -1,4 +1,4 @@
-"""XLA's CPU callbacks: numba functions that read its call frames (xla/ffi/api/c_api.h, version 0.3)."""
+"""XLA callbacks on a CPU: numba functions that read XLA's call frames (xla/ffi/api/c_api.h, version 0.3)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ VERSION = (0, 3)
 
 @cache
 def known() -> bool:
-    """True if XLA's interface has the supported version, and programs run on a CPU."""
+    """Return True if XLA's callback interface has the supported version, and programs run on a CPU."""
     header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     text = header.read_text() if header.exists() else ""
     found = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")]
@@ -36,7 +36,7 @@ ALIVE: list[Any] = []
 
 
 def registered(name: str, function: Any, *held: Any) -> str:
-    """Register a C function with XLA on the CPU and return its name; keep its data alive."""
+    """Register a C function with XLA on the CPU, keep its data alive, and return its name."""
     ALIVE.extend([function, *held])
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform="cpu")
     return name
@@ -47,7 +47,7 @@ carray: Any = numba.carray  # pyright: ignore
 
 @intrinsic
 def pointer(typingctx: Any, address: Any) -> Any:
-    """Convert a number to a memory address."""
+    """Convert an integer to a memory address."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
@@ -84,7 +84,7 @@ free = types.ExternalFunction("free", types.void(types.intp))
 
 
 def _place(builder: Any, address: Any, k: Any) -> Any:
-    """Location of the k-th 64-bit number at an address."""
+    """Return the location of the k-th 64-bit number at an address."""
     return builder.gep(builder.inttoptr(address, ir.IntType(64).as_pointer()), [k])
 
 
@@ -128,7 +128,7 @@ def buffer(typingctx: Any, buffers: Any, k: Any) -> Any:
 
 @njit
 def asked_to_run(frame):
-    """True if a call requests execution; a request for the version is answered, others are ignored."""
+    """Return True if XLA requests execution; report the version if XLA requests it, ignore other requests."""
     asked = peek(frame, 1)
     if asked != 0 and peek(asked, 1) & 0xFFFFFFFF == 1:
         # for which version of the interface was this written?

@@ -1,8 +1,8 @@
-"""Cell-list neighbor search on the host, compiled by numba: the fast builder of Verlet lists.
+"""Cell-list neighbor search on the host, compiled by numba, for building Verlet lists.
 
-Bins are at least half a list radius wide. An axis with space for fewer than five bins has one bin, so that
-all atoms along it are compared. Distances are those of the minimum image; callers reject radii larger than
-half the smallest perpendicular width.
+Bins are at least half a list radius wide. An axis that is too short for five bins has a single bin, so that
+all atoms along this axis are compared. Distances are minimum-image distances; calling functions reject radii
+larger than half the smallest perpendicular width.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _MOST_BINS = 1e9
 
 @njit
 def _bin_atoms(fractional, bins, bin_of, start, order):
-    """Sort atoms by bin (counting sort); atoms keep their order within a bin."""
+    """Sort atoms by bin (counting sort), keeping the order of atoms within a bin."""
     n = fractional.shape[1]
     for i in range(n):
         b = 0
@@ -56,10 +56,10 @@ def _bin_atoms(fractional, bins, bin_of, start, order):
 
 @njit
 def _layered(x, start, bins):
-    """Sort atoms into layers along the third axis, in which bins along the second axis are contiguous.
+    """Sort atoms into layers along the third axis, with contiguous bins along the second axis.
 
     Returns:
-        positions, labels, and the start of each bin with the end of the last.
+        positions, labels, start of each bin and end of the last bin.
     """
     n = x.shape[1]
     layered, label = np.empty((3, n + EIGHT)), np.empty(n + EIGHT, np.int32)
@@ -81,7 +81,7 @@ def _layered(x, start, bins):
 
 @njit
 def _runs(b0, b1, box, run, shift):
-    """Find the bins of a layer that are near a column, with the lattice vector for each run of bins.
+    """Find runs of bins near a column of bins in a layer, with the lattice vector that shifts each run.
 
     Returns:
         number of runs, and the run that contains the column. run: index along the first axis, first and last
@@ -113,13 +113,13 @@ def _runs(b0, b1, box, run, shift):
 
 @njit
 def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
-    """Copy the atoms near a column of bins, layer by layer, shifted by their lattice vectors.
+    """Copy the atoms near a column of bins, layer by layer, shifted by lattice vectors to nearby images.
 
-    The neighborhood of a bin consists of the layers around its own, which are contiguous; every atom is
-    therefore copied only once for a column of bins.
+    The neighborhood of a bin consists of contiguous layers around its own layer, so that every atom is copied
+    only once for a whole column of bins.
 
     Returns:
-        whether the capacity sufficed. begin: start of each layer, and the end; home: start of its middle bin.
+        True if the capacity sufficed. begin: start of each layer, and the end; home: start of its middle bin.
     """
     (x, own, start), (runs, middle), (bins, reach, periodic, matrix) = layered, found, box
     count, apart, wide = 0, x.shape[1], near.shape[1]
@@ -160,7 +160,7 @@ def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
 
 @njit
 def _within(x, y, z, xi, yi, zi, r2_list, mask):
-    """Compute the mask of the candidates within the list radius."""
+    """Set the mask of the candidate atoms within the list radius of an atom."""
     for k in range(len(x)):
         dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         mask[k] = dx * dx + dy * dy + dz * dz <= r2_list
@@ -168,7 +168,7 @@ def _within(x, y, z, xi, yi, zi, r2_list, mask):
 
 @njit
 def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
-    """Like `_within`, for a box with a single bin along an axis, where the nearest image must be found."""
+    """Set the mask of candidates within the list radius, for a box with a single bin along an axis."""
     for k in range(len(x)):
         dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         f = np.rint(dx * inverse[0, 0] + dy * inverse[1, 0] + dz * inverse[2, 0])
@@ -182,7 +182,7 @@ def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
 
 @njit
 def _compressed(mask, label, first, atoms, out, place):
-    """Write the labels of the first atoms that the mask selects; return their number."""
+    """Write the labels of the atoms that the mask selects; return the number of labels."""
     filled = place
     for k in range(0, atoms, EIGHT):
         filled = kept(mask, k, label, first + k, out, filled)
@@ -191,7 +191,7 @@ def _compressed(mask, label, first, atoms, out, place):
 
 @njit
 def _transposed(rows, table, first, begin, end):
-    """Write the slots of consecutive atoms, which share cache lines, together."""
+    """Copy the neighbors of consecutive atoms to the table, many atoms at once to write whole cache lines."""
     room, n = table.shape
     if end - begin == _TOGETHER and room % EIGHT == 0:
         for k in range(0, room, EIGHT):
@@ -205,7 +205,7 @@ def _transposed(rows, table, first, begin, end):
 
 @njit
 def _fill(x, layered, box, inverse, start, r2_list, table, columns):
-    """Write the neighbors of the atoms (sorted by bin) in some columns of bins.
+    """Write the neighbors of the atoms, sorted by bin, in a range of columns of bins.
 
     Returns:
         the largest number of neighbors, which may exceed the capacity.
@@ -258,7 +258,7 @@ def _fill(x, layered, box, inverse, start, r2_list, table, columns):
 
 
 def grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
-    """Return the number of bins, and the range of the search in bins, along each axis."""
+    """Return the number of bins along each axis, and the range of the search in bins."""
     bins = np.ones(3, np.int64)
     reach = np.zeros(3, np.int64)
     for k in range(3):
@@ -277,7 +277,7 @@ def grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
 def neighbor_table(
     positions: Float[np.ndarray, "atoms 3"], cell: Cell, r_list: float, room: int
 ) -> tuple[Int[np.ndarray, "room atoms"], Int[np.ndarray, "atoms"], int]:
-    """Return all neighbors within r_list of every atom, in both directions, with atoms sorted by bin.
+    """Find all neighbors within r_list of every atom, in both directions, with atoms sorted by bin.
 
     Args:
         positions: wrapped positions, length.
@@ -286,8 +286,8 @@ def neighbor_table(
         room: number of slots per atom.
 
     Returns:
-        table of sorted indices, padded with the number of atoms; order, such that sorted atom k is atom
-            order[k]; and the largest number of neighbors, which exceeds room if the table is incomplete.
+        table of sorted indices, padded with the number of atoms; order (sorted atom k is atom order[k]); and
+            the largest number of neighbors, which exceeds room if the table is incomplete.
     """
     atoms = len(positions)
     components = np.ascontiguousarray(positions.T, np.float64)
@@ -348,9 +348,9 @@ _using = threading.Lock()
 
 
 def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
-    """Return aligned memory for a table, which XLA need not copy on a CPU; unused memory is used again.
+    """Return aligned memory for a neighbor table, reusing memory if possible; on a CPU, XLA need not copy it.
 
-    For a million atoms the table takes half a gigabyte, and allocating new memory takes longer than a search.
+    For a million atoms, the table needs half a gigabyte, whose allocation takes longer than a search.
     """
     size = 4 * room * atoms + 64
     with _using:
@@ -364,9 +364,5 @@ def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
 
 
 def free_extent(cell: Cell, low: float, high: float) -> float:
-    """Return the extent of the atoms along a free axis; 0 if a single bin contains all atoms.
-
-    The extent is measured along the axis, which is orthogonal to the periodic axes if the lattice vectors
-    are.
-    """
+    """Return the extent of the atoms along a nonperiodic axis; 0 (a single bin) in a tilted box."""
     return float(high - low) if cell.orthorhombic or not any(cell.pbc) else 0.0

@@ -1,9 +1,9 @@
-"""Integrators: the update between two force evaluations, and the common step that uses it.
+"""Integrators, which update the state between two force evaluations, and the time step that uses them.
 
-A step evaluates the forces at x_s, completes the previous step (`finish`), which gives the full-step velocity
-v_s, and makes the first half of the next step (`begin`), which gives x_{s+1}. The state between steps is
-(x_{s+1}, half-step velocity, extra). A neighbor list that is used up is therefore replaced before its forces
-are evaluated, and a rollout can stop and resume between steps without evaluating forces twice.
+A step evaluates the forces at x_s and completes the previous step (`finish`), which gives the full-step
+velocity v_s. The first half of the next step (`begin`) then gives x_{s+1}. The state between steps is
+(x_{s+1}, half-step velocity, extra). An outdated neighbor list is therefore replaced before forces are
+evaluated, and a simulation can stop and resume between steps without evaluating forces twice.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ Order = Int[Array, "atoms"]
 
 
 def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Array, "*rest atoms"]:
-    """Convert an array over atoms from the sorted order of a list to the order of the user."""
+    """Convert a per-atom array from the sorted order of a neighbor list to the order of the input."""
     return jnp.zeros_like(a).at[..., order].set(a)
 
 
 class ByAtom(NamedTuple):
-    """Array in an extra state whose last axis is over atoms, and which is sorted together with them."""
+    """Per-atom array in an extra state, sorted like the atoms along its last axis."""
 
     value: Array
 
 
 def by_atom(change: Callable[[Array], Array], extra: Any) -> Any:
-    """Apply a function to the per-atom arrays of an extra state."""
+    """Apply a function to all per-atom arrays of an extra state."""
 
     def one(part: Any) -> Any:
         return ByAtom(change(part.value)) if isinstance(part, ByAtom) else part
@@ -65,7 +65,7 @@ _INSIDE = {
 
 
 def converted(field: Field[Any], value: Any, units: Units, *, back: bool = False) -> Any:
-    """Convert a number of a file to the unit of a field of an integrator, or back if `back` is true."""
+    """Convert a number from the unit in a system file to the internal unit of a field, or back."""
     if (unit := field.metadata.get("unit")) not in _INSIDE:
         return value
     *ways, factor = _INSIDE[unit]
@@ -75,14 +75,15 @@ def converted(field: Field[Any], value: Any, units: Units, *, back: bool = False
 def quantity(
     unit: Literal["time", "rate", "temperature", "pressure", "compressibility", "seed"], **options: Any
 ) -> Any:
-    """A field of an integrator that a system file has in another unit: a time, one over a time, a temperature
-    (by the key `temperature`; an energy inside mdnum), a pressure, one over a pressure or a random key (by
-    `seed`)."""
+    """Declare an integrator field that a system file gives in units of this kind, or as a random seed.
+
+    The units "temperature" (an energy inside mdnum) and "seed" (a random key) are also keys in the file.
+    """
     return eqx.field(metadata={"unit": unit}, **options)
 
 
 class AtStep(NamedTuple):
-    """Data of a step whose forces have just been evaluated, for an integrator; atoms are sorted."""
+    """Data of a step after the evaluation of its forces, as an integrator needs them; atoms are sorted."""
 
     acceleration: Vector  # force/mass, in the dtype of the state
     virial: Number  # sum over pairs of r_ij · F_ij, energy, float64
@@ -95,10 +96,10 @@ class AtStep(NamedTuple):
 
 
 class Integrator(eqx.Module):
-    """Base class: update of positions and velocities between force evaluations.
+    """Base class of integrators, which update positions and velocities between force evaluations.
 
-    The fields, except keyword-only fields, are keys of a system file. A field with a unit is declared by
-    `quantity`. The value of a static field is not converted.
+    All fields except keyword-only fields are keys in a system file. Fields with units are declared by
+    `quantity`. Values of static fields are not converted.
 
     Example:
         >>> class NoseHoover(mdnum.Integrator): ...  # examples/thermostat.py is a whole one
@@ -120,18 +121,18 @@ class Integrator(eqx.Module):
 
     @classmethod
     def keys(cls) -> dict[str, Field[Any]]:
-        """Fields of the integrator, by their keys in a system file."""
+        """Fields of the integrator by their keys in a system file."""
         units = [(one.metadata.get("unit"), one) for one in fields(cls) if not one.kw_only]
         return {unit if unit in ("temperature", "seed") else one.name: one for unit, one in units}
 
     @classmethod
     def numbers(cls) -> list[str]:
-        """Keys of the numbers with respect to which the integrator can be differentiated."""
+        """Keys of the numerical parameters by which an integrator can be differentiated."""
         return [key for key, one in cls.keys().items() if key != "seed" and not one.metadata.get("static")]
 
     @classmethod
     def of_file(cls, table: Mapping[str, Any], units: Units) -> Integrator:
-        """Make the integrator that a table of a system file describes."""
+        """Make an integrator from the table that describes it in a system file."""
         made = {}
         for key, field in cls.keys().items():
             if (value := table.get(key)) is None:
@@ -143,30 +144,29 @@ class Integrator(eqx.Module):
 
     @property
     def random(self) -> Any:
-        """Random key, an array; None without noise. Inside eqx.tree_at it may be another object."""
+        """Random key, an array, or None for an integrator without noise; eqx.tree_at may replace it."""
         field = self.keys().get("seed")
         return None if field is None else getattr(self, field.name)
 
     @property
     def noise_belongs_to(self) -> tuple[str, ...]:
-        """Whether atoms and axes have noise of their own: after a permutation of "atoms" or "axes" they have
-        that of others."""
+        """Symmetries, "atoms" or "axes", that the noise breaks because it is tied to atom or axis indices."""
         return () if self.random is None else ("atoms", "axes")
 
     def number(self, key: str, units: Units) -> float:
-        """Return the number of a field by its key, in the units of a system file."""
+        """Return the value of a field by its key, in the units of a system file."""
         field = self.keys()[key]
         return converted(field, float(getattr(self, field.name)), units, back=True)
 
     def with_number(self, key: str, value: Any, units: Units) -> Integrator:
-        """Return the integrator with another number for a key, without recompilation."""
+        """Return a copy of the integrator with another value of a field, without recompilation."""
         field = self.keys()[key]
         # of a numpy number: a Python one would make another compiled program (a weak type)
         inner = jnp.asarray(np.float64(converted(field, value, units)))
         return eqx.tree_at(lambda one: getattr(one, field.name), self, inner)
 
     def init(self, x: Vector, v: Vector, masses: Masses) -> Any:
-        """Return the initial extra state: any pytree of numerical arrays; arrays over atoms are `ByAtom`.
+        """Return the initial extra state, a pytree of numerical arrays, with per-atom arrays as `ByAtom`.
 
         Args:
             x, v: wrapped positions and velocities of step 0, in the order of the user.
@@ -175,7 +175,7 @@ class Integrator(eqx.Module):
 
     @abstractmethod
     def finish(self, v: Vector, extra: Any, at: AtStep, time: Number) -> tuple[Vector, Any]:
-        """Return full-step velocities and the extra state.
+        """Complete a step after its force evaluation; return full-step velocities and the extra state.
 
         Args:
             v, extra: sorted velocities and extra state, as returned by `begin` and `deform`.
@@ -186,17 +186,17 @@ class Integrator(eqx.Module):
 
     @abstractmethod
     def begin(self, x: Vector, v: Vector, extra: Any, at: AtStep) -> tuple[Vector, Vector, Any, Number]:
-        """Return positions, velocities, extra state for the next force evaluation, and the absorbed heat.
+        """Begin a step; return positions, velocities and extra state for the next forces, and absorbed heat.
 
         Args:
             x, v: sorted positions and full-step velocities.
         """
 
     def deform(self, v: Vector, extra: Any, at: AtStep) -> tuple[Float[Array, "3 3"], Vector, Any]:
-        """Return the deformation of the box before the next force evaluation; by default none.
+        """Return the deformation of the box before the next force evaluation; the default is no deformation.
 
         The method is called after `begin`. Lattice vectors and positions, as rows, are multiplied by the
-        deformation; motion relative to the box belongs in `begin`.
+        deformation; `begin` must make only the motion relative to the box.
 
         Args:
             v, extra: sorted velocities and extra state, as returned by `begin`.
@@ -208,14 +208,14 @@ class Integrator(eqx.Module):
 
     @property
     def moves_cell(self) -> bool:
-        """Whether the integrator has its own `deform`; if not, the box is constant and no row records it."""
+        """True if the integrator defines `deform`; otherwise the box is constant and is not recorded."""
         return type(self).deform is not Integrator.deform
 
     def check(self, cell: Cell) -> None:
-        """Raise `InputError` for an unsupported box or option; called once, on the host."""
+        """Raise `InputError` for an unsupported box or option; this check runs once, on the host."""
 
     def freedom(self, masses: Float[Any, "atoms"]) -> int:
-        """Return the degrees of freedom: three per atom, minus three if the total momentum is zero."""
+        """Return the number of degrees of freedom: 3 per atom, minus 3 if the total momentum is zero."""
         return max(3 * masses.shape[0] - self.constraints, 1)
 
     def kinetic(self, v: Vector, masses: Masses) -> Number:
@@ -225,24 +225,24 @@ class Integrator(eqx.Module):
 
     @property
     def anisotropic(self) -> bool:
-        """True if the integrator needs the virial tensor, which adds a tenth to the time of the forces."""
+        """True if the integrator needs the virial tensor, which makes force evaluations 10 % slower."""
         return False
 
     @property
     def keeps_angles(self) -> bool:
-        """True if `deform` returns diagonal matrices, so that an orthorhombic box stays orthorhombic."""
+        """True if `deform` returns only diagonal matrices, so that orthorhombic boxes stay orthorhombic."""
         return False
 
     def exchanged(self, extra: Any, at: AtStep) -> tuple[Number | float, Number | float]:
-        """Return the energy transferred to the atoms so far: heat of the thermostat, and work of the box.
+        """Return the energies transferred to the atoms so far: heat from the thermostat, and work of the box.
 
-        Potential plus kinetic energy, minus both terms and minus the heat returned by `begin`, is conserved.
+        Potential plus kinetic energy, minus both terms and minus heat returned by `begin`, is conserved.
         """
         return 0.0, 0.0
 
 
 class StepEnd(NamedTuple):
-    """Result of a step, with atoms in the input order."""
+    """Result of a time step, with atoms in the input order."""
 
     # v, extra: full-step velocities and the extra state with them
     v: Vector
@@ -270,13 +270,13 @@ def one_step(
     *,
     wrap: bool = True,
 ) -> StepEnd:
-    """Make one step of molecular dynamics, from its forces to the positions of the next step.
+    """Make one time step, from the forces at the present positions to the positions of the next step.
 
     Args:
         cell: the box, float64. masses: float64. made: the `Forces` at x.
         x, v, extra: wrapped positions, and velocities and extra state as returned by `begin`; at step 0, the
             starting state.
-        wrap: False for derivatives without a box, for which wrapping is a translation.
+        wrap: True to wrap positions; False for derivatives, for which wrapping is only a translation.
     """
     dtype = x.dtype
     acceleration = made.force.astype(dtype) / masses.astype(dtype)
@@ -299,14 +299,14 @@ def one_step(
 
 
 class KickDrift(Integrator):
-    """Base class of integrators that consist of a kick by the forces and a drift independent of them.
+    """Base class of integrators that alternate a kick by the forces with a drift independent of the forces.
 
     Example:
         >>> isinstance(mdnum.build("argon/langevin-500").integrator, mdnum.KickDrift)
         True
 
     Raises:
-        TypeError: a subclass overrides kick, half step, extra state or box, which derivatives would ignore.
+        TypeError: a subclass overrides a method that derivatives of kick and drift would ignore.
     """
 
     def __init_subclass__(cls, **options: Any):
@@ -333,11 +333,11 @@ class KickDrift(Integrator):
     def drift(
         self, x: Vector, v: Vector, masses: Masses, step: Step, order: Order
     ) -> tuple[Vector, Vector, Number]:
-        """Advance as in `begin`, after the kick; linear in x and v."""
+        """Advance positions and velocities as in `begin`, after the kick; linear in x and v."""
 
 
 def without_kick(integrator: Integrator) -> str | None:
-    """Return why derivatives for a kick and a drift do not apply to an integrator; None if they do."""
+    """Return the reason why derivatives of kick and drift are invalid for an integrator; None if valid."""
     if type(integrator) in (VelocityVerlet, Langevin):
         return None
     if isinstance(integrator, KickDrift) and _is_linear(integrator):
@@ -349,13 +349,13 @@ def without_kick(integrator: Integrator) -> str | None:
 
 
 def check_kick(integrator: Integrator) -> None:
-    """Raise `InputError` for an integrator that a linearization does not support."""
+    """Raise `InputError` if the equations of motion of an integrator cannot be linearized."""
     if why := without_kick(integrator):
         raise InputError(f"the equations of the run cannot be linearized: {why}", where="dynamics.kind")
 
 
 def check_one_box(integrator: Integrator, what: str) -> None:
-    """Raise `InputError` if the integrator moves the box where a fixed box is required."""
+    """Raise `InputError` if an integrator changes the box although a fixed box is required."""
     if integrator.moves_cell:
         raise InputError(
             f"{what} need a fixed box, but {integrator.name} changes the box", where="dynamics.kind"
@@ -363,7 +363,7 @@ def check_one_box(integrator: Integrator, what: str) -> None:
 
 
 def _is_linear(integrator: KickDrift) -> bool:
-    """True if the drift has the same derivative (by positions and velocities) at two states."""
+    """Return True if the derivative of the drift, by positions and velocities, is equal at two states."""
     x, v, dx, dv = jax.random.normal(jax.random.key(0), (4, 3, 4), jnp.float64)
     zero, order = jnp.zeros((), jnp.int64), jnp.arange(4)
 
@@ -375,7 +375,7 @@ def _is_linear(integrator: KickDrift) -> bool:
 
 
 class VelocityVerlet(KickDrift):
-    """NVE. Symplectic and time-reversible in exact arithmetic; local error O(dt³).
+    """Velocity Verlet (NVE): symplectic and time-reversible in exact arithmetic; local error O(dt³).
 
     Example:
         >>> mdnum.simulation(atoms, argon, mdnum.Cut("switched", 8.5), timestep=0.002)
@@ -388,10 +388,10 @@ class VelocityVerlet(KickDrift):
 
 
 class Langevin(KickDrift):
-    """BAOAB (Leimkuhler & Matthews 2013): drift, exact Ornstein-Uhlenbeck step, drift.
+    """Langevin dynamics, BAOAB (Leimkuhler & Matthews 2013): drift, exact Ornstein-Uhlenbeck step, drift.
 
-    The noise is a function of the random key and the step, so that two runs can have the same noise and a
-    resumed run continues it.
+    The noise is a function of the random key and the step number, so that two runs can have the same noise
+    and a resumed run continues the same noise sequence.
 
     Example:
         >>> cut = mdnum.Cut("switched", 8.5)

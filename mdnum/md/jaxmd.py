@@ -1,4 +1,4 @@
-"""The only interface to jax-md: displacement, neighbor lists and pair search, avoiding its pitfalls."""
+"""Interface to jax-md (displacements, neighbor lists, pair search), which avoids pitfalls of jax-md."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Format = Literal["dense", "sparse", "ordered-sparse"]
 
 
 def _dual(cell: Float[Array, "3 3"], periodic: tuple[int, ...]) -> Float[Array, "3 axes"]:
-    """Return the matrix that maps a vector to its fractional coordinates along the periodic axes only."""
+    """Return the matrix that maps a vector to its fractional coordinates along periodic axes only."""
     if len(periodic) == 3:
         a, b, c = cell
         dual = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
@@ -50,7 +50,7 @@ def displacement(
 
     Args:
         cell: lattice vectors as rows, length; orthorhombic or triclinic.
-        pbc: flags of the periodic axes; the rows of the other axes are ignored.
+        pbc: flags of the periodic axes; rows of nonperiodic axes are ignored.
 
     Returns:
         `fn(Ra, Rb, cell=None, perturbation=None) -> Ra - Rb`, (3,) arrays. `cell=` replaces the given cell,
@@ -59,7 +59,7 @@ def displacement(
 
     Error:
         the minimum image is the nearest image only for distances below half the smallest perpendicular width;
-            the list builders of this module reject a larger radius. jax-md's own spaces do not check it.
+            the list builders of this module reject larger radii, which jax-md's spaces do not check.
     """
     periodic = tuple(axis for axis in range(3) if pbc[axis])
     base = jnp.asarray(cell)
@@ -92,7 +92,7 @@ def neighbor_vectors(
     cell: Float[Array, "3 3"],
     pbc: tuple[bool, bool, bool],
 ) -> Float[Array, "atoms slots 3"]:
-    """Return minimum-image vectors from each atom to its neighbors; vectors of padding slots are finite."""
+    """Return minimum-image vectors from each atom to its neighbors; vectors of padding entries are finite."""
     toward = displacement(cell, pbc)
     others = positions[jnp.where(idx < positions.shape[0], idx, 0)]
     return jax.vmap(lambda here, there: jax.vmap(lambda point: toward(point, here))(there))(positions, others)
@@ -106,20 +106,20 @@ _ROOM = 1.25
 
 
 def standard_promotion() -> AbstractContextManager[None]:
-    """Enable the dtype promotion that jax-md needs, since it mixes dtypes even when it is imported."""
+    """Enable automatic dtype promotion, which jax-md requires because it mixes dtypes even on import."""
     return jax.numpy_dtype_promotion("standard")
 
 
 @contextmanager
 def _quiet_scatter() -> Iterator[None]:
-    """Suppress a warning of jax: jax-md scatters int64 indices into int32 arrays at every trace."""
+    """Suppress a jax warning about jax-md, which scatters int64 indices into int32 arrays at every trace."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "scatter inputs have incompatible types", FutureWarning)
         yield
 
 
 def upstream() -> ModuleType:
-    """Return the package jax_md; the first call imports it, which takes seconds."""
+    """Return the package jax_md, which is imported, in seconds, at the first call."""
     with standard_promotion():
         import jax_md
         import jax_md.custom_partition
@@ -130,10 +130,10 @@ def upstream() -> ModuleType:
 
 
 def scalar(value: float | np.ndarray) -> Float[Array, ""]:
-    """Convert a number to a float64 jax array, the only form that jax-md does not round to float32.
+    """Convert a number to a float64 jax array, the only type that jax-md does not round to float32.
 
-    jax_md.util.maybe_downcast converts Python floats, numpy floats and numpy arrays to float32 even if x64 is
-    enabled, but not float64 jax arrays. Use this function for every sigma, epsilon, r_onset and r_cutoff.
+    Even with x64 enabled, jax_md.util.maybe_downcast converts Python floats, numpy floats and numpy arrays to
+    float32, but no float64 jax arrays. Use this function for every sigma, epsilon, r_onset and r_cutoff.
     """
     return jnp.asarray(value, jnp.float64)
 
@@ -152,9 +152,9 @@ def as_neighbor_list(
     self_edges: bool = False,
     code: Any = 0,
 ) -> NeighborList:
-    """Make a jax-md NeighborList from a list built by another program, for use with jax-md energies.
+    """Make a jax-md NeighborList from the list of another program, for use with jax-md energy functions.
 
-    The function also works inside jit; the positions of padding do not change.
+    The function also works inside jit; padding entries keep their places in the arrays.
 
     Args:
         idx_dense: neighbors of each atom, in both directions, padded with the number of atoms. Entries of an
@@ -190,7 +190,7 @@ def listed(
     format: Format,
     code: Any = 0,
 ) -> NeighborList:
-    """Make a NeighborList like `as_neighbor_list`, from entries that already have jax-md's format."""
+    """Make a jax-md NeighborList from entries in jax-md's format; see `as_neighbor_list`."""
     partition = upstream().partition
     return partition.NeighborList(
         idx=idx,
@@ -208,7 +208,7 @@ def listed(
 def multi_image(
     neighbor: NeighborList, x: Float[Array, "atoms 3"], cell: Float[Array, "3 3"], box: Float[Array, "3 3"]
 ) -> Any:
-    """Return the list with integer shifts of nearest images, in the form of jax_md.custom_partition.
+    """Return a neighbor list with integer shifts of minimum images, in the form of jax_md.custom_partition.
 
     Args:
         x: positions, length. cell: lattice vectors as rows, length. box: the box in the form that the energy
@@ -228,11 +228,12 @@ def multi_image(
 
 
 class PairSearch:
-    """jax-md's own neighbor search for one cell, for repeated calls with new positions.
+    """Neighbor search of jax-md for one cell, for repeated calls with new positions.
 
-    jax-md receives fractional coordinates wrapped into [0, 1) and the perpendicular widths as its box,
-    because it loses pairs of positions outside the box without an error, and rejects some valid triclinic
-    boxes. The overflow flag is read after every search, outside jit; after an overflow, the list is enlarged.
+    Positions are passed to jax-md as fractional coordinates wrapped into [0, 1), with the perpendicular
+    widths as the box. Otherwise, jax-md loses pairs of positions outside the box without an error, and
+    rejects some valid triclinic boxes. The overflow flag is read after every search, outside jit; after an
+    overflow, the list is enlarged.
 
     Args:
         cell: lattice vectors as rows, length.
@@ -265,7 +266,7 @@ class PairSearch:
         self._update = jax.jit(lambda folded, previous: previous.update(folded))
 
     def _frame(self, fractional: np.ndarray) -> None:
-        """Return a frame [0, 1) around the atoms along free axes, with a margin for their motion."""
+        """Set the interval [0, 1) around the atoms along nonperiodic axes, with a margin for their motion."""
         low, high = fractional.min(axis=0), fractional.max(axis=0)
         self._low = np.where(self.pbc, 0.0, low - self.r_list)
         self._span = np.where(self.pbc, 1.0, high - low + 2 * self.r_list)
@@ -301,7 +302,7 @@ class PairSearch:
         return functions.allocate(jnp.asarray(folded))
 
     def __call__(self, positions: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "atoms slots"]:
-        """Return the neighbors within r_list of each atom, as sorted rows padded with the number of atoms.
+        """Return sorted neighbors within r_list, one row per atom, padded with the number of atoms.
 
         Raises:
             NumericalError: a position is not finite.
@@ -344,7 +345,7 @@ def dense_pairs(
     pbc: tuple[bool, bool, bool],
     r_list: float,
 ) -> Int[np.ndarray, "atoms slots"]:
-    """Return neighbors within r_list found by jax-md; a few compiled `PairSearch` objects are kept."""
+    """Return neighbors within r_list found by jax-md; the most recent `PairSearch` objects are reused."""
     rows = np.ascontiguousarray(cell, np.float64)
     return _kept_search(rows.tobytes(), pbc, float(r_list))(np.asarray(positions))
 
