@@ -1,10 +1,10 @@
-"""Sums over the neighbors of every atom in one compiled loop, which XLA calls on a CPU.
+"""Sums over the neighbors of every atom, by one compiled loop that XLA calls on a CPU.
 
-jax traces a function of one pair, and its operations are written as LLVM text for vectors of eight atoms. The
-data of an atom are contiguous, so that loading a neighbor takes one or two instructions, and eight slots are
-summed in registers; XLA's own loop gathers and computes in separate passes. No operation is contracted or
-reordered: equal input gives the same bits on every processor. XLA calls the loop through its foreign-function
-interface (xla/ffi/api/c_api.h, version 0.3).
+A function of one pair is traced by jax, and its operations are written as LLVM text for vectors of eight
+atoms. The data of an atom are contiguous, so that loading a neighbor takes one or two instructions, and the
+terms of eight slots are summed in registers. In contrast, XLA's own loop gathers and computes in separate
+passes. No operation is contracted or reordered, so that equal input gives equal bits on every processor. XLA
+calls the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 class PairSums(NamedTuple):
-    """Results of a loop over a list."""
+    """Results of a loop over all pairs of a neighbor list."""
 
     # of each term over the slots of each atom, first slot first, shape (terms, atoms)
     sums: Float[Array, "terms atoms"]
@@ -79,7 +79,7 @@ _Pair = Callable[..., Sequence[Any]]
 
 
 class Shortcut(NamedTuple):
-    """A cheaper function of a pair, which the loop evaluates for a vector of pairs none of which is far."""
+    """A cheaper function of a pair, used for a vector of pairs if all pairs in the vector are near."""
 
     # whether a pair is far, from the arguments of a function of a pair
     far: Callable[..., Any]
@@ -99,7 +99,7 @@ def over_pairs(
     near: Shortcut | None = None,
     totals: int = 0,
 ) -> PairSums | None:
-    """Sum a function of pairs over the slots of every atom; inside jit, on a CPU.
+    """Sum a function of pairs over the neighbor slots of every atom; inside jit, on a CPU.
 
     Args:
         pair: a function of scalars: the columns of the atom, those of its neighbor, the pair type (None if
@@ -151,7 +151,7 @@ def over_pairs(
 
 
 def left_out(potential: Any) -> str | None:
-    """Return jax's name of the operation for which a potential cannot use the loop; None if there is none."""
+    """Return jax's name of the operation that prevents a potential from using the loop; None without any."""
     return _LEFT_OUT.get(jax.tree.structure(potential))
 
 
@@ -159,18 +159,18 @@ def left_out(potential: Any) -> str | None:
 
 
 class _NotKnown(Exception):
-    """Raised for a jax operation without an LLVM counterpart, with the name of the operation."""
+    """Error for a jax operation without an LLVM counterpart; its message is the name of the operation."""
 
 
 class _Value(NamedTuple):
-    """A value that differs between pairs, with its name in the loop: a vector of numbers or decisions."""
+    """A value that differs between pairs: the name of a vector of numbers or decisions in the loop."""
 
     name: str
     kind: str = "VEC"
 
 
 class _Written(NamedTuple):
-    """Source of a loop, its numerical arguments, and the number of terms that it adds."""
+    """Source of a compiled loop, its numerical arguments, and the number of terms to sum."""
 
     loop: str
     constants: Array
@@ -213,14 +213,14 @@ _SHAPES = ("broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient")
 
 
 def _number(value: Any, kind: str = "VEC") -> str:
-    """Return a constant as LLVM text, the same for all atoms of a vector."""
+    """Return a constant as LLVM text, for a vector with equal elements."""
     if kind != "VEC":
         return f"ALL[{'i1' if kind == 'BOOL' else 'i64'} {int(value)}]"
     return f"ALL[double 0x{struct.unpack('>Q', struct.pack('>d', float(value)))[0]:016X}]"
 
 
 def _whole_power(equation: Any, inputs: list[Any]) -> int:
-    """Return the exponent of a power that is computed by products; 0 for anything else."""
+    """Return the exponent of a power that is computed by products; 0 for other operations."""
     name, y = equation.primitive.name, inputs[-1]
     if name in ("square", "integer_pow"):
         return equation.params.get("y", 2)
@@ -239,11 +239,11 @@ def _written(
     inverses: bool,
     totals: int,
 ) -> _Written:
-    """Return the loop over eight slots of the atoms of a block, as a function `word`.
+    """Return the source of the loop over eight slots of a block of atoms, an LLVM function `word`.
 
-    Its arguments are the number of atoms, the constants, the distance in atoms from one slot to the next, and
-    the addresses of rows: the columns of the atoms, flags, sums, totals, decisions, types and neighbors of
-    the first slot, nearest margins so far, and the table with the data of all atoms, one after the other.
+    The arguments of `word` are the number of atoms, the constants, the stride between slots (in atoms), and
+    the addresses of rows. The rows are columns of the atoms, flags, sums, totals, decisions, types and
+    neighbors of the first slot, smallest |margin| so far, and the table of atom data.
     """
     number, truth = jax.ShapeDtypeStruct((), np.float64), jax.ShapeDtypeStruct((), np.bool_)
     kind = jax.ShapeDtypeStruct((), np.uint8) if types else None
@@ -386,7 +386,7 @@ def _written(
         each.append("br i1 %distant.WIDE, label %far.WIDE, label %near.WIDE")
 
     def body(program: Any, place: str, totals: int) -> list[str]:
-        """Write a function of a pair as a block of its own; returns the names of the sums after the pair."""
+        """Write a function of a pair as a block of LLVM text; return the names of the updated sums."""
         nonlocal lines
         before, lines = dict(made), []
         quotients.clear()
@@ -484,7 +484,7 @@ def _divide_once(
     powers: dict[str, tuple[str, int]],
     block: str,
 ) -> None:
-    """Replace several quotients by powers of one number by products with its inverse; see `_written`.
+    """Replace quotients by powers of the same number by products with its inverse; see `_written`.
 
     Args:
         block: name of the block to which the lines belong; names of inverse powers contain it.
@@ -504,7 +504,7 @@ def _divide_once(
 
 
 def _same(single: str, value: str, name: str, kind: str) -> str:
-    """Return a vector with the same value in every lane."""
+    """Return LLVM text that makes a vector with the same value in every lane."""
     return (
         f"{name}.first = insertelement {kind} poison, {single} {value}, i64 0\n  "
         f"{name} = shufflevector {kind} {name}.first, {kind} poison, <WIDE x i32> zeroinitializer"
@@ -512,7 +512,7 @@ def _same(single: str, value: str, name: str, kind: str) -> str:
 
 
 def _of_width(text: str, wide: int) -> str:
-    """Adapt lines of source to vectors of a given number of atoms."""
+    """Adapt lines of LLVM text to vectors of the given number of atoms."""
     text = re.sub(r"ALL\[(.+?)\]", lambda one: "<" + ", ".join([one[1]] * wide) + ">", text)
     kinds = {"VEC": "double", "BOOL": "i1", "BYTE": "i8", "LONG": "i64"}
     for name, kind in kinds.items():
@@ -521,7 +521,7 @@ def _of_width(text: str, wide: int) -> str:
 
 
 def _listed(rows: int, margins: bool) -> list[str]:
-    """Test whether any atom of a vector has a neighbor in eight slots; initially all decisions are false."""
+    """Write a test for neighbors of any atom of a vector in eight slots; reset the decisions to false."""
     lines = []
     for k in range(8):
         lines += [
@@ -546,7 +546,7 @@ def _listed(rows: int, margins: bool) -> list[str]:
 
 
 def _others(wide: int, columns: int, rows: int) -> list[str]:
-    """Load the data of the neighbors in a slot, four numbers per load, and transpose them."""
+    """Write the loading of the neighbors in a slot: four numbers per load, followed by a transposition."""
     parts = -(-columns // 4)
     lines = [
         f"%at.WIDE = getelementptr i32, ptr %r{rows - 3}, i64 %from.WIDE",
@@ -651,7 +651,7 @@ define i64 @called(i64 %frame) {{
 
 @cache
 def _registered(source: str, cpu: str = "") -> str:
-    """Register the loop of a source with XLA, for this or a named LLVM processor, and return its name."""
+    """Compile a loop and register it with XLA, for this or a named LLVM processor; return its name in XLA."""
     name = f"mdnum_pairs_{cpu}{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     features = "" if cpu else llvm.get_host_cpu_features().flatten()
     machine = llvm.Target.from_default_triple().create_target_machine(
@@ -682,7 +682,7 @@ def _filled(out_at, n, value):
 
 @njit
 def _interleaved(columns_at, columns, atoms, table_at, apart):
-    """Return the data of one atom after the other, and of one more atom, to which padding refers."""
+    """Write the data of one atom after the other to a table, and NaN for the index of padding."""
     of = carray(pointer(columns_at), (columns * atoms,), np.float64)
     table = carray(pointer(table_at), ((atoms + 1) * apart,), np.float64)
     for k in range(atoms):
@@ -709,7 +709,7 @@ _USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _WORD, _TABLE, _THREADS, _ASKED, _NEAREST
 
 @njit
 def _work(job):
-    """Process the blocks of a job one by one until none is left."""
+    """Process blocks of atoms of a job, one after the other, until none is left."""
     block, blocks = added(job + 8 * _NEXT, 1), peek(job, _BLOCKS)
     if block >= blocks:
         return
@@ -757,13 +757,13 @@ def _work(job):
 
 @njit
 def _leave(job):
-    """Leave a job; the last thread that leaves it frees its memory."""
+    """Release a job; the last thread that uses the job frees its memory."""
     if added(job + 8 * _USERS, -1) == 1:
         free(job)
 
 
 def _help(job):
-    """Task of a helping thread."""
+    """Task of a helper thread: process blocks of a job, then release the job."""
     _work(job)
     _leave(job)
     return 0
@@ -771,7 +771,7 @@ def _help(job):
 
 @njit
 def _helped(job, frame, helpers, task):
-    """Request help from XLA's threads; without help, the calling thread does all the work."""
+    """Schedule helper threads of XLA for a job; if this fails, the calling thread does all the work."""
     api, asked = peek(frame, 2), job + 8 * _ASKED
     schedule, ask = peek(api, 17), peek(api, 18)
     poke(asked, 0, 32)
@@ -791,7 +791,7 @@ def _helped(job, frame, helpers, task):
 
 
 def _over_blocks(frame, word, task):
-    """Process all blocks of atoms for `over_pairs`; return 0 (no error).
+    """Process all blocks of atoms for `over_pairs`, in a call from XLA; return 0 (no error).
 
     Args:
         frame: address of XLA's call frame. word, task: addresses of the loop over a word, and of `_help`.
@@ -825,7 +825,7 @@ def _over_blocks(frame, word, task):
 
 @cache
 def _driver() -> tuple[int, int]:
-    """Return the addresses of the driver and of its helper task; compiled once after an installation."""
+    """Return the addresses of the driver and of its helper task, compiled once per installation."""
     made = [
         cfunc(types.intp(*[types.intp] * count), function)
         for function, count in ((_over_blocks, 3), (_help, 1))

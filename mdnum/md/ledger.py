@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Int
 
 
 class Columns:
-    """Base class of tables: the fields of a frozen dataclass are columns of equal length, first an array.
+    """Base class of tables; the fields of a dataclass are columns of equal length, the first an array.
 
-    A field that is not an array applies to all rows: a text, or None for an unknown column.
+    A field that is not an array is a text that applies to all rows, or None for an unknown column.
     """
 
     def __len__(self) -> int:
@@ -24,7 +24,7 @@ class Columns:
         return type(self)(**chosen)
 
     def equals(self, other: Columns) -> bool:
-        """Whether two tables have bitwise identical columns."""
+        """Return True if two tables have bitwise identical columns."""
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
     def to_pandas(self) -> Any:
@@ -42,7 +42,7 @@ class Columns:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Any]) -> Any:
-        """Concatenate the rows of at least one table, keeping the columns known in all of them."""
+        """Concatenate the rows of one or more tables, keeping only columns that are known in all tables."""
         columns = {name: [vars(one)[name] for one in parts] for name in vars(parts[0])}
         others = {k: [v for v in one if not isinstance(v, np.ndarray)] for k, one in columns.items()}
         return cls(**{k: others[k][0] if others[k] else np.concatenate(one) for k, one in columns.items()})
@@ -50,7 +50,7 @@ class Columns:
 
 @dataclass(frozen=True)
 class Members(Columns):
-    """The pairs inside the cutoff at one frame, sorted by (i, j, rank), each once."""
+    """Pairs inside the cutoff at one frame, sorted by (i, j, rank) without duplicates."""
 
     i: Int[
         np.ndarray, "pairs"
@@ -65,8 +65,8 @@ class Members(Columns):
 class FlipTable(Columns):
     """Table with one row per flip, sorted by (step or frame, i, j, rank).
 
-    For a run, the decisions are those on which the program acted, for each pair at each step. For a
-    trajectory or other given positions, they are derived from the positions at each frame.
+    In a run of mdnum, flips are changes of the decisions used for forces, for each pair at each step. For a
+    trajectory or other given positions, flips are computed from the positions at each frame.
     """
 
     i: Int[np.ndarray, "flips"]  # the pair, as in `Members`
@@ -94,6 +94,6 @@ class FlipTable(Columns):
     by_box: Float[np.ndarray, "flips"] | Any = None
 
     def columns(self, rule: int = 0) -> dict[str, Any]:
-        """Return the known columns by their names in flips.parquet; all rows are from one rule."""
+        """Return the known columns by their names in flips.parquet, with all rows from one rule."""
         known = {name: column for name, column in vars(self).items() if column is not None}
         return {"rule": np.broadcast_to(np.int32(rule), len(self)), **known}

@@ -1,4 +1,4 @@
-"""Many-body potentials: an energy over a neighbor list, with forces and stress derived from it."""
+"""Many-body potentials: energies over a neighbor list, from which forces and stress are derived."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mdnum.md.jaxmd import NeighborList
 
 @dataclass(frozen=True)
 class Smoothness:
-    """Smoothness of the energy when a pair crosses r_cut."""
+    """Smoothness of the energy as a function of a pair distance at r_cut."""
 
     # continuous derivatives of the energy at r_cut: -1 where the energy itself jumps, 0 where only the force
     # does, math.inf where every derivative vanishes
@@ -30,11 +30,11 @@ _UNKNOWN = Smoothness(-1, float("nan"), float("nan"))
 
 
 class ManyBody(eqx.Module):
-    """A potential whose energy is not a sum over pairs.
+    """Base class of potentials whose energy is not a sum over pairs.
 
-    Decisions are made before the energy is evaluated: the list contains the pairs that are inside, and an
-    entry equal to the number of atoms is padding. Every potential also tests r < r_cut itself, so that a list
-    with a skin gives the same energy.
+    Pair decisions are made before the energy is evaluated: the neighbor list contains only pairs inside the
+    cutoff, and an entry equal to the number of atoms is padding. Every potential also tests r < r_cut, so
+    that a neighbor list with a skin gives the same energy.
 
     Attributes:
         pbc: which axes are periodic.
@@ -81,13 +81,13 @@ class ManyBody(eqx.Module):
         cell: Float[Array, "3 3"],
         deformation: Float[Array, "3 3"],
     ) -> Float[Array, ""]:
-        """Return the energy after a deformation near 1 of positions and lattice vectors (rows)."""
+        """Return the energy after a deformation near 1 of positions and lattice vectors (as rows)."""
         return self.energy(positions @ deformation, neighbor, cell @ deformation)
 
     def forces(
         self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
     ) -> Float[Array, "atoms 3"]:
-        """Return the forces: minus the gradient of the energy, energy/length."""
+        """Return the forces, the negative gradient of the energy, in energy/length."""
         return -jax.grad(self.energy)(positions, neighbor, cell)
 
     def evaluate(
@@ -97,7 +97,7 @@ class ManyBody(eqx.Module):
 
         Returns:
             energy; forces (atoms, 3); stress (3, 3), energy/length³ in ASE's sign: (1/V) dE/d(strain),
-            positive if the cell tends to shrink. It is meaningful only for a cell with a volume.
+            positive if the cell tends to shrink. The stress is meaningful only for a cell with a volume.
         """
         identity = jnp.eye(3, dtype=positions.dtype)
 
@@ -112,13 +112,13 @@ class ManyBody(eqx.Module):
 
 
 def leaves_by_path(potential: Any) -> dict[str, Any]:
-    """Return the arrays of a potential by their paths, such as "pair.values"."""
+    """Return the arrays of a potential by their paths in the pytree, such as "pair.values"."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(potential)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
 def quantities_of(potential: Any) -> dict[str, Any]:
-    """Return the parameters of a many-body potential by name: its arrays and its constants."""
+    """Return all numerical parameters of a many-body potential, arrays and constants, by name."""
     found = {name: leaf for name, leaf in leaves_by_path(potential).items() if eqx.is_inexact_array(leaf)}
     for field in fields(potential):
         value = getattr(potential, field.name)
@@ -129,7 +129,7 @@ def quantities_of(potential: Any) -> dict[str, Any]:
 
 
 def with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
-    """Return the potential with other parameters; also inside jit."""
+    """Return a copy of the potential with other parameter values; also inside jit."""
     names, tree = list(leaves_by_path(potential)), jax.tree.structure(potential)
     leaves = [values.get(name, leaf) for name, leaf in zip(names, jax.tree.leaves(potential), strict=True)]
     whole = jax.tree.unflatten(tree, leaves)

@@ -1,4 +1,4 @@
-"""Verlet lists with a skin: rules for rebuilding them, their builders, and their content."""
+"""Verlet neighbor lists with a skin: rules for rebuilding, list builders, and the pairs in a list."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SLOTS = 8
 
 @dataclass(frozen=True)
 class RebuildRule:
-    """Rule for rebuilding a list, in the terms of LAMMPS's neigh_modify."""
+    """Rule for rebuilding a neighbor list, with the parameters of LAMMPS's neigh_modify."""
 
     skin: float  # r_list - r_cut, length
     every: int = 1  # a list may be rebuilt only at multiples of this many steps after its build
@@ -32,20 +32,20 @@ class RebuildRule:
 
     @property
     def first_allowed(self) -> int:
-        """Smallest age at which a list can be rebuilt.
+        """Smallest age, in steps, at which a neighbor list can be rebuilt.
 
-        A rebuild at this age is `dangerous` in the sense of LAMMPS: it may have been due earlier."""
+        LAMMPS calls a rebuild at this age dangerous, since it may have been necessary earlier."""
         return max(self.every, self.delay)
 
     @property
     def safe(self) -> bool:
-        """True if a list is always rebuilt before its skin is used up."""
+        """True if this rule always rebuilds a neighbor list before motion has used up the skin."""
         return self.check and self.every == 1 and self.delay <= 1
 
 
 @dataclass(frozen=True)
 class PairTable:
-    """The pairs of one list, in both directions, in the layout of the force loop."""
+    """Pairs of one neighbor list, in both directions, in the memory layout of the force loop."""
 
     # neighbor of each slot and atom, in sorted labels, padded with the number of atoms, shape (slots, atoms);
     # where the search left it, on the host or on a device
@@ -57,12 +57,12 @@ class PairTable:
 
     @cached_property
     def index(self) -> Int[np.ndarray, "slots atoms"]:
-        """The neighbor index table `found`, copied to the host."""
+        """Host copy of the neighbor index table `found`."""
         return np.asarray(self.found)
 
     @cached_property
     def order(self) -> Int[np.ndarray, "atoms"]:
-        """The order of sorted atoms, `sorting`, copied to the host."""
+        """Host copy of `sorting`, the order of the sorted atoms."""
         return np.asarray(self.sorting)
 
     @cached_property
@@ -74,22 +74,21 @@ class PairTable:
 
     @property
     def slots(self) -> int:
-        """Number of neighbor slots per atom."""
+        """Capacity of the table: number of neighbor slots per atom."""
         return self.found.shape[0]
 
     @cached_property
     def pairs(self) -> int:
-        """Number of listed pairs, each counted once."""
+        """Number of pairs in the list, each counted once."""
         module = self.found.__array_namespace__()
         return int(module.count_nonzero(self.found < self.found.shape[1])) // 2
 
     def decided(
         self, bits: UInt8[np.ndarray, "words atoms"]
     ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Return labels i < j of the pairs whose packed decision is true, each once, in table order.
+        """Return indices i < j of the pairs whose packed decision is true, each once, in table order.
 
-        If a pair has decisions in several channels, i is increased by the number of atoms for each previous
-        channel.
+        In channel number c (from 0), i is increased by c times the number of atoms.
         """
         slots, columns = set_bits(bits)
         channel, slots = np.divmod(slots, self.slots)
@@ -98,7 +97,7 @@ class PairTable:
         return (i + channel * len(self.order))[keep], j[keep]
 
     def listed(self, channels: int = 1) -> tuple[Int[np.ndarray, "pairs"], ...]:
-        """Return sorted indices of both atoms of every pair, per channel, and labels as in `decided`."""
+        """Return sorted indices of both atoms, and i and j as in `decided`, for every pair and channel."""
         slots, first = np.nonzero(self.index < len(self.order))
         second = self.index[slots, first]
         i, j = self.order[first], self.order[second]
@@ -108,7 +107,7 @@ class PairTable:
         return first, second, i + np.repeat(np.arange(channels), once.sum()) * len(self.order), j
 
     def unsorted(self) -> Int[np.ndarray, "atoms slots"]:
-        """Return neighbors in the labels of the user, one row per atom, padded with the number of atoms."""
+        """Return neighbors in the input order, one row per atom, padded with the number of atoms."""
         atoms = self.index.shape[1]
         labels = np.append(self.order, atoms).astype(np.int32)
         out = np.empty((atoms, self.slots), np.int32)
@@ -118,7 +117,7 @@ class PairTable:
 
 @runtime_checkable
 class ListBuilder(Protocol):
-    """A neighbor search that fills a pair table."""
+    """Interface of neighbor searches that fill a pair table."""
 
     @property
     def name(self) -> str:
@@ -128,13 +127,13 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Return index table in sorted labels, order, and largest neighbor count (incomplete if > slots)."""
+        """Return index table (sorted atoms), atom order, largest neighbor count (incomplete if > slots)."""
         ...
 
 
 @dataclass(frozen=True)
 class HostBuilder:
-    """mdnum's own cell list, compiled by numba, on the host."""
+    """List builder with mdnum's own cell list, compiled by numba, on the host."""
 
     name: str = "host"
 
@@ -144,7 +143,7 @@ class HostBuilder:
 
 @dataclass(frozen=True)
 class JaxMdBuilder:
-    """List builder that uses jax-md's partition.neighbor_list and avoids its pitfalls."""
+    """List builder with jax-md's partition.neighbor_list, used in a way that avoids its pitfalls."""
 
     name: str = "jax-md"
 
@@ -170,7 +169,7 @@ BUILDERS.add("device", "mdnum.md.device_search:BUILDER")
 
 
 def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
-    """Raise if the list radius is too large for the minimum image.
+    """Raise an error if the list radius is too large for the minimum image.
 
     Raises:
         InputError: r_cut + skin exceeds half the smallest perpendicular width of the box.
@@ -187,7 +186,7 @@ def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
 
 @dataclass
 class VerletList:
-    """Builder of Verlet lists that increases their capacity when needed."""
+    """Builder of Verlet lists, which increases the capacity when needed."""
 
     builder: ListBuilder  # the neighbor search
     rule: RebuildRule  # when to rebuild
@@ -200,7 +199,7 @@ class VerletList:
     slots: int = field(default=0)  # room per atom; 0 lets the density decide
 
     def build(self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell) -> PairTable:
-        """Return the pairs within r_cut + skin of wrapped positions; the capacity is increased as needed.
+        """Return the pairs within r_cut + skin of wrapped positions, increasing the capacity as needed.
 
         Raises:
             CapacityError: an atom would need more slots than there are other atoms.
@@ -239,7 +238,7 @@ class VerletList:
         return max(SLOTS, int(np.ceil(slots / SLOTS)) * SLOTS)
 
     def consumed(self, positions, cell: Cell, reference, reference_cell: Cell) -> float:
-        """Return the fraction of the skin that motion and strain have used; above 1, pairs may be missing.
+        """Return the fraction of the skin used up by motion and strain; above 1, pairs may be missing.
 
         Args:
             positions, cell: present state. reference, reference_cell: state when the list was built.

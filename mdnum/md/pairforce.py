@@ -1,10 +1,10 @@
-"""Pair forces by gathers over a full neighbor list.
+"""Pair forces, computed from a neighbor list that contains each pair in both directions.
 
-Every pair is evaluated once for each of its atoms, so that there are no scattered writes: each atom sums over
-its neighbors in a fixed order. In double precision on a CPU, one compiled loop does this (`md.kernel`).
-Otherwise XLA evaluates a group of slots for all atoms at once and packs the decisions into bits; the
-temporary arrays have at most a few times four numbers per atom and stay in the cache. The same expression
-over the whole (slots, atoms) array takes twice as long at 4,000 atoms and ten times as long at 32,000.
+Every pair is evaluated twice, once for each atom. Each atom sums over its neighbors in a fixed order, without
+scattered writes. In double precision on a CPU, forces are computed by one compiled loop (`md.kernel`).
+Otherwise, XLA evaluates a group of slots for all atoms at once and packs the decisions into bits, so that
+temporary arrays are small enough for the cache. Evaluating the whole (slots, atoms) array at once takes twice
+as long for 4,000 atoms and ten times as long for 32,000 atoms.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _FEW_TYPES = 6
 
 
 class Forces(NamedTuple):
-    """Result of one force evaluation."""
+    """Result of one force evaluation: forces, energies, virial and decisions."""
 
     force: Float[Array, "3 atoms"]  # energy/length, shape (3, atoms)
     # energy of each atom, half of its pairs' (or, where a potential has no such division, the total on the
@@ -60,7 +60,7 @@ class Forces(NamedTuple):
 
 
 class PairForce(eqx.Module):
-    """Forces and decisions of a cut pair potential."""
+    """Forces and pair decisions of a pair potential with a cutoff."""
 
     model: CutPotential  # the potential with its cutoff
     cell: Cell  # the box; that of a row in a rollout
@@ -73,7 +73,7 @@ class PairForce(eqx.Module):
 
     @classmethod
     def create(cls, model: Any, cell: Cell, decider: PairDecider, policy, reduction) -> PairForce:
-        """Make the force with parameters and box in the dtypes of the policy."""
+        """Make the force, with parameters and box in the dtypes of the precision policy."""
         return cls(
             model.astype(policy.dtype("force")),
             cell.astype(np.float64),
@@ -86,7 +86,7 @@ class PairForce(eqx.Module):
 
     @property
     def law(self) -> CutPotential | Guarded:
-        """The potential as the policy computes it: in sixteen bits it is rounded after every operation."""
+        """The potential in the arithmetic of the policy: sixteen-bit types are rounded at every operation."""
         model = self.model.typed
         return Guarded(model, self.zero, rounded) if self._short else model
 
@@ -95,16 +95,16 @@ class PairForce(eqx.Module):
         return self.policy.dtype("force").itemsize == 2
 
     def _in_force_dtype(self, x: Any) -> Float[Array, "..."]:
-        """Round a number to the dtype of the force; XLA would compute in a wider format than sixteen bits."""
+        """Round a number to the force dtype, since XLA computes sixteen-bit types in a wider format."""
         x = x.astype(self.policy.dtype("force"))
         return fence(x, self.zero) if self._short else x
 
     def judge(self, positions: Float[Array, "3 atoms"]) -> SlotJudge:
-        """Return the pair decider at these positions."""
+        """Return the pair decisions at the given positions, as a `SlotJudge`."""
         return SlotJudge(self.decider, self.thresholds, self.cell, self.zero, positions)
 
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
-        """The decisions of a list at given positions, without forces."""
+        """Return the decisions of a neighbor list at given positions, without computing forces."""
         if self.in_one_loop(tables):
 
             def pair(own, other, types, near=False):
@@ -118,11 +118,11 @@ class PairForce(eqx.Module):
 
     @property
     def _inside(self) -> str:
-        """The comparison of the margin with 0 that holds for a pair inside the cutoff."""
+        """Comparison of the margin with 0 that is true for a pair inside the cutoff, ">" or ">="."""
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
     def _near(self, pair: Callable[..., Any], tensor: bool) -> kernel.Shortcut | None:
-        """Return the function for pairs without a minimum image; None if it would save no time."""
+        """Return a pair function without minimum image, for near pairs; None if it would save no time."""
         if not any(self.cell.pbc) or (self.cell.orthorhombic and not tensor):
             return None
 
@@ -136,7 +136,7 @@ class PairForce(eqx.Module):
         """Return displacement, difference of positions, squared distance, decision and margin of a pair.
 
         Args:
-            near: whether the difference of positions is known to be the displacement to the nearest image.
+            near: True if the difference of positions is known to be the minimum image.
         """
         apart = [b - a for a, b in zip(own, other, strict=True)]
         d = apart if near else self.cell.minimum_image(*apart)
@@ -156,16 +156,17 @@ class PairForce(eqx.Module):
         given: UInt8[Array, "words atoms"] | None = None,
         where: UInt8[Array, "words atoms"] | None = None,
     ) -> Forces:
-        """Return the forces at sorted, wrapped positions.
+        """Return the forces at sorted and wrapped positions.
 
         Args:
             positions: shape (3, atoms), length, in the order of the tables.
             tables: the list.
-            decisions, tensor: whether to return these too; forces have the same bits either way.
-            given: imposed decisions, packed like those returned. The returned decisions are always those of
-                the positions, so that both can be compared.
-            where: slots (as bits) in which decisions are imposed; in the other slots the own decisions are
-                used.
+            decisions, tensor: True to return decisions or the virial tensor; forces have the same bits either
+                way.
+            given: imposed decisions, packed like the returned decisions, which always follow from the
+                positions, so that both can be compared.
+            where: slots (as bits) in which decisions are imposed; in all other slots, decisions follow from
+                positions.
         """
         if self.in_one_loop(tables):
             made = _in_one_loop(self, positions, tables, given, where, decisions=decisions, tensor=tensor)
@@ -174,17 +175,17 @@ class PairForce(eqx.Module):
         return self.in_blocks(positions, tables, given, where, decisions=decisions, tensor=tensor)
 
     def in_one_loop(self, tables: Tables) -> bool:
-        """True if `kernel.over_pairs` can sum over the list: double precision, few pair types, on a CPU."""
+        """True if `kernel.over_pairs` can be used: double precision, few pair types, and a CPU."""
         roles = ("force", "decision", "accumulate")
         wide = {self.policy.geometry, *map(self.policy.dtype, roles)} == {np.dtype(np.float64)}
         few = tables.types is None or self.model.pair_types <= _FEW_TYPES
         return wide and few and self.reduction == Sequential() and foreign.known()
 
     def _terms(self, tensor: bool) -> Callable[..., tuple[Float[Array, "..."], ...]]:
-        """Return contributions of a pair to force, energy and virial, from displacement, square and decision.
+        """Return a function for force, energy and virial of a pair, given its displacement and decision.
 
         Args:
-            tensor: whether the virial has six components, in Voigt's order.
+            tensor: True for a virial with six components, in Voigt order.
         """
         law, exactly = self.law, self._in_force_dtype
         at = law.at_cutoff()
@@ -202,7 +203,7 @@ class PairForce(eqx.Module):
         return terms
 
     def weights(self, tables: Tables) -> list[Float[Array, "atoms"]]:
-        """Weights of all weighted terms, in the order of the tables."""
+        """Per-atom weights of all weighted terms, in the order of the tables."""
         return [one[tables.order] for one in self.model.weights if one is not None]
 
     def in_blocks(
@@ -215,7 +216,7 @@ class PairForce(eqx.Module):
         decisions: bool,
         tensor: bool = False,
     ) -> Forces:
-        """Return the forces like `__call__`, in any precision and order and on any device."""
+        """Return the forces as `__call__` does, for any precision, order of summation and device."""
         judge, terms_of = self.judge(positions), self._terms(tensor)
         geometry, accumulate = self.policy.geometry, self.policy.dtype("accumulate")
         same = self.policy.dtype("decision") == geometry
@@ -252,16 +253,16 @@ class PairForce(eqx.Module):
 
 
 class ChannelForce(PairForce):
-    """Forces of terms with different radii, evaluated one after the other over the same list.
+    """Forces of several terms with different cutoff radii, evaluated one after the other over one list.
 
-    The decisions of the terms are concatenated along the axis of words.
+    Decisions of different terms are concatenated along the axis of words of decisions.
     """
 
     model: Channels  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @property
     def parts(self) -> list[PairForce]:
-        """Pair forces of the channels."""
+        """Pair forces of the channels, one for each cutoff radius."""
         thresholds = self.thresholds.reshape(len(self.model.parts), -1)
         rest = self.cell, self.zero
         return [
@@ -270,7 +271,7 @@ class ChannelForce(PairForce):
         ]
 
     def split(self, bits: UInt8[Array, "words atoms"] | None) -> Sequence[Any]:
-        """Decisions by channel."""
+        """Split concatenated decisions into the decisions of each channel."""
         parts = len(self.model.parts)
         return [None] * parts if bits is None else jnp.split(bits, parts)
 
@@ -301,7 +302,7 @@ def _joined(parts: Sequence[Any]) -> Decisions:
 
 
 def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...]]:
-    """Return the factors of the energies of all terms, for `CutPotential.evaluate`; none without weights.
+    """Return factors of the term energies, for `CutPotential.evaluate`; empty if no term has weights.
 
     Args:
         products: products of the weights of both atoms, for terms with weights.
@@ -311,7 +312,7 @@ def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...
 
 
 def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) -> Forces:
-    """Return forces from sums of `PairForce._terms`, which count every pair once for each of its atoms."""
+    """Return forces from sums of `PairForce._terms`, in which every pair is counted for both of its atoms."""
     fx, fy, fz, energy, *virial = sums
     half = jnp.asarray(0.5, energy.dtype)
     summed = [-jnp.sum(half * one, dtype=jnp.float64) for one in virial]
@@ -321,7 +322,7 @@ def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) 
 
 @eqx.filter_custom_jvp
 def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, decisions: bool, tensor: bool):
-    """Compute the result of `PairForce.in_blocks` in one compiled loop; None if this is not possible."""
+    """Return the result of `PairForce.in_blocks` from one compiled loop; None if the loop cannot be used."""
     terms_of = force._terms(False)
 
     def pair(own, other, types, *bits, near=False):
@@ -353,10 +354,10 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
 
 
 def _virial(made: kernel.PairSums, x: Float[Array, "3 atoms"]) -> list[Float[Array, ""]]:
-    """Return force times displacement in Voigt's order, summed over both ends of all pairs.
+    """Return force times displacement in Voigt order, summed over both atoms of all pairs.
 
-    A displacement is x_j - x_i minus lattice vectors. Force times position is summed over atoms; the loop
-    over pairs adds force times lattice vectors, for the few pairs that have some.
+    A displacement is x_j - x_i minus lattice vectors. Force times position is summed over atoms; force times
+    lattice vectors is added in the loop over pairs, for the few pairs across a boundary.
     """
     force, totals = made.sums, made.totals
     return [-2 * jnp.sum(force[a] * x[b]) - total for (a, b), total in zip(VOIGT, totals, strict=True)]
@@ -376,10 +377,10 @@ def _in_one_loop_jvp(primals, tangents, *, decisions: bool, tensor: bool):
 def imposed(
     inside: Bool[Array, "4 atoms"], given: UInt8[Array, "atoms"], where: UInt8[Array, "atoms"] | None
 ) -> Bool[Array, "4 atoms"]:
-    """Return the decisions on which a group acts: the imposed decisions, if there are any, or its own.
+    """Return the decisions used in a group of slots: the imposed decisions where given, or else its own.
 
-    A mask of the given decisions alone makes the compiler compute distances twice; a mask for each slot
-    (`unpacked`) avoids this in part. A step of 864 atoms takes 2.2 and 1.3 times a plain one; here 1.2 times.
+    A simple mask makes the compiler compute distances twice: a step of 864 atoms takes 2.2 times as long as a
+    normal step, 1.3 times with a mask per slot (`unpacked`), and 1.2 times in this way.
 
     Args:
         where: slots in which decisions are imposed; None for all.
@@ -397,11 +398,11 @@ class Guarded(eqx.Module):
     how: Callable[..., Any] = eqx.field(static=True)
 
     def at_cutoff(self) -> AtCutoff:
-        """Same as that of the potential."""
+        """Return the constants at the cutoff, computed in the modified arithmetic."""
         return self.how(self.model.at_cutoff, self.zero)()
 
     def evaluate(self, r2, types, at: AtCutoff):
-        """Same as that of the potential."""
+        """Return energy and slope of pairs, computed in the modified arithmetic."""
         return self.how(self.model.evaluate, self.zero)(r2, types, at)
 
 
@@ -409,7 +410,7 @@ VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
 def symmetric(components: Iterable[Float[Array, ""]]) -> Float[Array, "3 3"]:
-    """The symmetric matrix with six given components in Voigt order."""
+    """Return the symmetric matrix with the six given components in Voigt order."""
     xx, yy, zz, yz, xz, xy = components
     return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
 
@@ -418,7 +419,7 @@ def symmetric(components: Iterable[Float[Array, ""]]) -> Float[Array, "3 3"]:
 
 
 class ManyBodyForce(eqx.Module):
-    """Forces of an energy function over a jax-md neighbor list, by automatic differentiation."""
+    """Forces from an energy function over a jax-md neighbor list, by automatic differentiation."""
 
     potential: Any  # energy(positions (atoms, 3), neighbor, cell (3, 3)) -> energy, with `format`
     # cell, zero, thresholds, decider, policy: as in PairForce. The energy is evaluated in the force's dtype,
@@ -431,14 +432,14 @@ class ManyBodyForce(eqx.Module):
 
     @classmethod
     def create(cls, potential, cell: Cell, decider: PairDecider, policy: PrecisionPolicy) -> ManyBodyForce:
-        """Make the force with the box as jax arrays, and parameters in the dtype of the force."""
+        """Make the force, with the box as jax arrays and parameters in the force dtype."""
         zero, dtype = zero_bits(policy.dtype("decision")), policy.dtype("force")
         if dtype != np.float64:
             potential = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, potential)
         return cls(potential, cell.astype(np.float64), zero, decider.values(), decider.convention, policy)
 
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
-        """The decisions of a list at given positions."""
+        """Return the decisions of a neighbor list at given positions."""
         return SlotJudge(self.decider, self.thresholds, self.cell, self.zero, positions).decide(tables)
 
     def __call__(
@@ -451,7 +452,7 @@ class ManyBodyForce(eqx.Module):
         given: UInt8[Array, "words atoms"] | None = None,
         where: UInt8[Array, "words atoms"] | None = None,
     ) -> Forces:
-        """Return forces at wrapped positions, like `PairForce`; the first atom has the whole energy."""
+        """Return forces as `PairForce` does; the total energy is assigned to the first atom."""
         made = self.decide(positions, tables)
         bits = made.bits if given is None else given
         if given is not None and where is not None:
@@ -468,7 +469,7 @@ class ManyBodyForce(eqx.Module):
     def neighbors(
         self, positions: Float[Array, "3 atoms"], tables: Tables, bits: UInt8[Array, "words atoms"]
     ) -> Any:
-        """Return the neighbor list for the energy function, with only the pairs inside the cutoff."""
+        """Return the neighbor list for the energy function, which contains only pairs inside the cutoff."""
         from mdnum.md import jaxmd
 
         own, atoms = self.potential, positions.shape[1]
@@ -500,14 +501,14 @@ class ManyBodyForce(eqx.Module):
         return self.policy.dtype("force")
 
     def placed(self, x: Float[Array, "atoms 3"], tables: Tables) -> Float[Array, "atoms 3"]:
-        """Return sorted positions in the order of atoms that the energy function expects."""
+        """Return sorted positions in the atom order that the energy function requires."""
         # an energy that takes all atoms for alike sees the table's sorted order
         return jnp.zeros_like(x).at[tables.order].set(x) if self.potential.labeled else x
 
     def energy_of(
         self, tables: Tables, neighbor: Any, potential: Any = None
     ) -> Callable[[Any, Any, Any], Float[Array, ""]]:
-        """Energy as a function of sorted positions (atoms, 3), lattice rows, and a deformation of both."""
+        """Return the energy as a function of sorted positions, lattice vectors (rows), and a deformation."""
         own = self.potential if potential is None else potential
         return lambda x, matrix, by: own.deformed(self.placed(x, tables), neighbor, matrix, by)
 
@@ -529,7 +530,7 @@ class ManyBodyForce(eqx.Module):
 
 
 class MdState(NamedTuple):
-    """State between two force evaluations, with atoms in the order of the tables."""
+    """State of a simulation between two force evaluations, with atoms in the order of the tables."""
 
     step: Int[Array, ""]  # the step whose forces come next
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
@@ -539,10 +540,10 @@ class MdState(NamedTuple):
 
 
 class PairDynamics(eqx.Module):
-    """Dynamics on a fixed list of pairs with imposed decisions.
+    """Dynamics on a fixed neighbor list with imposed decisions.
 
-    The class is used for replays, with the decisions of another run, and for gradients at fixed decisions. A
-    rollout makes the same steps in compiled epochs, with its own decisions.
+    The class is used to replay the decisions of another run, and for gradients at fixed decisions. A normal
+    simulation makes the same steps in compiled epochs, with decisions from its own positions.
     """
 
     force: PairForce  # the pair force
@@ -551,7 +552,7 @@ class PairDynamics(eqx.Module):
     tables: Tables  # the list
 
     def margins(self, state: MdState) -> Float[Array, "groups 4 atoms"]:
-        """Return threshold minus quantity of every slot, positive inside; -inf for padding."""
+        """Return the margin (threshold minus r or r²) of every slot, positive inside; -inf for padding."""
         judge = self.force.judge(state.x)
         index, types = self.tables.groups()
 
@@ -563,11 +564,11 @@ class PairDynamics(eqx.Module):
         return jnp.stack(groups)
 
     def decide(self, state: MdState) -> UInt8[Array, "words atoms"]:
-        """Decisions of the list at the current positions."""
+        """Return the decisions of the neighbor list at the present positions."""
         return self.force.decide(state.x, self.tables).bits
 
     def step(self, state: MdState, decisions: UInt8[Array, "words atoms"]) -> MdState:
-        """Take one time step, with the forces of the pairs inside the cutoff."""
+        """Make one time step, with the forces of the pairs that are inside according to `decisions`."""
         made = self.force(state.x, self.tables, decisions=False, given=decisions)
         order, cell = self.tables.order, self.force.cell
         end = one_step(self.integrator, cell, self.masses, order, *state, made)

@@ -1,4 +1,4 @@
-"""Pair potentials: energy and slope as functions of r²."""
+"""Pair potentials, which return the energy and its slope as functions of r²."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ else:
 
 
 def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> Num[Array, "..."]:
-    """Return the entries of given pair types (None: there is only one type); indices are not checked."""
+    """Return the entries of an array for given pair types (None for a single type), without bounds checks."""
     return leaf[0] if types is None else leaf.at[types].get(mode="promise_in_bounds")
 
 
 class PairPotential(eqx.Module):
-    """Base class of pair potentials without a cutoff; fields are parameters with an entry per pair type.
+    """Base class of pair potentials without a cutoff; its fields are parameters with one entry per pair type.
 
     Example:
         >>> class Inverse(mdnum.PairPotential):
@@ -58,12 +58,12 @@ class PairPotential(eqx.Module):
 
     @abstractmethod
     def evaluate(self, r2: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return energy u and du/d(r²) at squared distances; parameters are broadcast against r2."""
+        """Return energy u and slope du/d(r²) at squared distances; parameters are broadcast against r2."""
 
     def reference(
         self, r: Float[np.ndarray, "pairs"], **constants: Any
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """Return u(r) and u'(r), computed by numpy as a reference for `evaluate`.
+        """Return u(r) and du/dr, computed by numpy as a reference for `evaluate`.
 
         Args:
             r: distances, length.
@@ -75,30 +75,30 @@ class PairPotential(eqx.Module):
         return np.asarray(energy), np.asarray(slope)
 
     def of(self, types: Integer[Array, "..."] | None) -> PairPotential:
-        """Return the parameters of given pair types; None if there is only one type."""
+        """Return the potential with the parameters of given pair types (None for a single type)."""
         own, shared = self.typed.split()
         return eqx.combine(jax.tree.map(lambda leaf: of_type(leaf, types), own), shared)
 
     @property
     def typed(self) -> PairPotential:
-        """The potential with each per-species parameter as two per-pair-type values (first, second atom)."""
+        """The potential with each per-species parameter as two values per pair type, one for each atom."""
         return self
 
     def split(self) -> tuple[Any, Any]:
-        """Return two copies: with only the per-pair-type and only the shared parameters; others are None."""
+        """Return one copy with only per-pair-type parameters and one with only shared parameters."""
         return self, jax.tree.map(lambda _: None, self)
 
     @property
     def leaves(self) -> dict[str, Any]:
-        """Per-pair-type parameters by name, each of shape (types,)."""
+        """Parameters with one value per pair type, by name, each of shape (types,)."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def with_leaves(self, leaves: Mapping[str, Any]) -> PairPotential:
-        """Return the same potential with other parameters."""
+        """Return a copy of the potential with other parameter values."""
         return replace(self, **leaves)
 
     def constants(self, kind: int) -> dict[str, Any]:
-        """Parameters for one pair type (per-species ones as two values), without the shared parameters."""
+        """Return the parameters of one pair type, with two values of each per-species parameter."""
         return jax.tree.map(lambda leaf: float(leaf[kind]), dict(self.typed.leaves))
 
 
@@ -167,7 +167,7 @@ class SoftSphere(PairPotential):
 
 
 class PairFunction(PairPotential):
-    """User-defined pair energy `u(r, **parameters)` or `u(r2, **parameters)`; jax computes its derivative.
+    """User-defined pair energy `u(r, **parameters)` or `u(r2, **parameters)`, differentiated by jax.
 
     Example:
         >>> def morse(r, depth, alpha, r0):
@@ -180,8 +180,8 @@ class PairFunction(PairPotential):
         >>> PairFunction(mixed, sigma={"Na": 1.2, "Cl": 1.8})
 
     Args:
-        function: a function made of jax operations, elementwise in its first argument, whose name determines
-            whether it is the distance, `r` (length), or its square, `r2`. If an argument `species` is not
+        function: a function of jax operations, elementwise in its first argument, which is the distance
+            (length) if named `r`, or the squared distance if named `r2`. If an argument `species` is not
             given, its value is the atomic numbers of both atoms, as two floats.
         parameters: values by name. A number, or a number for each pair of species ({"Ni-P": 0.2, ...}),
             becomes a parameter with one entry per pair type. For a number per species ({"Ni": 2.2, "P": 1.9})
@@ -273,14 +273,14 @@ class PairFunction(PairPotential):
 
 
 def _is_by_type(value: Any) -> bool:
-    """True if a parameter is a number, or a number for each pair of species; other values are shared."""
+    """Return True for a parameter per pair type: a number, or a number for each pair of species."""
     if isinstance(value, Mapping):
         return bool(value) and all(isinstance(key, str) and "-" in key for key in value)
     return isinstance(value, int | float | np.generic) or (eqx.is_array_like(value) and np.ndim(value) == 0)
 
 
 def _is_by_species(value: Any) -> bool:
-    """True if a parameter is a number for each species, by chemical symbols."""
+    """Return True for a parameter per species: numbers by chemical symbol."""
     return (
         isinstance(value, Mapping)
         and bool(value)
@@ -300,7 +300,7 @@ for _potential in (LennardJones, Morse, SoftSphere):
 
 
 class SumPotential(PairPotential):
-    """Potentials of terms that share a decision; energies and slopes are tuples with one entry per term."""
+    """Potentials of several terms with a common pair decision; energies and slopes are tuples, by term."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     parts: tuple[PairPotential, ...]
@@ -322,7 +322,7 @@ class SumPotential(PairPotential):
 
 
 class Together(Cutoff):
-    """Cutoffs of terms that share a decision; onsets, energies and slopes are tuples with one entry each."""
+    """Cutoffs of terms with a common pair decision; onsets, energies and slopes are tuples, by term."""
 
     def __init__(self, ends: tuple[Cutoff, ...]):
         self.ends = ends
@@ -336,7 +336,7 @@ class Together(Cutoff):
         return zip(self.ends, (AtCutoff(at.r_cut, *own) for own in rest), strict=True)
 
     def cut(self, r2, u, w, at, weights=None):
-        """Return the sum over the terms of `Cutoff.cut`; weights: a factor for each term, None for 1."""
+        """Return the sum of `Cutoff.cut` over terms; weights: one factor for each term, None for 1."""
         rows = zip(self._each(at), u, w, strict=True)
         made: list[Any] = [end.cut(r2, energy, slope, own) for (end, own), energy, slope in rows]
         for k, weight in enumerate(weights or ()):
@@ -348,7 +348,7 @@ class Together(Cutoff):
 
 
 class CutPotential(eqx.Module):
-    """A pair potential with its cutoff, or several terms that share a decision, for the force loop."""
+    """Pair potential with its cutoff, or a sum of such terms with a common pair decision."""
 
     potential: PairPotential  # bare potential, parameters per pair type
     cutoff: Cutoff = eqx.field(static=True)  # how it ends
@@ -362,7 +362,7 @@ class CutPotential(eqx.Module):
 
     @classmethod
     def of_terms(cls, terms: Mapping[str, CutPotential]) -> CutPotential:
-        """Make the sum of terms that have the same radii, by name."""
+        """Combine terms with equal cutoff radii, given by name, into one potential."""
         parts = list(terms.values())
         _, bare, ends, onsets, weights = zip(*(one.rows[0] for one in parts), strict=True)
         weights = weights if any(one.weights for one in parts) else ()
@@ -370,12 +370,12 @@ class CutPotential(eqx.Module):
 
     @property
     def parts(self) -> tuple[CutPotential, ...]:
-        """Channels of decisions: only this potential."""
+        """Channels of decisions; a single potential is its own channel."""
         return (self,)
 
     @property
     def rows(self) -> list[tuple[str, PairPotential, Cutoff, Any, Any]]:
-        """Name ("" for a single term), bare potential, cutoff, onset and weights or None of each term."""
+        """For each term: name ("" if single), bare potential, cutoff, onset, and weights or None."""
         # eqx.tree_at looks at a tree whose empty tuples are leaves
         weights = self.weights if isinstance(self.weights, tuple) else ()
         if not isinstance(self.potential, SumPotential) or not isinstance(self.cutoff, Together):
@@ -386,7 +386,7 @@ class CutPotential(eqx.Module):
 
     @property
     def terms(self) -> dict[str, CutPotential]:
-        """Terms by name, each with its weights; a single potential is one term without a name."""
+        """Terms of the potential by name, with their weights; a single potential is one term named ""."""
         return {
             name: CutPotential(part, end, self.r_cut, onset, () if weight is None else (weight,))
             for name, part, end, onset, weight in self.rows
@@ -399,16 +399,16 @@ class CutPotential(eqx.Module):
 
     @property
     def typed(self) -> CutPotential:
-        """The potential with each per-species parameter as two per-pair-type values."""
+        """The potential with each per-species parameter as two values per pair type, one for each atom."""
         return replace(self, potential=self.potential.typed)
 
     def at_cutoff(self) -> AtCutoff:
-        """Return the bare potential at r_cut, per pair type."""
+        """Return energy and slope of the bare potential at r_cut, per pair type."""
         energy, w = self.potential.evaluate(self.r_cut * self.r_cut)
         return AtCutoff(self.r_cut, self.r_onset, energy, jax.tree.map(lambda w: 2 * self.r_cut * w, w))
 
     def evaluate(self, r2, types, at: AtCutoff, *weights):
-        """Return energy and denergy/d(r²) of pairs inside the cutoff.
+        """Return energy and denergy/d(r²) of pairs inside the cutoff, by pair type.
 
         Args:
             r2: squared distances.
@@ -421,7 +421,7 @@ class CutPotential(eqx.Module):
         return self.cutoff.cut(r2, u, w, here, *weights)
 
     def jumps(self) -> Float[np.ndarray, "2 terms types"]:
-        """Return energy and radial force jump of an entering pair with weight 1, per term and pair type."""
+        """Return energy jump and radial force jump as a pair of weight 1 enters, per term and pair type."""
         # in numpy: to jax each operation on these few numbers is a program to compile
         made = self.cutoff.jumps(jax.tree.map(np.asarray, self).at_cutoff())
         return np.array(made).swapaxes(0, 1)
@@ -432,19 +432,19 @@ class CutPotential(eqx.Module):
 
 
 class Channels(eqx.Module):
-    """Sum of cut potentials with different radii, with one decision per pair for each radius.
+    """Sum of cut potentials with different radii, where a pair has one decision for each radius.
 
-    The kind of a decision is the pair type plus the number of pair types in all previous channels.
+    The kind of a decision is its pair type index plus the number of pair types in all previous channels.
     """
 
     parts: tuple[CutPotential, ...]
 
     @classmethod
     def of_terms(cls, terms: Mapping[str, CutPotential], *, apart: bool = False) -> CutPotential | Channels:
-        """Make the sum of terms by name; terms with equal radii share a channel, unless `apart`.
+        """Combine terms given by name; terms with equal radii share a channel, unless `apart` is true.
 
         Raises:
-            InputError: a name cannot be used in a key.
+            InputError: the name of a term cannot be used in a key of a system file.
         """
         for name in terms:
             if not name.replace("_", "").replace("-", "").isalnum():
@@ -458,22 +458,22 @@ class Channels(eqx.Module):
 
     @property
     def terms(self) -> dict[str, CutPotential]:
-        """Same as for a `CutPotential`."""
+        """Terms of all channels by name, with their weights."""
         return {name: term for part in self.parts for name, term in part.terms.items()}
 
     @property
     def potential(self) -> SumPotential:
-        """The bare potentials of all terms."""
+        """Sum of the bare potentials of all terms."""
         return SumPotential(tuple(self.terms), tuple(term.potential for term in self.terms.values()))
 
     @property
     def cutoff(self) -> Together:
-        """The cutoffs of all terms."""
+        """Cutoffs of all terms, as a single object."""
         return Together(tuple(term.cutoff for term in self.terms.values()))
 
     @property
     def weights(self) -> tuple[Any, ...]:
-        """Weights of the terms of all channels."""
+        """Weights of the terms, for all channels in order."""
         return tuple(weight for part in self.parts for weight in part.weights)
 
     @property
@@ -482,24 +482,24 @@ class Channels(eqx.Module):
         return jnp.concatenate([part.r_cut for part in self.parts])
 
     def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
-        """Same as for a `CutPotential`, by kind of decision."""
+        """Return energy jump and radial force jump as a pair enters, per term and kind of decision."""
         sides = zip(*(part.jumps() for part in self.parts), strict=True)
         return np.stack([np.asarray(block_diag(*one)) for one in sides])
 
     def astype(self, dtype) -> Channels:
-        """Same as for a `CutPotential`."""
+        """Return the sum with parameters as jax arrays of the given dtype."""
         return Channels(tuple(part.astype(dtype) for part in self.parts))
 
 
 def each_term(
     model: CutPotential | Channels, change: Callable[[CutPotential], CutPotential]
 ) -> CutPotential | Channels:
-    """Return a copy of the model with a function applied to every term; not for use inside jit."""
+    """Return a copy of the potential with a function applied to every term; not for use inside jit."""
     made = {name: change(term) for name, term in model.terms.items()}
     return made[""] if "" in made else Channels.of_terms(made)
 
 
 def pair_type(first, second, species: int):
-    """Return the index of an unordered pair of species, row by row in the upper triangle."""
+    """Return the index of an unordered pair of species, counted row by row in the upper triangle."""
     low, high = np.minimum(first, second), np.maximum(first, second)
     return low * species - low * (low - 1) // 2 + (high - low)

@@ -24,7 +24,7 @@ _UNIT = 2.0**24
 class StillingerWeber(ManyBody):
     """Two- and three-body potential for tetrahedral semiconductors.
 
-    All derivatives are continuous at the cutoff: a flip changes neither the energy nor the forces.
+    All derivatives are continuous at the cutoff, so that flips change neither the energy nor the forces.
 
     Source: Stillinger and Weber, Phys. Rev. B 31, 5262 (1985), eqs. 2.3 to 2.7; checked against a plain
     numpy evaluation of those equations (tests/support/oracles_manybody.py).
@@ -75,11 +75,11 @@ _LARGEST_EXPONENT = 69.0776
 
 
 class Tersoff(ManyBody):
-    """Bond-order potential for one element; the constants default to silicon, set Si(C), "T3".
+    """Bond-order potential for one element; the default constants are those of silicon, set Si(C), "T3".
 
-    Energy and force go to zero at r_cut = R + D, but the derivative of the force jumps there. If the crossing
-    atom is the only other neighbor of a bond, the bond order varies as (r_cut - r)^(2n); for n < 1 the force
-    is then continuous with an infinite derivative (in dilute silicon, not in the crystal).
+    Energy and force go to zero at r_cut = R + D, where the derivative of the force jumps. If no other atom
+    affects the order of a bond, the bond order varies as (r_cut - r)^(2n). For n < 1, the force is then
+    continuous with an infinite derivative (in dilute silicon, not in the crystal).
 
     Source: Tersoff, Phys. Rev. B 38, 9902 (1988), eqs. 1 to 3 and table I, in LAMMPS's notation; checked
     against ase.calculators.tersoff and a plain numpy evaluation (tests/support/oracles_manybody.py).
@@ -120,7 +120,7 @@ class Tersoff(ManyBody):
         return self.R + self.D
 
     def taper(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the taper: 1 up to R - D, 0 beyond R + D (exactly 0 there), squared quarter sine between."""
+        """Return the taper: 1 up to R - D, then a squared quarter sine, and exactly 0 beyond R + D."""
         # (1 - sin(pi x / 2)) / 2 with x = (r - R) / D, in the form that does not cancel where it vanishes
         inward = jnp.clip((self.r_cut - r) / (2 * self.D), 0.0, 1.0)
         return jnp.sin(0.5 * np.pi * inward) ** 2
@@ -175,10 +175,10 @@ _SETS: dict[str, tuple[Any, dict[str, dict[str, Any]]]] = {
 def named(
     kind: str, parameters: str = "Si", pbc: tuple[bool, bool, bool] = (True, True, True)
 ) -> StillingerWeber | Tersoff:
-    """Return the potential "stillinger-weber" or "tersoff" with a named set of constants.
+    """Return the potential "stillinger-weber" or "tersoff" with a set of constants given by name.
 
     Raises:
-        InputError: there is no such set.
+        InputError: there is no set of constants with this name.
     """
     made, sets = _SETS[kind]
     if parameters not in sets:

@@ -1,8 +1,8 @@
-"""Thermostats that multiply all velocities by one factor: Nosé-Hoover chains and stochastic rescaling.
+"""Thermostats that scale all velocities by one factor: Nosé-Hoover chains and stochastic rescaling.
 
-If the total momentum is zero, it stays zero; the number of degrees of freedom, which determines the
-temperature, is then smaller (`Integrator.freedom`). Extra states are always float64. Velocities are scaled in
-float64, too, because rounding a factor near one to float32 would cause the same relative error for all atoms.
+A total momentum of zero stays zero, which reduces the number of degrees of freedom and affects the
+temperature (`Integrator.freedom`). The extra states of thermostats are always float64. Velocities are scaled
+in float64, too: if a factor near one were rounded to float32, all atoms would have the same relative error.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ _WEIGHTS = (_FIRST, 1 - 2 * _FIRST, _FIRST)
 
 
 class Chain(NamedTuple):
-    """Nosé-Hoover chain: each thermostat controls the one before it."""
+    """Nosé-Hoover chain of thermostats, in which each thermostat controls the previous thermostat."""
 
     rate: Float[Array, "links"]  # p_ξ / Q, one over time
     way: Float[Array, "links"]  # ξ
 
     @classmethod
     def at_rest(cls, links: int) -> Chain:
-        """Return the state of the chain before the first step."""
+        """Return the initial state of a chain, at rest."""
         return cls(jnp.zeros(links), jnp.zeros(links))
 
     def act(
         self, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
     ) -> tuple[Number, Chain]:
-        """Return the factor for the velocities, and the chain, after the chain has acted for a time.
+        """Advance the chain by a time; return the scale factor of the velocities, and the chain.
 
         Each of three substeps updates the links from last to first, scales the velocities, and updates the
-        links in reverse order (Tuckerman et al., J. Phys. A 39, 5629, 2006, the operator L_NHC); error
+        links in reverse order (Tuckerman et al., J. Phys. A 39, 5629, 2006, the operator L_NHC). The error is
         O(time⁵).
 
         Args:
@@ -73,10 +73,11 @@ class Chain(NamedTuple):
 
 
 class NoseHooverChain(Integrator):
-    """Canonical ensemble by Nosé-Hoover chains: velocity Verlet between two half-steps of the chain.
+    """Canonical ensemble by a Nosé-Hoover chain: velocity Verlet between two half-steps of the chain.
 
-    Deterministic and time-reversible. Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635 (1992), integrated
-    as in Tuckerman et al., J. Phys. A 39, 5629 (2006). A stiff system at low temperature may not be ergodic.
+    Deterministic and time-reversible dynamics. Source: Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635
+    (1992), integrated as in Tuckerman et al., J. Phys. A 39, 5629 (2006). A stiff system at low temperature
+    may not be ergodic.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="nose-hoover",
@@ -115,10 +116,9 @@ class NoseHooverChain(Integrator):
 def rescaled(
     key: Array, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
 ) -> Number:
-    """Return the factor for the velocities after an exact stochastic step of their kinetic energy.
+    """Return the scale factor of the velocities, from an exact stochastic step of the kinetic energy.
 
-    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007), eqs. A7 and A8. If all velocities are zero,
-    they stay zero.
+    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007), eqs. A7 and A8. Zero velocities stay zero.
 
     Args:
         key: random key of this step. time: time during which the thermostat acts.
@@ -136,11 +136,11 @@ def rescaled(
 
 
 class CSVR(Integrator):
-    """Canonical ensemble by stochastic velocity rescaling: velocity Verlet, then a random scale factor.
+    """Stochastic velocity rescaling in the canonical ensemble: velocity Verlet, then a random scale factor.
 
     Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). The noise is a function of the random key
-    and the step, so that two runs can have the same noise and a resumed run continues it. The effective
-    energy (their eq. 15), the total energy minus the heat, is conserved.
+    and the step number, so that two runs can have the same noise and a resumed run continues the same noise.
+    The effective energy (eq. 15 of the paper), which is the total energy minus the heat, is conserved.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="csvr",
