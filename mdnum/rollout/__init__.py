@@ -1,4 +1,4 @@
-"""Rollouts: epochs of a Verlet list, the records that they make, and the run folder with the results."""
+"""Simulation runs: the time-stepping loop with Verlet lists, its records, and the run folder with results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of whether a time step and a cutoff are adequate for a configuration and a potential."""
+"""Estimates of whether time step and cutoff are adequate for a configuration and a potential."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ _NODES, _FEWER, _AGREE = 200, 100, 1e-3
 
 
 def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> float | None:
-    """Period of a configuration's fastest vibration, in the user's time; None if no motion is bound.
+    """Period of the fastest vibration of a configuration, in the user's time unit; None if none is bound.
 
     The largest eigenvalue of the mass-weighted Hessian is found by a Lanczos iteration with finite
-    differences of forces. To avoid jumps at pairs that cross the cutoff between two evaluations, forces are
-    shifted to vanish there, which leaves second derivatives unchanged except for a small transverse term.
+    differences of forces. Forces are shifted to zero at the cutoff, to avoid jumps when pairs cross the
+    cutoff between two evaluations. The shift does not change second derivatives except for a small transverse
+    term.
 
     Args:
         simulation: the system as objects.
-        positions: length.
+        positions: positions of the atoms, length.
 
     Error: the period is at most a few percent too long, because the Lanczos iteration has 12 steps.
     """
@@ -56,7 +57,7 @@ def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3
 
 
 def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mapping[str, float] | None:
-    """Contributions of pairs beyond the cutoff to energy and pressure of a bulk with g(r) = 1 there.
+    """Tail corrections: contributions of pairs beyond the cutoff to energy and pressure, with g(r) = 1.
 
     Args:
         simulation: the system as objects.
@@ -76,7 +77,7 @@ def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mappin
 
 
 def _beyond(simulation: Simulation, nodes: int, volume: float | None) -> tuple[float, float]:
-    """Integrate energy per atom and pressure by quadrature from the cutoff to infinity."""
+    """Integrate the tail corrections of energy per atom and pressure from the cutoff to infinity."""
     density = simulation.atoms / (volume or simulation.cell.volume)
     share = np.bincount(simulation.species) / simulation.atoms
     node, weight = np.polynomial.legendre.leggauss(nodes)

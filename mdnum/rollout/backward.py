@@ -1,8 +1,8 @@
-"""Reversal of a fixed-point rollout, from its end to its start, with separate neighbor lists.
+"""Exact time reversal of a run with a fixed-point (integer) state, from the last step to the first.
 
-Every step is undone by subtracting the integers that it added, so the states visited are those of the forward
-run, bit for bit. Neighbor lists are rebuilt independently on the way back, because sums of integers do not
-depend on them.
+Every step is reversed by subtracting the integers that were added in this step, so all states of the forward
+run are recovered bit for bit. The reversed run builds its own neighbor lists, because sums of integers do not
+depend on the order of pairs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mdnum.systems.simulation import Simulation
 
 
 class Back(NamedTuple):
-    """State of a rollout that is being reversed, in the user's order of atoms."""
+    """State of a run during time reversal, in the user's order of atoms."""
 
     step: Int[Array, ""]  # the step whose forces come next; -1 when all are done
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
@@ -39,7 +39,7 @@ class Back(NamedTuple):
 
 
 class Stretched(NamedTuple):
-    """Rows recorded during the reversal, earlier steps first, atoms in the order of the neighbor list."""
+    """Steps recorded during time reversal, earliest first, with atoms in the order of the neighbor list."""
 
     first: int  # step of the first row
     rows: int  # how many there are; the record's other rows are void
@@ -52,14 +52,14 @@ class Stretched(NamedTuple):
 
 @partial(jax.jit, static_argnames=("structure",))
 def _undrifted(leaves, structure, state: EpochState) -> Back:
-    """Return the state of a rollout before its last drift."""
+    """Return the state of a run before its last drift (the last update of positions)."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = jnp.arange(state.x.shape[1])
     return _before(program, program.masses, order, Back(state.step, *state[1:4], state.extra))
 
 
 def _before(program: EpochProgram, masses, order, back: Back) -> Back:
-    """Undo the drift that led to a state; return positions, velocities and extra state of the step before."""
+    """Reverse a drift (an update of positions); return the state of the previous step."""
     step = back.step - 1
     x, v, extra = program.integrator.undrift(  # type: ignore[attr-defined]
         back.x, back.v, back.extra, masses, step, order
@@ -71,7 +71,7 @@ def _before(program: EpochProgram, masses, order, back: Back) -> Back:
 
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
 def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord):
-    """Undo steps until the skin is used up, the record is full or the bath is due to be replaced."""
+    """Reverse steps until the skin is used up, the record is full or the stored bath must be restored."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
 
@@ -121,12 +121,13 @@ def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord
 
 
 class BackwardRun:
-    """Reversal of a fixed-point rollout.
+    """Exact time reversal of a run with a fixed-point state.
 
     Args:
         simulation: the system as objects, with a fixed-point state.
-        end: the state after the last step of the rollout.
-        baths: for each step at which the forward run emptied its bath, the bits stored before that step.
+        end: the state after the last step of the run.
+        baths: bits of the thermostat's bath, by step, before each step at which the forward run emptied the
+            bath.
 
     Raises:
         InputError: the state is not a fixed-point state.
@@ -152,10 +153,10 @@ class BackwardRun:
         self.back: Back = _undrifted(self._leaves, self._structure, end)
 
     def stretches(self) -> Iterator[Stretched]:
-        """Yield the steps in stretches, the last stretch first; `back` is the current state of the reversal.
+        """Yield groups of consecutive steps, the last group first; `back` is the current reversed state.
 
         Raises:
-            NumericalError: the thermostat's bath differs from that of the forward run.
+            NumericalError: the thermostat's bath differs from the bath of the forward run.
         """
         simulation = self.simulation
         while int(self.back.step) >= 0:
@@ -177,7 +178,7 @@ class BackwardRun:
         self._check_bath()
 
     def _change_bath(self) -> None:
-        """Restore the stored bath if the forward run emptied its bath before this step."""
+        """Restore the thermostat's stored bath if the forward run emptied the bath before this step."""
         step, period = int(self.back.step), self.simulation.propagator.pause
         if period is None or step % int(period):
             return
@@ -187,7 +188,7 @@ class BackwardRun:
         self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
-        """Raise `NumericalError` unless the bath is zero, as it was when the forward run emptied it."""
+        """Raise `NumericalError` if the thermostat's bath is not zero where the forward run emptied it."""
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(

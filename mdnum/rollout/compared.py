@@ -1,4 +1,4 @@
-"""Comparison of two runs whose atoms and axes differ by relabeling, a symmetry of the box and a shift."""
+"""Comparison of two runs, whose atoms and axes may differ by a permutation, a symmetry and a shift."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mdnum.md.neighbors import PairTable
 
 @dataclass(frozen=True)
 class ReferenceFrame:
-    """Mapping of one run's atom labels and axes to those of another run."""
+    """Mapping of the atom labels and axes of one run to those of another run."""
 
     labels: Int[np.ndarray, "atoms"]  # atom b of this run is atom labels[b] of the other, shape (atoms,)
     axes: Int[np.ndarray, "3"]  # axis a of the other run is axis axes[a] of this one, shape (3,)
@@ -27,12 +27,12 @@ class ReferenceFrame:
 
     @classmethod
     def same(cls, atoms: int) -> ReferenceFrame:
-        """Return the identity mapping."""
+        """Return the mapping of a run to itself."""
         return cls(np.arange(atoms), np.arange(3), np.ones(3), np.zeros(3))
 
     @property
     def is_same(self) -> bool:
-        """True if the mapping is the identity."""
+        """True if labels, axes and positions are the same in both runs."""
         return (
             bool((self.labels == np.arange(len(self.labels))).all())
             and bool((self.axes == np.arange(3)).all())
@@ -42,7 +42,7 @@ class ReferenceFrame:
 
     @property
     def inverse(self) -> ReferenceFrame:
-        """Mapping from the other run's labels and axes to those of this run."""
+        """Inverse mapping: from the labels and axes of the other run to those of this run."""
         shift = -self.signs * self.shift[self.axes]
         axes = np.argsort(self.axes)
         return ReferenceFrame(np.argsort(self.labels), axes, self.signs[axes], shift)
@@ -50,10 +50,10 @@ class ReferenceFrame:
     def positions(
         self, x: Float[np.ndarray, "rows 3 atoms"], by: Float[np.ndarray, "rows 3 3"] | None = None
     ) -> Float[np.ndarray, "rows 3 atoms"]:
-        """Convert positions of this run to the other run's labels and axes, up to lattice vectors.
+        """Convert positions to the labels and axes of the other run; they are not wrapped into the box.
 
         Args:
-            by: deformation of the box since the start, for each row; None if the box is fixed.
+            by: deformation of the box since the start for each row; None if the box is fixed.
         """
         if self.is_same:
             return x
@@ -78,7 +78,7 @@ class ReferenceFrame:
         return tuple(Cell.create(matrix, first.pbc) for matrix in matrices)
 
     def vectors(self, v: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows 3 atoms"]:
-        """Convert velocities of this run to the other run's labels and axes."""
+        """Convert velocities to the atom labels and axes of the other run."""
         if self.is_same:
             return v
         out = np.empty_like(v)
@@ -86,11 +86,11 @@ class ReferenceFrame:
         return out
 
     def keys(self, own: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """Convert keys of pairs of this run to the other run's labels, sorted."""
+        """Convert keys of pairs to the atom labels of the other run, and sort the keys."""
         return np.sort(self.keys_of(*np.divmod(own, len(self.labels))))
 
     def keys_of(self, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """Return keys, in the other run's labels, of pairs given by their atoms, in the same order."""
+        """Return the keys of pairs of atoms i, j with the labels of the other run, in the given order."""
         atoms = len(self.labels)
         channel, i = np.divmod(i, atoms)
         a, b = self.labels[i], self.labels[j]
@@ -102,7 +102,7 @@ class ReferenceFrame:
 
 @dataclass(frozen=True)
 class CrossFlip:
-    """A pair whose decisions in two runs begin or cease to differ at this step."""
+    """A pair of atoms whose cutoff decisions in two runs begin or cease to differ at a step."""
 
     step: int  # of the flip
     # i, j: the pair, labels of the first run, i < j
@@ -118,7 +118,7 @@ class CrossFlip:
 
 @dataclass(frozen=True)
 class PairFlips(Columns):
-    """Flips of one run as columns, in the labels of the first run."""
+    """Flips (changes of cutoff decisions) of one run as columns, with the atom labels of the first run."""
 
     step: Int[np.ndarray, "flips"]  # of the flip
     key: Int[np.ndarray, "flips"]  # i * atoms + j of the pair, i < j
@@ -130,7 +130,7 @@ class PairFlips(Columns):
 
 @dataclass(frozen=True)
 class CrossFlips(Sequence[CrossFlip]):
-    """Cross-run flips in order; objects are created only on access because there may be millions of flips."""
+    """Sequence of cross-run flips by step, stored as arrays because there may be millions of flips."""
 
     flips: PairFlips  # of either run
     from_b: Bool[np.ndarray, "flips"]  # which of them are the second run's
@@ -165,10 +165,10 @@ class CrossFlips(Sequence[CrossFlip]):
 
 
 class CrossRecorder:
-    """Record of the pairs on which the decisions of two runs currently differ.
+    """Record of the pairs of atoms whose cutoff decisions currently differ between two runs.
 
     Args:
-        a, b: keys of the pairs inside at the first step, in the labels of the first run.
+        a, b: keys of the pairs inside the cutoff at the first step, with labels of the first run.
         atoms: number of atoms.
     """
 
@@ -177,7 +177,7 @@ class CrossRecorder:
         self.differing: Int[np.ndarray, "pairs"] = np.setxor1d(a, b, assume_unique=True)
 
     def opening(self) -> list[CrossFlip]:
-        """Return the pairs on which the runs differ from the start, as flips at step 0."""
+        """Return the pairs whose decisions differ between the runs at the start, as flips at step 0."""
         i, j = np.divmod(self.differing, self.atoms)
         pairs = zip(i.tolist(), j.tolist(), strict=True)
         return [CrossFlip(0, i, j, True, "B", False, np.nan, np.nan) for i, j in pairs]
@@ -185,7 +185,7 @@ class CrossRecorder:
     def take(
         self, first: int, rows: int, a: PairFlips, b: PairFlips
     ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
-        """Count the pairs that differ at each of the next steps; return also the flips that change the count.
+        """Return how many pairs differ at each of the next steps, and the flips that change this number.
 
         Args:
             first: step of the first row.
@@ -211,7 +211,7 @@ class CrossRecorder:
 
 
 def _times_before(keys: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """For each key, count its earlier occurrences in the array."""
+    """For each element of an array of keys, count the earlier elements with the same key."""
     order, times = np.argsort(keys, kind="stable"), np.empty(len(keys), np.int64)
     times[order] = np.arange(len(keys)) - np.searchsorted(keys[order], keys[order])
     return times
@@ -231,7 +231,7 @@ def _place(values, order, out):
 def in_user_order(
     values: Float[np.ndarray, "rows 3 atoms"], order: Int[np.ndarray, "atoms"]
 ) -> Float[np.ndarray, "rows 3 atoms"]:
-    """Return columns of a record in the user's order of atoms, in float64.
+    """Return an array with one entry per atom in the user's order of atoms, in float64.
 
     Args:
         order: atom k of the record is atom order[k].
@@ -296,13 +296,12 @@ def separations(
     b: Float[np.ndarray, "rows 3 atoms"],
     others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
-    """Largest distance between the same atoms of two runs for each row; NaN if a position is not a number.
+    """Return the largest distance between the same atoms in two runs for each row; NaN if a position is NaN.
 
     Args:
-        cells: the box, or one box for each row; distances are to the nearest image.
-        others: boxes of the second run, for each row, if they differ: its positions are transformed to the
-            first run's box, so that a difference between boxes does not count as a displacement of distant
-            atoms.
+        cells: the box, or one box for each row; distances are minimum-image distances.
+        others: boxes of the second run for each row, if they differ. Positions of the second run are then
+            transformed to the box of the first run, so that a difference between boxes is not a displacement.
     """
     out = np.empty(len(a))
     if others:
@@ -313,7 +312,7 @@ def separations(
 
 
 def strains(cells: Sequence[Cell], others: Sequence[Cell]) -> Float[np.ndarray, "rows"]:
-    """Largest relative change of a length between two boxes, for each row."""
+    """Return the largest relative change of any length between two boxes (the strain), for each row."""
     by = np.array([cell.deformation(other) for cell, other in zip(cells, others, strict=True)])
     out, known = np.full(len(by), np.nan), np.flatnonzero(np.isfinite(by).all(axis=(1, 2)))
     # a rotation is no strain
@@ -330,12 +329,12 @@ def overridden(
     species: Int[np.ndarray, "atoms"],
     r_cut: Float[np.ndarray, "channels species species"],
 ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
-    """Count the pairs whose decisions differ between two records; find their largest distance to the cutoff.
+    """Count the pairs with different decisions in two records, and find their largest distance to the cutoff.
 
     Args:
         cells: as for `separations`.
-        own, imposed: packed decisions on the same neighbor list, `table`.
-        x: positions in the list's order of atoms.
+        own, imposed: packed decisions for the neighbor list `table`.
+        x: positions, with atoms in the order of the neighbor list.
         species: species of each atom, in the user's order.
         r_cut: cutoff of each channel for each pair of species, length.
     """
@@ -348,5 +347,5 @@ def overridden(
 def differ(
     a: Float[np.ndarray, "rows 3 atoms"], b: Float[np.ndarray, "rows 3 atoms"]
 ) -> Bool[np.ndarray, "rows"]:
-    """For each row, True if any number differs between the two runs or is not a number."""
+    """Return, for each row, True if any number differs between two runs or is NaN."""
     return (a != b).any(axis=(1, 2))

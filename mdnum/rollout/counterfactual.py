@@ -1,4 +1,4 @@
-"""Counterfactual runs, which use their own arithmetic but another run's decisions."""
+"""Counterfactual runs: runs with their own arithmetic, but with the cutoff decisions of another run."""
 
 from __future__ import annotations
 
@@ -22,24 +22,25 @@ from mdnum.systems.simulation import Simulation
 
 
 class Counterfactual:
-    """A run with its own arithmetic and the decisions of another run, the leader, imposed step by step.
+    """A run with its own arithmetic, on which the cutoff decisions of another run (the leader) are imposed.
 
-    The run's own decisions are also computed, and those that differ are counted. The object is called with
-    each segment of the leader, and keeps the resulting rows until `until` returns them.
+    Decisions that the run would have made by itself are also computed, and differences are counted. The
+    object is called with each segment of the leader, and keeps the resulting rows until `until` returns the
+    rows.
 
     Args:
         simulation: the run whose arithmetic is used.
         leader: the run whose decisions are imposed.
         start: initial state; by default the simulation's own start.
         frame: mapping of this run's atoms and axes to those of the leader.
-        guard: length; the run ends when an imposed decision is further than this from its cutoff, because
-            rounding could no longer have changed that decision.
+        guard: largest distance, length, of a pair with an imposed different decision from its cutoff. The run
+            ends at larger distances, because rounding could not have changed such a decision.
 
     Attributes:
         failed: one of `FAILURES` if the run failed, else empty.
 
     Raises:
-        InputError: a potential is many-body, so its decisions are made inside the energy function.
+        InputError: a potential is many-body, so decisions cannot be imposed on its energy function.
     """
 
     def __init__(
@@ -70,7 +71,7 @@ class Counterfactual:
         self._record: EpochRecord | None = None
 
     def __call__(self, segment: Segment) -> None:
-        """Run one segment of the leader's steps under the leader's decisions, and keep the rows."""
+        """Simulate one segment of the leader's steps with the leader's decisions, and keep the rows."""
         if self._over:
             return
         rows = self.follow(segment)
@@ -82,11 +83,11 @@ class Counterfactual:
             self._ahead.append(rows)
 
     def until(self, last: int) -> Rows | None:
-        """Return the rows up to a step that have not been returned before; None if there are none."""
+        """Return the rows up to a step that were not returned before; None if there are no such rows."""
         return taken(self._ahead, last)
 
     def follow(self, segment: Segment) -> Rows:
-        """Run one segment of the leader's steps under the leader's decisions, and return the rows."""
+        """Simulate one segment of the leader's steps with the leader's decisions; return the rows."""
         parts: list[Rows] = []
         row = 0
         while row < segment.rows and not self.failed:
@@ -145,7 +146,7 @@ class Counterfactual:
         return tuple(leaves), structure
 
     def _list(self, segment: Segment):
-        """Return this run's own list, and for each of its slots the position of the leader's decision."""
+        """Return this run's neighbor list, and the slot of the leader's list for each of its slots."""
         simulation = self.simulation
         if self._own is None:
             home, cell = self.state.x, jax.tree.map(np.asarray, self.state.cells[0])
@@ -160,7 +161,7 @@ class Counterfactual:
 
 
 def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species species"]:
-    """Return the cutoff of each channel and pair of species, length."""
+    """Return the cutoff radius for each channel (group of terms) and pair of species, length."""
     radii = np.array(simulation.decider.r_cut).reshape(simulation.channels, -1)
     count = len(simulation.symbols)
     if radii.shape[1] == 1:
@@ -172,7 +173,7 @@ def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species s
 def _places(
     table: PairTable, led: PairTable, labels: Int[np.ndarray, "atoms"]
 ) -> Int[np.ndarray, "slots atoms"]:
-    """Return, for each slot of a list, where another list has the same directed pair (its size if absent)."""
+    """For each slot of a list, return the slot of the same pair in another list (its size if absent)."""
     atoms = len(labels)
     slot, column = np.nonzero(led.index < atoms)
     keys = led.order[column].astype(np.int64) * atoms + led.order[led.index[slot, column]]
@@ -190,7 +191,7 @@ def _places(
 def _mapped(
     bits: UInt8[Array, "rows words atoms"], place: Int[Array, "slots atoms"], channels: int = 1
 ) -> UInt8[Array, "rows own atoms"]:
-    """Rearrange the decisions of one list into the slots of another list."""
+    """Rearrange the packed decisions of one neighbor list into the slots of another list."""
     rows, _, atoms = bits.shape
     shift = jnp.arange(8, dtype=jnp.uint8)[None, None, :, None]
     each = ((bits[:, :, None, :] >> shift) & jnp.uint8(1)).reshape(rows * channels, -1)

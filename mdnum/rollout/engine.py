@@ -1,8 +1,8 @@
-"""Host side of a rollout, epoch after epoch.
+"""Control of a simulation run by the host: neighbor lists, calls of the compiled loop, and records.
 
-The engine builds neighbor lists, starts jitted epochs and yields their records. While the device computes an
-epoch, the caller works on the previous record: a segment is therefore yielded only after the next epoch has
-been started.
+The engine builds neighbor lists, starts the compiled loop over steps with one list, and yields its records. A
+record is yielded only after the next loop has been started, so that the caller works on this record while the
+device computes the next one.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ FAILURES = ("blow-up", "runaway", NARROW)
 
 @dataclass(frozen=True)
 class Segment:
-    """Record of consecutive steps with one neighbor list, on the host."""
+    """Record of consecutive time steps with one neighbor list."""
 
     first: int  # step of the first row
     rows: int  # number of rows
@@ -81,30 +81,30 @@ class Segment:
 
     @property
     def last(self) -> int:
-        """Step of the last row."""
+        """Time step of the last row."""
         return self.first + self.rows - 1
 
     def rows_of(self, name: str) -> np.ndarray:
-        """Return the filled rows of a column; steps are recomputed if the record lacks this column."""
+        """Return the rows of a recorded quantity; steps are recomputed if this quantity was not recorded."""
         lacks = self.changes is not None and name in ("x", "v", "images", "bits")
         return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """The box of each row, on the host; empty if the box is fixed."""
+        """The simulation box of each row; empty if the box is fixed."""
         return self.record.boxes(self.rows, self.cell.pbc)
 
     def cell_of(self, row: int) -> Cell:
-        """Return the box at a row, on the host."""
+        """Return the simulation box at the step of a row."""
         return self.cells[row] if self.cells else self.cell
 
     @property
     def last_positions(self) -> Float[Array | np.ndarray, "3 atoms"]:
-        """Return wrapped positions at the last row, in the user's order of atoms."""
+        """Return wrapped positions at the last step of the segment, in the user's order of atoms."""
         return self.unsorted("x", self.rows - 1).T if self.closes == "blow-up" else self.state.x_before
 
     def unsorted(self, name: str, row: int) -> np.ndarray:
-        """Return a row of a per-atom column in the user's order of atoms, shape (atoms, 3)."""
+        """Return a recorded quantity at one row in the user's order of atoms, shape (atoms, 3)."""
         if name == "x" and row == 0:
             return np.asarray(self.start.x).T
         if name == "x" and row == self.rows - 1 and self.closes != "blow-up":
@@ -117,7 +117,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Start:
-    """Initial state of an engine: the start of a rollout, or a checkpoint."""
+    """Initial state of an engine: step 0 of a run, or the state of a checkpoint."""
 
     state: EpochState  # the state to go on from
     home: Float[Array, "3 atoms"]  # wrapped positions at which the list in use was built, shape (3, atoms)
@@ -127,16 +127,16 @@ class Start:
 
     @property
     def reference(self) -> Float[np.ndarray, "atoms 3"]:
-        """Return `home` on the host, one atom per row, in float64."""
+        """Return the positions at which the neighbor list was built, shape (atoms, 3), in float64."""
         return np.asarray(self.home, np.float64).T
 
     def check_box(self, simulation: Simulation, which: int = -1) -> None:
-        """Raise `InputError` if a box (default: of the list's build) is too narrow for a neighbor list."""
+        """Raise `InputError` if the box, by default at the list's build, is too narrow for a list."""
         cell = jax.tree.map(np.asarray, self.state.cells[which])
         check_radius(cell, simulation.r_cut, simulation.rule.skin)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return plain arrays for a checkpoint."""
+        """Return the initial state as arrays, for storage in a checkpoint."""
         parts = self.state._asdict()
         parts |= {f"extra_{k}": leaf for k, leaf in enumerate(jax.tree.leaves(parts.pop("extra")))}
         # boxes with their inverses, as the loop had them: no others have their bits
@@ -147,7 +147,7 @@ class Start:
 
     @classmethod
     def from_arrays(cls, arrays, simulation: Simulation) -> Start:
-        """Restore a start from the arrays of `to_arrays`, bit for bit; the box defaults to the system's."""
+        """Restore an initial state, bit for bit, from the arrays that `to_arrays` returned."""
         places: Any = (jnp.asarray(arrays[f"state_{name}"]) for name in EpochState._fields[:-2])
         first = first_state(simulation).state
         leaves, structure = jax.tree.flatten(first.extra)
@@ -165,7 +165,7 @@ class Start:
 
 
 def first_state(simulation: Simulation) -> Start:
-    """Return the start of a rollout, with positions wrapped and the system's velocities."""
+    """Return the initial state of a run, with wrapped positions and the velocities of the system."""
     dtype = simulation.policy.dtype("state")
     positions, velocities = simulation.first_frame()
     wrapped, images = wrap_positions(simulation.cell, positions)
@@ -183,24 +183,24 @@ def first_state(simulation: Simulation) -> Start:
 
 
 def room_for(rows: int, per_row: int) -> int:
-    """Number of rows to allocate for at least `rows`: a power of two, larger where memory permits."""
+    """Return how many rows to allocate for at least `rows` steps: a power of two that fits into memory."""
     few = max(2, min(_MOST_ROWS, _SMALL_BYTES // per_row))
     return 1 << max(few.bit_length() - 1, rows.bit_length())
 
 
 class Engine:
-    """Runs a simulation from a start to a last step.
+    """Engine that simulates a system from an initial state to a last step.
 
     Args:
         simulation: the system as objects.
         last: last step to evaluate.
         start: initial state; by default the system's own start.
-        record: whether to record decisions and positions. Energies are always recorded, and the choice does
-            not change a bit of the trajectory.
+        record: whether to record decisions and positions. Energies are always recorded; the trajectory has
+            the same bits in both cases.
         rows: whether to keep decisions and positions of every step. If False, only changes of decisions are
             recorded, which in double precision takes a tenth of the memory, and `Segment.rows_of` recomputes
             a segment's steps on request.
-        pins: decisions that replace the run's own. The record still contains the run's own decisions.
+        pins: decisions that replace the run's own decisions. The record still contains the run's own.
         inputs: whether to record also the inputs of each step that are needed for its derivatives.
     """
 
@@ -248,7 +248,7 @@ class Engine:
         self.leaves = tuple(leaves)
 
     def _room(self, words: int) -> int:
-        """Number of rows of a record: a power of two within the memory limit."""
+        """Return the number of rows of a record: a power of two within the memory limit."""
         kept = self.record and self.rows
         per_row = self.simulation.atoms * (2 * 24 + 12 + words) if kept else 64
         per_row += sum(leaf.size * 8 for leaf in jax.tree.leaves(self._inputs))
@@ -257,7 +257,7 @@ class Engine:
         return min(1 << (rows.bit_length() - 1), room_for(int(self.last + 1), per_row))
 
     def take(self, turn: int, words: int) -> EpochRecord:
-        """Return the record buffer for this turn; the buffer is donated to the epoch that fills it."""
+        """Return the record buffer for this turn; the buffer is donated to the loop that fills it."""
         rows, held, most = self._room(words), self._records[turn], self.program.most
         self._records[turn] = None
         # as many as a list's life brings, or a large system sorts its atoms several times for one list
@@ -270,11 +270,11 @@ class Engine:
         return empty_record(rows, words, self.simulation.atoms, dtype, self.record, *rest)
 
     def give(self, turn: int, record: EpochRecord) -> None:
-        """Return a record that is no longer in use to the engine."""
+        """Give a record that is no longer used back to the engine as a buffer."""
         self._records[turn] = record
 
     def segments(self) -> Iterator[Segment]:
-        """Yield segments of steps in order; the last has `closes` equal to "end" or to one of FAILURES."""
+        """Yield segments in the order of steps; the last segment has `closes` "end" or one of FAILURES."""
         here, turn, held = self.start, 0, None
         listed = self._listed(here)
         waiting: Segment | None = None
@@ -295,10 +295,10 @@ class Engine:
                 listed = self._listed(here)
 
     def again(self, start: Start) -> Segment:
-        """Recompute the segment that begins at a start, with the same bits.
+        """Recompute the segment that begins at a given initial state; all bits are the same.
 
         Args:
-            start: where a segment of this engine began (`resume_point` of the segment before).
+            start: state at which a segment of this engine began (`resume_point` of the previous segment).
         """
         self.verlet.slots = start.slots
         listed = self._listed(start)
@@ -307,7 +307,7 @@ class Engine:
         return made
 
     def _listed(self, start: Start) -> tuple[PairTable, Tables]:
-        """Build the neighbor list of a start; return the list and the tables that the loop reads."""
+        """Build the neighbor list for a state; return the list and its tables for the compiled loop."""
         cell = self._cell
         if self._moves:
             cell = jax.tree.map(np.asarray, start.state.cells[-1])
@@ -316,10 +316,10 @@ class Engine:
         return table, self.simulation.tables(table)
 
     def _advance(self, listed: tuple[PairTable, Tables], start: Start, held, turn: int):
-        """Start the compiled loop on the device.
+        """Start the compiled loop over time steps on the device.
 
         Args:
-            held: decisions of the list at the step before; None if they must be computed.
+            held: decisions for this list at the previous step; None if the decisions must be computed.
         """
         table, tables = listed
         words = self.simulation.channels * table.slots // 8
@@ -339,7 +339,7 @@ class Engine:
     def _segment(
         self, listed, start: Start, held, turn: int, begun: tuple[EpochOutcome, EpochRecord]
     ) -> tuple[Segment, np.ndarray | jax.Array | None]:
-        """Wait for the loop; return its segment and the decisions at its last row."""
+        """Wait for the compiled loop; return its segment and the decisions at the last step."""
         outcome, record = begun
         rows, rebuild, finite, _ = np.asarray(outcome.flags).tolist()
         while (changes := record.changes) is not None and finite and changes.found > len(changes.pairs):
@@ -365,7 +365,7 @@ class Engine:
         return segment, last
 
     def _with_rows(self, start: Start, last: int) -> EpochRecord:
-        """Recompute the steps from a start to a last step of the same list, recorded row by row."""
+        """Recompute the steps from a state to a last step with the same list, and record every step."""
         engine = Engine(self.simulation, last, start=start, pins=self.pins)
         parts: list[list[Any]] = [
             [np.array(segment.rows_of(name)) for name in EpochRecord._fields[:-2]]
@@ -375,13 +375,13 @@ class Engine:
         return EpochRecord(*whole)
 
     def _pinned(self, table: PairTable, first: int, words: int) -> tuple[UInt8[np.ndarray, "..."], ...]:
-        """Return the decisions imposed on the rows of the next epoch, and where; empty without pins."""
+        """Return imposed decisions for the next steps, and the mask of their slots; empty without pins."""
         if self.pins is None:
             return ()
         return self.pins.rows(table, first, self._room(words), self.simulation.channels)
 
     def failure(self, outcome: EpochOutcome) -> str:
-        """Return one of FAILURES if the steps ended in a failure, else an empty string."""
+        """Return one of FAILURES if the time steps ended in a failure, else an empty string."""
         _, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
         if not finite:
             return "blow-up"
@@ -403,7 +403,7 @@ class Engine:
 
 
 def resume_point(segment: Segment) -> Start:
-    """Return the start from which a rollout continues after a segment, with a new list if it is due."""
+    """Return the state from which a run continues after a segment, with a new neighbor list if necessary."""
     state, slots = segment.state, segment.table.slots
     if segment.due:
         return Start(state, state.x, segment.last + 1, segment.epoch + 1, slots)

@@ -1,4 +1,4 @@
-"""Epochs: the compiled loop over steps with one neighbor list, its state, records and imposed decisions."""
+"""The compiled loop over time steps with one neighbor list (an epoch): state, records, imposed decisions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mdnum.md.pairforce import Forces
 
 @dataclass(frozen=True)
 class Pin:
-    """Imposed decisions of one pair."""
+    """Cutoff decisions that are imposed on one pair of atoms."""
 
     # i, j: the pair, i < j; to i the number of atoms is added for each channel before that of the decision
     i: int
@@ -35,23 +35,23 @@ class Pin:
     inside: bool = False  # what it is told before the first of them
 
     def at(self, steps: Int[np.ndarray, "steps"]) -> Bool[np.ndarray, "steps"]:
-        """Return the imposed decision at each of the given steps, True for inside."""
+        """Return the imposed decision at each of the given steps: True if the pair is inside the cutoff."""
         turned = np.searchsorted(np.asarray(self.changes, np.int64), steps, side="right")
         return (turned % 2 == 1) ^ self.inside
 
 
 @dataclass(frozen=True)
 class Pins:
-    """Imposed decisions of selected pairs; all other decisions are the run's own."""
+    """Cutoff decisions that are imposed on selected pairs; the run makes all other decisions."""
 
     pins: Sequence[Pin]
 
     def rows(
         self, table: PairTable, first: int, count: int, channels: int = 1
     ) -> tuple[UInt8[np.ndarray, "rows words atoms"], UInt8[np.ndarray, "rows words atoms"]]:
-        """Return packed decisions and a mask of where they are imposed, for consecutive steps of one list.
+        """Return packed decisions, and a mask of the imposed ones, for consecutive steps of one list.
 
-        A pair that is not in the list is too distant to be inside; no decision can be imposed on it.
+        No decision can be imposed on a pair that is not in the list, because such a pair is too distant.
 
         Args:
             table: the neighbor list.
@@ -83,7 +83,7 @@ class Pins:
 
 
 class EpochProgram(eqx.Module):
-    """The constant data of a rollout, which do not change between epochs."""
+    """Constant data of a run: force function, integrator, masses and limits."""
 
     force: eqx.Module  # PairForce or ManyBodyForce: forces and decisions over a list, in the box of a row
     integrator: Integrator  # between force evaluations
@@ -103,7 +103,7 @@ class EpochProgram(eqx.Module):
 
 
 class EpochState(NamedTuple):
-    """State of a rollout between two force evaluations, in the user's order of atoms."""
+    """State of a run between two force evaluations, in the user's order of atoms."""
 
     step: Int[Array, ""]  # the step whose forces come next
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
@@ -118,7 +118,7 @@ class EpochState(NamedTuple):
 
 
 class StepInputs(NamedTuple):
-    """Inputs of a step for its derivatives, except positions, box and virial; atoms in the list's order."""
+    """Inputs of a time step that its derivatives need in addition to positions, box and virial."""
 
     v: Float[Array, "3 atoms"]  # velocities that lead there, as the step before left them
     extra: Any  # the extra state then
@@ -127,7 +127,7 @@ class StepInputs(NamedTuple):
 
 
 class EpochRecord(NamedTuple):
-    """Record of an epoch with one row per step, atoms in the order of its tables."""
+    """Record with one row per time step, with atoms in the order of the neighbor list."""
 
     # x, v: positions and full-step velocities, shape (rows, 3, atoms), or (rows, 3, 0) without rows
     x: Float[Array, "rows 3 atoms"]
@@ -149,7 +149,7 @@ class EpochRecord(NamedTuple):
     inputs: Any = ()  # `StepInputs` of each row, where they were asked for
 
     def boxes(self, rows: int, pbc: tuple[bool, bool, bool]) -> tuple[Cell, ...]:
-        """Return the boxes of the first rows, on the host; empty if all rows share one box."""
+        """Return the boxes of the first rows; empty if the box is the same for all rows."""
         if not self.cell.size:
             return ()
         return tuple(Cell.create(one, pbc) for one in np.asarray(self.cell)[:rows])
@@ -159,7 +159,7 @@ _NUMBERS = ("potential", "kinetic", "virial", "heat", "work", "nearest", "moved"
 
 
 class EpochOutcome(NamedTuple):
-    """State, flags and decisions at the end of an epoch's loop."""
+    """State, flags and decisions at the end of the compiled loop."""
 
     state: EpochState  # where to go on
     # four numbers that travel together: how many rows were recorded; whether the list must be rebuilt before
@@ -188,10 +188,10 @@ def empty_record(
     cells: bool = False,
     inputs: Any = (),
 ) -> EpochRecord:
-    """Allocate the rows of an epoch; if `record` is False, allocate only per-step numbers.
+    """Allocate the record of an epoch; if `record` is False, allocate only one number per step.
 
     Args:
-        changes: allocate this number of changes of decisions instead of rows of decisions and positions.
+        changes: number of changes of decisions to allocate in place of rows of decisions and positions.
         cells: whether each row has its own box.
         inputs: `StepInputs` of any step, if they are to be recorded.
     """
@@ -210,7 +210,7 @@ def empty_record(
 
 
 def write_row(record: EpochRecord, row, **values) -> EpochRecord:
-    """Write one row of the named columns."""
+    """Write one row of the named arrays of a record."""
 
     def put(column, value):
         return lax.dynamic_update_index_in_dim(column, jnp.asarray(value, column.dtype), row, 0)
@@ -222,10 +222,10 @@ def write_row(record: EpochRecord, row, **values) -> EpochRecord:
 def over_rows(
     step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, used: Any, *, backward: bool = False
 ) -> tuple[Any, Any]:
-    """Scan like `jax.lax.scan`, but only over the first `used` rows; `backward` starts with the last row.
+    """Like `jax.lax.scan`, but only over the first `used` rows, from the last row on if `backward`.
 
-    Buffers have the size of the longest segment so that one program serves all segments; a loop over the
-    whole buffer would spend most of its time on empty rows. Outputs of unused rows are zero.
+    Buffers have the size of the longest segment, so that one compiled function can be used for all segments.
+    A loop over the whole buffer would spend most of its time on empty rows. Outputs of unused rows are zero.
     """
     first = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
     _, out = jax.eval_shape(step, carry, first)
@@ -261,7 +261,7 @@ def run_epoch(
     pinned: UInt8[Array, "rows words atoms"] | None = None,
     held: UInt8[Array, "words atoms"] | None = None,
 ) -> tuple[EpochOutcome, EpochRecord]:
-    """Advance with one list until the skin is used up, the record is full or the last step is done.
+    """Advance with one neighbor list until its skin is used up, the record is full or the run ends.
 
     Args:
         leaves, structure: the program, flattened by jax.tree.flatten.
@@ -270,13 +270,12 @@ def run_epoch(
         reference: wrapped positions at which the list was built, in the user's order of atoms.
         built: step at which the list was built.
         last: last step to evaluate.
-        look_back: whether to evaluate the decisions of the step before with this list too.
+        look_back: whether to evaluate also the decisions of the previous step with this list.
         record: rows to fill; donated.
-        told: imposed decisions of each row, which replace those of the list; the list's own decisions are
+        told: imposed decisions of each row, which replace the computed decisions; computed decisions are
             still recorded. Only for pair potentials.
         pinned: slots of each row at which decisions are imposed; None for all slots.
-        held: decisions of the list at the step before, if they are not evaluated again; required without
-            rows.
+        held: decisions for this list at the previous step, if not evaluated again; required without rows.
     """
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order

@@ -1,4 +1,4 @@
-"""Conversion of packed decisions to ledger rows: pair, step, margin and effect of each flip."""
+"""Table of flips from recorded cutoff decisions: pair, step, margin and energy jump of each flip."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mdnum.systems.simulation import Simulation
 
 @njit
 def _mixed(key):
-    """Return a well-mixed 64-bit hash of a key (the finalizer of splitmix64)."""
+    """Return a 64-bit hash of an integer key (the finalizer of splitmix64)."""
     z = np.uint64(key) + np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -34,7 +34,7 @@ def _mixed(key):
 
 @njit
 def fingerprint_of_bits(bits, index, order):
-    """Count and hash sum of the pairs inside; both are equal for all lists with the same decisions."""
+    """Return the number and a hash of the pairs inside the cutoff, which do not depend on the list."""
     count, total = 0, np.uint64(0)
     atoms, listed = order.shape[0], index.shape[0] // 8
     for w in range(bits.shape[0]):
@@ -62,7 +62,7 @@ def _fingerprint_of_keys(keys):
 
 @njit
 def _note_rows(before, rows, index, x, v, pairs, ends, count):
-    """Record the `Changes` between consecutive rows of one list."""
+    """Record the `Changes` of decisions between consecutive rows of one neighbor list."""
     held = before.copy()
     for r in range(len(rows)):
         note(held, rows[r], index, x[r], v[r], r, pairs, ends, count)
@@ -71,7 +71,7 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
 # atoms in one place have no radial speed: not a number, as in numpy
 @njit(error_model="numpy")
 def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, narrow, back, first, factor):
-    """Sorted columns of a ledger, computed from `Changes`, and whether a margin contradicts its decision.
+    """Compute the columns of a table of flips from `Changes`; check that margins agree with decisions.
 
     Args:
         labels: labels of the sorted atoms. species: species by label. kinds: pair type of two species.
@@ -139,7 +139,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
 
 
 def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
-    """Return deformations from each row's box to the previous row's box; empty if the box is fixed."""
+    """Return the deformation from each row's box to the previous row's box; empty if the box is fixed."""
     if not segment.cells:
         return np.empty((0, 3, 3))
     before = jax.tree.map(np.asarray, segment.start.cells[1]), *segment.cells[:-1]
@@ -147,7 +147,7 @@ def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
 
 
 def _noted(before, bits, index, x, v) -> Changes:
-    """Return the changes in consecutive rows of one list, in the format of the compiled loop."""
+    """Return the changes of decisions in consecutive rows of one list, in the format of the compiled loop."""
     room = len(bits) * max(64, bits.shape[2] // 4)
     while True:
         made = np.empty((room, 4), np.int32), np.empty((room, 12), x.dtype), np.zeros(3, np.int64)
@@ -159,7 +159,7 @@ def _noted(before, bits, index, x, v) -> Changes:
 
 @dataclass(frozen=True)
 class AmbiguousPairs(Columns):
-    """Pair decisions that a different but equally valid rounding could have reversed, one row each."""
+    """Pairs whose cutoff decision could have been reversed by rounding errors, one row per pair and step."""
 
     step: Int[np.ndarray, "rows"]  # of the decision
     # i, j: the pair, i < j
@@ -171,15 +171,15 @@ class AmbiguousPairs(Columns):
 
 
 class PairRecorder:
-    """Recorder of the `pair` channel of a simulation.
+    """Recorder of all flips of pair decisions in a simulation.
 
-    A flip is a difference between the decisions that the program used at two consecutive steps, even if the
-    list was rebuilt in between: a pair missed by a used-up list enters when the new list contains it, and a
-    pair beyond the range of the new list leaves.
+    A flip is a difference between the decisions for a pair at two consecutive steps, even if the neighbor
+    list was rebuilt in between. A pair that the old list missed enters when the new list contains the pair,
+    and a pair beyond the range of the new list leaves.
 
     Args:
         simulation: the system as objects.
-        held: keys of the pairs that the previous list counted as inside, if a run continues with a new list.
+        held: keys of the pairs inside the cutoff in the previous list, if a run continues with a new list.
     """
 
     def __init__(self, simulation: Simulation, held: Int[np.ndarray, "pairs"] | None = None):
@@ -198,11 +198,11 @@ class PairRecorder:
         self._by_type = np.stack([thresholds, *simulation.jumps()])
 
     def inside(self, bits: UInt8[np.ndarray, "words atoms"]) -> int:
-        """Return the number of pairs inside the cutoff; a full list contains each pair twice."""
+        """Return the number of pairs inside the cutoff; a full neighbor list contains each pair twice."""
         return self._once(int(count_set(bits)))
 
     def _once(self, both: int) -> int:
-        """Return the number of pairs from a count that includes each pair twice."""
+        """Return the number of pairs, given a number that counts each pair twice."""
         if both % 2:
             raise MdnumError(
                 "the decision of a pair differs between its two atoms", remedy="Report this as a bug"
@@ -216,12 +216,12 @@ class PairRecorder:
         return np.array([self._once(int(both)) for both in segment.rows_of("inside")], np.int64)
 
     def _stacked(self, cells: Sequence[Cell]) -> tuple[Any, Any]:
-        """Return boxes in double precision, and in the dtype of decisions if it is different."""
+        """Return boxes in float64, and also in the dtype of cutoff decisions if this is not float64."""
         dtype = self.simulation.decider.dtype
         return stacked(cells), None if dtype == "float64" else stacked(cells, dtype)
 
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
-        """Bounds on the rounding error of margins at each step of a segment, in the space of the quantity."""
+        """Bounds on the rounding errors of margins at each step, in the unit of the margin (r or r²)."""
         decider = self.simulation.decider
         if not decider.grows and not segment.cells:
             return np.repeat([decider.bounds], segment.rows, axis=0)
@@ -232,11 +232,11 @@ class PairRecorder:
         return np.concatenate([one.bounds_at(x[[row]]) for row, one in enumerate(each)])
 
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
-        """Number of pairs at every step of a segment whose decision another valid rounding could change."""
+        """Number of pairs at each step of a segment whose decision could be reversed by rounding errors."""
         return np.bincount(self.doubtful(segment).step - segment.first, minlength=segment.rows)
 
     def doubtful(self, segment: Segment) -> AmbiguousPairs:
-        """Return the pairs that `ambiguous` counts, ordered by step."""
+        """Return the pairs whose decision could be reversed by rounding errors, sorted by step."""
         parts = [AmbiguousPairs.none()]
         bounds, table, dtype = self.bounds(segment), segment.table, np.dtype(self.simulation.decider.dtype)
         # almost always no pair comes that close; where one does, the host looks again
@@ -258,10 +258,10 @@ class PairRecorder:
         return AmbiguousPairs.concatenate(parts)
 
     def flips(self, segment: Segment) -> FlipTable:
-        """Return the flips of a segment by step, i and j (user's labels, i < j; channels as in `type_of`).
+        """Return the flips of a segment, sorted by step, i and j (user's labels, i < j; see `type_of`).
 
-        Distance, margin and radial speed are those at the step of the flip; the margin has the bits that the
-        program used for the decision.
+        Distance, margin and radial speed refer to the step of the flip. The margin has the same bits as in
+        the decision of the run.
 
         Raises:
             MdnumError: a flip was recorded for one atom of a pair only, or a margin contradicts its decision,
@@ -323,7 +323,7 @@ class PairRecorder:
         )  # fmt: skip
 
     def caused_by_box(self, ledger: FlipTable) -> Bool[np.ndarray, "flips"]:
-        """Select the flips that would not occur, for the same motion of atoms, in the previous step's box."""
+        """Return which flips would not occur in the previous step's box, for the same motion of atoms."""
         root, inclusive = self._rule
         # the same margin, at the distance in that box
         change = ledger.by_box if root else ledger.by_box * (2 * ledger.distance - ledger.by_box)
@@ -331,21 +331,21 @@ class PairRecorder:
         return (margin >= 0 if inclusive else margin > 0) != ledger.entered
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
-        """Return the keys of the pairs inside the cutoff at the last step, if a list ended with this step."""
+        """Return the keys of the pairs inside the cutoff at the last step of a neighbor list, if it ended."""
         if self._held_segment is not None:
             table, bits, _ = self._held_segment
             self._held_keys = _keys(self.simulation, table, np.asarray(bits))
         return self._held_keys
 
     def _cannot_differ(self, segment: Segment) -> bool:
-        """True if the old and the new list certainly have the same pairs inside the cutoff."""
+        """Return True if the old and the new list certainly have the same pairs inside the cutoff."""
         rule = self.simulation.rule
         if self._held_segment is None or not rule.safe:
             return False
         return 2 * float(segment.leap) < rule.skin and self._held_segment[2] == int(segment.inside)
 
     def _replace(self, segment: Segment) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the flips due to a new list that decides the previous step differently from the old list."""
+        """Return flips caused by a new list whose decisions at the previous step differ from the old list."""
         self.missed = 0
         if not segment.opens or (self._held_segment is None and self._held_keys is None):
             return None
@@ -371,19 +371,19 @@ class PairRecorder:
 def pair_keys(
     i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], atoms: int
 ) -> Int[np.ndarray, "pairs"]:
-    """One sorted integer for each pair i < j; the channel of a decision is included in i as in `type_of`."""
+    """Return one sorted integer for each pair i < j; i includes the channel of a decision (see `type_of`)."""
     return np.sort(i.astype(np.int64) * atoms + j)
 
 
 def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "words atoms"]):
-    """Return the sorted keys of the pairs inside the cutoff."""
+    """Return the sorted keys of all pairs inside the cutoff."""
     keys = np.empty(count_set(bits), np.int64)
     return keys[: _write_keys(bits, table.index, table.order, table.place, keys)].copy()
 
 
 @njit
 def _write_keys(bits, index, order, place, keys):
-    """Write the keys of each atom's pairs inside, neighbors in ascending order; return the number of keys."""
+    """Write the keys of the pairs inside the cutoff in ascending order; return the number of keys."""
     atoms, listed, at = order.shape[0], index.shape[0] // 8, 0
     # the channel of a decision counts as one of its first atom
     for first in range(atoms * (bits.shape[0] // listed)):
@@ -404,19 +404,19 @@ def _write_keys(bits, index, order, place, keys):
 
 
 def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.ndarray, "pairs"]:
-    """Return the keys of the pairs that the program counted as inside at a row of a segment."""
+    """Return the keys of the pairs that were inside the cutoff in a run, at one row of a segment."""
     return _keys(simulation, segment.table, bits_of(segment, row))
 
 
 def bits_of(segment: Segment, row: int) -> UInt8[np.ndarray, "words atoms"]:
-    """Return packed decisions at a row of a segment; for the last row, steps are not recomputed."""
+    """Return the packed decisions at one row of a segment; the last row needs no recomputation of steps."""
     if row == segment.rows - 1 and segment.held is not None and segment.closes != "blow-up":
         return np.asarray(segment.held)
     return segment.rows_of("bits")[row]
 
 
 def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "pairs"]:
-    """Return the keys of all pairs inside, from a new search with the program's convention and bits."""
+    """Return the keys of all pairs inside the cutoff from a new search, with the arithmetic of the run."""
     decider = simulation.decider
     table = simulation.verlet_list(skin=0.0).build(np.asarray(wrapped, np.float64), simulation.cell)
     _, _, i, j = table.listed(simulation.channels)

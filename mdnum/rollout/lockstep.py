@@ -1,8 +1,8 @@
-"""Lockstep of two runs and of counterfactuals with the arithmetic of one run and the decisions of the other.
+"""Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other imposed.
 
-Each free run is identical, bit for bit, to the same run on its own: it has its own lists and compiled epochs,
-and only the step counter is shared. Decisions are compared through the flips of both runs, so the cost does
-not depend on the number of pairs, and only the pairs that currently differ are stored.
+Each free run has the same bits as a run by itself, because it has its own neighbor lists and compiled loop;
+only the step counter is shared. Cutoff decisions are compared by the flips of both runs. Therefore the cost
+does not depend on the number of pairs, and only pairs with different decisions are stored.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from mdnum.systems.simulation import Simulation
 
 
 def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactual]) -> Iterator[PairRows]:
-    """Advance two runs and their counterfactuals, one segment of the leader at a time.
+    """Advance two runs and their counterfactual runs together, one segment of the first run at a time.
 
     Args:
-        leader, follower: the runs, A and B; the counterfactual under the decisions of each is its listener.
+        leader, follower: the runs A and B; the counterfactual with the decisions of a run is its listener.
         imposed: the requested counterfactuals: "B|A" has B's arithmetic and A's decisions, "A|B" the reverse.
     """
     tracks = {"A": leader, "B": follower}
@@ -86,17 +86,16 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
 def beside(
     leader: Track, runs: Sequence[Track | Counterfactual]
 ) -> Iterator[list[Float[np.ndarray, "rows"]]]:
-    """Yield separations of runs from a leader, one segment of the leader at a time."""
+    """Yield the separations of runs from a leading run, one segment of this run at a time."""
     while leader.segment() is not None:
         rows = leader.until(end := leader.ready)
         yield [separation_of(rows, run.until(end)) for run in runs]
 
 
 def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Largest distance between the same atoms of two runs at each step; NaN after the end of the second run.
+    """Return the largest distance between the same atoms in two runs at each step; NaN after run b has ended.
 
-    Positions are compared relative to the box; distances are nearest-image lengths in the box of the first
-    run.
+    Positions are compared relative to the box; distances are minimum-image distances in the first run's box.
     """
     out = np.full(0 if a is None else len(a), np.nan)
     if a is not None and b is not None:
@@ -107,7 +106,7 @@ def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
 
 
 def strain_of(a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Strain between the boxes of two runs at each step; NaN after the end of the second run."""
+    """Return the strain between the boxes of two runs at each step; NaN after run b has ended."""
     out = np.full(len(a), np.nan)
     if b is not None:
         rows = min(len(a), len(b))
@@ -116,7 +115,7 @@ def strain_of(a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
 
 
 def _differ(a: Rows, b: Rows) -> bool:
-    """True if the boxes of two runs may differ."""
+    """Return True if the boxes of two runs can be different."""
     return bool(a.cells or b.cells) or not np.array_equal(a.box.matrix, b.box.matrix)
 
 
@@ -140,7 +139,7 @@ def _per_row(doubts: AmbiguousPairs, rows: Rows) -> Int[np.ndarray, "rows"]:
 
 
 def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarray, "rows"]:
-    """Convert the smallest |margin| of each step to a length, a lower bound on distances to the cutoff."""
+    """Convert the smallest |margin| of each step to a length, a lower bound on distances from the cutoff."""
     if rows is None or rows.nearest is None:
         return np.full(len(clock), np.nan)
     margin = rows.nearest
@@ -155,7 +154,7 @@ def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarra
 
 
 def _bound(track: Track, rows: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Largest rounding bound over all pair types at each step of a run, as a length."""
+    """Return the largest rounding bound of any pair type at each step of a run, as a length."""
     if rows is None:
         return np.zeros(0)
     decider = track.simulation.decider

@@ -1,4 +1,4 @@
-"""Components of a run's pressure, and the pressure that the cutoff neglects."""
+"""Components of the pressure in a run, and corrections of the pressure for the cutoff."""
 
 from __future__ import annotations
 
@@ -28,12 +28,11 @@ class PressureParts:
     """Components of the pressure: kinetic, virial (total and per term) and impulsive.
 
     The impulsive component is due to the jump of the energy at a cutoff: 2/3 π ρ² g(r_cut) r_cut³ u(r_cut)
-    for one kind of pairs (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). Neither the forces of
-    molecular dynamics nor a barostat include it; it is the difference from the pressure of the truncated
-    energy.
+    for one type of pair (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). Forces and barostats do
+    not contain this component, but it contributes to the pressure of the truncated potential.
 
     Args:
-        samples: for each sampled step, the volume and these components, energy/length³.
+        samples: for each sampled step, the volume, length³, and the components, energy/length³.
     """
 
     simulation: Simulation
@@ -41,11 +40,11 @@ class PressureParts:
 
     @cached_property
     def _jumps(self) -> Float[np.ndarray, "kinds"]:
-        """Energy jump of each kind of pair at its cutoff, independent of the box."""
+        """Energy jump of each type of pair at its cutoff."""
         return self.simulation.jumps()[0] if self.simulation.pairwise else np.zeros(1)
 
     def take(self, segment: Segment) -> None:
-        """Add the last step of a segment if the box is periodic and has a finite volume."""
+        """Add the last step of a segment to the samples, if the box is periodic and has a finite volume."""
         simulation, row = self.simulation.in_row(segment.cell_of(segment.rows - 1)), segment.rows - 1
         volume = simulation.cell.volume
         if not (np.isfinite(volume) and all(simulation.pbc)):
@@ -78,7 +77,7 @@ class PressureParts:
         self.samples.append(parts)
 
     def summary(self) -> dict[str, Any] | None:
-        """Return means and standard errors in the user's unit, and cutoff corrections; None without samples.
+        """Return means and standard errors in user units, and cutoff corrections; None without samples.
 
         Standard errors assume independent samples; the correction for pairs beyond the cutoff is evaluated at
         the mean volume.
@@ -112,7 +111,7 @@ _OWN = ("volume", "kinetic", "virial", "total")
 def _virials(
     simulation: Simulation, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], r: np.ndarray
 ) -> Mapping[str, float]:
-    """Sum of r · F over pairs for each term; i as for `Simulation.type_of`."""
+    """Return the sum of r · F over pairs for each term of the potential; for i see `Simulation.type_of`."""
     found, channel, i = {}, i // simulation.atoms, i % simulation.atoms
     for number, part in enumerate(simulation.model.parts):
         here = channel == number

@@ -1,4 +1,4 @@
-"""Molecular dynamics as a `Program`: runs in lockstep, with imposed decisions, perturbed or varied."""
+"""Molecular dynamics as a `Program`: runs for comparison, with imposed decisions or perturbed starts."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ Loss = Callable[[Simulation, Float[np.ndarray, "atoms 3"], Float[np.ndarray, "at
 
 
 def squared_displacement(simulation: Simulation, x: np.ndarray, v: np.ndarray) -> float:
-    """Mean squared displacement from the start, length squared; the default loss."""
+    """Return the mean squared displacement of the atoms from the start, length²; the default loss."""
     return float(np.mean(np.sum((x - simulation.positions) ** 2, axis=1)))
 
 
 @dataclass(frozen=True)
 class MdProgram:
-    """A simulation with its start and the mapping of its atoms and axes to another program's."""
+    """A simulation with an initial state, and the mapping of its atoms and axes to another simulation."""
 
     simulation: Simulation  # the system as objects
     begin: Start | None = None  # its start; None for the system's own
@@ -49,7 +49,7 @@ class MdProgram:
 
     @property
     def steps(self) -> int:
-        """Number of steps of the system's own run."""
+        """Number of steps that the system specifies for a run."""
         return self.simulation.steps
 
     @property
@@ -59,34 +59,34 @@ class MdProgram:
 
     @property
     def scale(self) -> float:
-        """Longest cutoff, the length scale of the program."""
+        """Longest cutoff radius, which is used as the length scale of the system."""
         return self.simulation.r_cut
 
     @property
     def ulp(self) -> float:
-        """Unit in the last place of the largest coordinate at the start."""
+        """Unit in the last place (ulp) of the largest initial coordinate, length."""
         x = np.asarray(self.start.state.x)
         return float(np.spacing(np.abs(x).max().astype(x.dtype)))
 
     @property
     def streams(self) -> bool:
-        """True: a run can be continued for as many steps as a verdict needs."""
+        """Always True, because a run can be continued for any number of steps."""
         return True
 
     @property
     def imposable(self) -> str | None:
-        """None if decisions can be imposed, else the reason; they can only be imposed on pair potentials."""
+        """None if decisions can be imposed on this simulation, else the reason why this is not possible."""
         if self.simulation.imposable:
             return None
         return "a many-body potential decides inside its energy function"
 
     @cached_property
     def start(self) -> Start:
-        """Initial state of the program."""
+        """Initial state of the simulation."""
         return self.begin or first_state(self.simulation)
 
     def check(self, other: MdProgram) -> None:
-        """Check that both programs have the same number of atoms.
+        """Raise an error if two simulations have different numbers of atoms.
 
         Raises:
             InputError: the numbers of atoms differ.
@@ -100,7 +100,7 @@ class MdProgram:
     def lockstep(
         self, other: MdProgram, last: int, *, forward: bool, back: bool, guard: float | None
     ) -> Iterator[PairRows]:
-        """Advance both runs and their counterfactuals, one segment at a time (see `Program.lockstep`)."""
+        """Advance two runs and their counterfactuals, one segment at a time (see `Program.lockstep`)."""
         a, b = self.simulation, other.simulation
         frame, imposed = other.frame or ReferenceFrame.same(a.atoms), {}
         if forward:
@@ -113,7 +113,7 @@ class MdProgram:
     def repeats(
         self, others: Sequence[MdProgram], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Separations of perturbed runs from one run of this program (see `Program.repeats`)."""
+        """Return separations of runs with perturbed starts from one run (see `Program.repeats`)."""
         a = self.simulation
         frame = others[0].frame or ReferenceFrame.same(a.atoms)
         imposed = [Counterfactual(b.simulation, a, b.begin, frame, guard) for b in others]
@@ -133,10 +133,10 @@ class MdProgram:
         return list(zip(whole[: len(free)], whole[len(free) :], strict=True))
 
     def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
-        """Return copies of the program with random displacements of atoms, the largest of about `size`.
+        """Return copies of the simulation with random displacements of the atoms of at most about `size`.
 
-        The largest displacement is at least one ulp, because a smaller one would be lost in the first
-        addition.
+        The largest displacement is at least one ulp, because a smaller displacement would be lost by
+        rounding.
         """
         rng = np.random.default_rng(seed)
         x, ulp = np.asarray(self.start.state.x), self.ulp
@@ -151,7 +151,7 @@ class MdProgram:
         return programs
 
     def decision(self, other: MdProgram, flips: Sequence[CrossFlip], separation: float) -> Decision:
-        """Return the decision at a fork: among the pairs that differ there, the one nearest to its cutoff."""
+        """Return the decision at a fork: of all pairs that differ, the pair nearest to its cutoff."""
         differing = [flip for flip in flips if flip.differs]
         flip = min(differing, key=lambda flip: abs(flip.margin) if np.isfinite(flip.margin) else np.inf)
         if np.isfinite(flip.margin):
@@ -171,7 +171,7 @@ class MdProgram:
         )  # fmt: skip
 
     def number(self, key: str) -> Number:
-        """Return a number of the system, given its path."""
+        """Return a numerical parameter of the system, given its path."""
         simulation = self.simulation
         name = parameters.resolve(simulation, key, parameters.numbers(simulation))
 
@@ -182,7 +182,7 @@ class MdProgram:
         return Number(name, here, unit, at, parameters.is_positive(simulation, name))
 
     def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
-        """Return a run's decisions (see `Program.history`); the default loss is `squared_displacement`."""
+        """Return the decisions of a run (see `Program.history`); default loss: `squared_displacement`."""
         marks: list[np.uint64] = []
         segment = None
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
@@ -204,7 +204,7 @@ class MdProgram:
         return DecisionHistory(every, digest, x, value, energy, failed)
 
     def differing(self, other: MdProgram, steps: int, step: int, key: str = "") -> Differing:
-        """Among the pairs that differ at a step, return the one nearest to its cutoff in both programs."""
+        """Return the pair that is nearest to its cutoff among the pairs that differ at a step."""
         sides = [one._pairs_at(steps, step) for one in (self, other)]
         keys = np.setxor1d(sides[0][0], sides[1][0], assume_unique=True)
         pairs = [divmod(int(key), self.size) for key in keys]
@@ -220,7 +220,7 @@ class MdProgram:
         return Differing(nearest)
 
     def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], Simulation, np.ndarray]:
-        """Keys of the pairs inside at a step of a full run, the simulation in its box, and the positions."""
+        """Return, for a step of a run, the keys of pairs inside, the simulation in its box, and positions."""
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             if segment.last >= step:
                 row = step - segment.first
@@ -229,7 +229,7 @@ class MdProgram:
         raise IndexError(f"the run has no step {step}")
 
     def state_at(self, step: int, last: int) -> tuple[Simulation, Float[np.ndarray, "atoms 3"]] | None:
-        """Simulation in its box and wrapped positions, in the frame, at a step; None after the run's end."""
+        """Return the simulation in its box and wrapped positions at a step; None after the end of the run."""
         track = Track(self.simulation, last, self.begin, self.frame, flips=False)
         while track.segment() is not None:
             rows = track.until(track.ready)
@@ -243,11 +243,11 @@ class MdProgram:
 def pair_margin(
     simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int, labels: Simulation | None = None
 ) -> float:
-    """Threshold minus quantity of a pair, with the bits of the program's own decision.
+    """Return threshold minus quantity (r or r²) of a pair, with the same bits as in the decision of a run.
 
     Args:
-        x: wrapped positions.
-        labels: simulation whose labels i and j are; by default this one.
+        x: wrapped positions, length.
+        labels: simulation to whose atoms i and j refer; by default this one.
     """
     decider = simulation.decider
     kind = int((labels or simulation).type_of(np.array([i]), np.array([j]))[0])

@@ -1,4 +1,4 @@
-"""Rollouts that write a run folder, check their record and can be resumed after being killed."""
+"""Simulation runs that write a run folder, check their results, and can be resumed after a kill."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _PACES = 99
 
 @result
 class RunResult:
-    """Result of a run: its folder, summary, simulation and first and last frames."""
+    """Result of a run: folder, summary, simulation, and first and last frame."""
 
     folder: Path  # the run folder
     summary: dict[str, Any]  # the content of summary.json
@@ -69,7 +69,7 @@ class RunResult:
 
 @dataclass
 class _Progress:
-    """Totals of the run so far, all of which are stored in a checkpoint."""
+    """Totals of a run up to the current step, which are stored in checkpoints."""
 
     tally: RunTally
     health: ListHealth
@@ -85,7 +85,7 @@ class _Progress:
 
 @dataclass
 class Rollout:
-    """One run in progress, which writes its folder.
+    """A simulation run in progress, with its run folder.
 
     Attributes:
         simulation: the system as objects.
@@ -93,7 +93,7 @@ class Rollout:
         steps: last step.
         save_every: number of steps between trajectory frames; 0 for no frames.
         progress: called with step, steps and a dictionary of figures.
-        began: time.perf_counter() at the start, for the time to the first step.
+        began: time.perf_counter() at the start, for the measurement of the time to the first step.
         shown: called with the simulation in its box, and the first and the last positions, as soon as they
             are available.
         ended: the simulation in its box at the last step.
@@ -116,7 +116,7 @@ class Rollout:
         self._earlier_seconds = 0.0
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Continue from the state of a checkpoint instead of from the start."""
+        """Continue the run from the state of a checkpoint."""
         self.start = Start.from_arrays(saved, self.simulation)
         done = saved["done"]
         self.done = _Progress(
@@ -131,10 +131,10 @@ class Rollout:
         self.recorder = PairRecorder(self.simulation, saved.get("held"))
 
     def run(self) -> dict[str, Any]:
-        """Run to the last step, write all files except the report, and return the summary.
+        """Run to the last step, write all files except the report page, and return the summary.
 
         Raises:
-            NumericalError: a number is no longer finite; all results up to the step before are kept.
+            NumericalError: a number is no longer finite; all results up to the previous step are kept.
             FolderError: the folder cannot be written.
         """
         engine = Engine(self.simulation, self.steps, start=self.start, rows=self._needs_rows())
@@ -186,7 +186,7 @@ class Rollout:
             self.shown(here, np.asarray(positions, np.float64))
 
     def _needs_rows(self) -> bool:
-        """True if rows of the record are needed so often that storing them is better than recomputing."""
+        """True if recorded steps are needed so often that storing is faster than recomputing."""
         simulation = self.simulation
         policy = simulation.policy
         # in single precision most steps have a margin within its bound, and a bad list misses pairs
@@ -272,7 +272,7 @@ class Rollout:
         self.folder.checkpoint_beside(lambda: state if held is None else {**state, "held": held()})
 
     def _to_dict(self, point: Start) -> dict[str, Any]:
-        """Return the data for resuming a run at a point; after a used-up list also its last pairs inside."""
+        """Return the data from which a run can be resumed, with the last pairs of a list that was used up."""
         last = None if self.done.last is None else np.asarray(self.done.last).T
         frames = {"first": self.done.first, "last": last}
         return {
@@ -414,7 +414,7 @@ def _fresh(simulation: Simulation, layout: Layout, out, steps, save_every, progr
 
 
 def _finished(path: Path, steps: int | None, given: Simulation | None) -> RunResult | None:
-    """Return the result of a run that is already complete, else None."""
+    """Return the result that a folder already contains if the run is complete, else None."""
     folder = RunFolder.open(path)
     summary = folder.summary
     if summary.get("status") != "complete" or not folder.has_checkpoint():

@@ -1,4 +1,4 @@
-"""Totals of a rollout, its energy budget, the health of its neighbor lists, and its summary."""
+"""Summary of a run: totals, check of the energy jumps, and checks of the neighbor lists."""
 
 from __future__ import annotations
 
@@ -21,10 +21,9 @@ from mdnum.systems.simulation import Simulation
 
 @dataclass
 class LineFit:
-    """A least-squares line through points that are not stored, so that memory does not grow with the steps.
+    """A least-squares line through a stream of points, with memory that does not grow with the points.
 
-    Values are taken relative to the first value, so that the sums contain the drift and not the energy
-    itself.
+    The first value is subtracted from all values, so that the sums contain the drift and not the energy.
     """
 
     count: int = 0
@@ -35,7 +34,7 @@ class LineFit:
     xy: float = 0.0
 
     def add(self, x: Float[np.ndarray, "rows"], y: Float[np.ndarray, "rows"]) -> None:
-        """Add points to the fit."""
+        """Add points (x, y) to the least-squares fit."""
         if not self.count:
             self.first = float(y[0])
         relative = y - self.first
@@ -47,7 +46,7 @@ class LineFit:
 
     @property
     def slope(self) -> float | None:
-        """Slope dy/dx; None for fewer than three points, or if their squares underflow or overflow."""
+        """Slope dy/dx of the line; None for fewer than three points, or if squares under- or overflow."""
         spread = self.count * self.xx - self.x * self.x
         if self.count < 3 or not 1e-280 < spread < np.inf:
             return None
@@ -56,7 +55,7 @@ class LineFit:
 
 @dataclass
 class RunTally:
-    """Totals over the rows recorded so far."""
+    """Totals over all recorded time steps up to the current step."""
 
     step: int = -1
     entered: int = 0
@@ -80,7 +79,7 @@ class RunTally:
     def take(
         self, segment: Segment, rows: dict[str, np.ndarray], ledger: FlipTable, bounds: np.ndarray
     ) -> None:
-        """Add a segment: its rows of series.parquet, its flips and the bounds of its margins."""
+        """Add a segment to the totals: rows of series.parquet, flips, and rounding bounds."""
         self.bound = max(self.bound, float(np.max(bounds)))
         pairs = rows["pairs"]
         if self.step < 0:
@@ -111,7 +110,7 @@ class RunTally:
 
 
 def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, flips: int) -> str:
-    """Format a line of log.txt for a row of a segment, with pairs inside and flips up to this step."""
+    """Format a line of log.txt for a step, with the number of pairs inside and of flips up to this step."""
     potential, kinetic = segment.rows_of("potential")[row], segment.rows_of("kinetic")[row]
     temperature = 2 * kinetic / (degrees_of_freedom(simulation) * simulation.units.k_B)
     step = segment.first + row
@@ -123,7 +122,7 @@ def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, fli
 
 
 def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dict[str, Any]:
-    """Return the content of summary.json, except the entries of the references and the report."""
+    """Return the contents of summary.json, except the entries of reference methods and the report page."""
     tally, health, budget = done.tally, done.health, done.budget
     jumps = energy_jump, force_jump = simulation.jumps()
     pairs = pair_names(simulation.symbols)
@@ -193,7 +192,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
 
 
 def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> str:
-    """Return a phrase that names the closest two atoms, to be appended to a message about a blow-up."""
+    """Return a phrase about the closest two atoms, which is appended to the message about a blow-up."""
     if simulation.atoms < 2 or not np.all(np.isfinite(positions)):
         return ""
     wrapped, _ = wrap_positions(simulation.cell, positions)
@@ -213,7 +212,7 @@ def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]
 
 
 def degrees_of_freedom(simulation: Simulation) -> int:
-    """Number of degrees of freedom: 3 N, minus three if the momentum of the center of mass is conserved."""
+    """Return the number of degrees of freedom: 3 N, or 3 N - 3 if the total momentum is conserved."""
     return simulation.integrator.freedom(simulation.masses)
 
 
@@ -225,15 +224,15 @@ def series_columns(
     ledger: FlipTable,
     by_box: Bool[np.ndarray, "flips"] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return the rows of series.parquet for a segment.
+    """Return the columns of series.parquet for the steps of a segment.
 
     Args:
         simulation: the system as objects.
         segment: the engine's record.
-        pairs: number of pairs inside at each row.
-        ambiguous: number of pairs within the rounding bound at each row.
+        pairs: number of pairs inside the cutoff at each row.
+        ambiguous: number of pairs with |margin| below the rounding bound at each row.
         ledger: the flips of the segment.
-        by_box: mask of the flips that the box caused; None if the box is fixed.
+        by_box: mask of the flips caused by a change of the box; None if the box is fixed.
     """
     units = simulation.units
     step = np.arange(segment.first, segment.first + segment.rows)
@@ -275,7 +274,7 @@ def series_columns(
 
 
 def _lattice(vectors: Float[np.ndarray, "rows 3 3"]) -> dict[str, np.ndarray]:
-    """Lengths of the lattice vectors, and the angles between them in degrees."""
+    """Return the lengths of the lattice vectors, and the angles between lattice vectors in degrees."""
     lengths = np.linalg.norm(vectors, axis=2)
     pairs = np.array([1, 2, 0]), np.array([2, 0, 1])
     dots, products = (np.prod([one[:, k] for k in pairs], axis=0) for one in (vectors, lengths))
@@ -298,7 +297,7 @@ _NOISES = 20.0
 
 @dataclass
 class EnergyBudget:
-    """Check of the ledger's energy jumps against an evaluation that does not use the run's neighbor lists."""
+    """Check of the recorded energy jumps against energies computed without the run's neighbor lists."""
 
     simulation: Simulation  # the system as objects
     start: float | None = None  # hard energy minus reference energy at step 0, or None before it was seen
@@ -317,7 +316,7 @@ class EnergyBudget:
     def check(
         self, step: int, positions: Float[np.ndarray, "atoms 3"], potential: float, cell: Cell | None = None
     ) -> dict:
-        """Check the budget at one step; return the numbers computed with its energy (`Simulation.numbers`).
+        """Check the energy at one step; return the quantities computed for this (`Simulation.numbers`).
 
         Args:
             step: the step.
@@ -339,7 +338,7 @@ class EnergyBudget:
 
     @property
     def tolerance(self) -> float:
-        """Largest deviation at which the budget closes: a tenth of the smallest jump, or rounding error."""
+        """Largest allowed deviation of the energy: a tenth of the smallest jump, or the rounding error."""
         if self._reference is not self.simulation:
             jumps = np.abs(self.simulation.jumps()[0])
             return _SHARE_OF_A_JUMP * float(jumps[jumps > 0].min())
@@ -350,16 +349,16 @@ class EnergyBudget:
 
     @property
     def closes(self) -> bool:
-        """True if every check was within the tolerance."""
+        """True if the deviation of every check was within the tolerance."""
         return abs(self.residual) <= self.tolerance
 
     def to_dict(self) -> dict:
-        """Return the budget as plain values for a checkpoint."""
+        """Return the state of the check as plain values, for storage in a checkpoint."""
         return {name: getattr(self, name) for name in self._fields}
 
     @classmethod
     def from_dict(cls, simulation: Simulation, values: dict) -> EnergyBudget:
-        """Restore the budget from the values of `to_dict`."""
+        """Restore the state of the check from the values that `to_dict` returned."""
         return cls(simulation, **values)
 
 
@@ -368,7 +367,7 @@ class EnergyBudget:
 
 @dataclass
 class Epoch:
-    """Statistics of the neighbor list in use, up to the current step."""
+    """Statistics of the current neighbor list, up to the current step."""
 
     epoch: int
     start: int
@@ -385,7 +384,7 @@ class Epoch:
 
     @classmethod
     def of(cls, segment: Segment) -> Epoch:
-        """Return the statistics of the epoch of a segment, before its first row."""
+        """Return the initial statistics of the neighbor list that is used in a segment."""
         table = segment.table
         return cls(
             segment.epoch, segment.built, table.pairs, table.slots, table.occupancy, 1e3 * table.build_seconds
@@ -405,8 +404,8 @@ class Epoch:
 class ListHealth:
     """Monitor of a run's neighbor lists, which counts missed pairs and dangerous rebuilds.
 
-    A list can miss a pair only after two atoms together have used up the skin. With a safe rebuild rule this
-    never happens; otherwise, every such step is compared with a new search.
+    A list can miss a pair only if the displacements of two atoms add up to more than the skin. A safe rebuild
+    rule prevents this; with any other rule, every such step is compared with a new neighbor search.
     """
 
     simulation: Simulation  # the system as objects
@@ -420,11 +419,11 @@ class ListHealth:
     mismatches: int = 0
 
     def take(self, segment: Segment, missed: int) -> list[dict[str, np.ndarray]]:
-        """Add a segment; return the rows of the epochs that are known to have ended.
+        """Add a segment; return a table row for each neighbor list whose use has ended.
 
         Args:
             segment: the engine's record.
-            missed: number of pairs that the previous list missed at its last step, according to the new list.
+            missed: number of pairs of the new list that the previous list missed at its last step.
         """
         self.mismatches += missed > 0
         rows = []
@@ -448,7 +447,7 @@ class ListHealth:
         return rows
 
     def last_row(self) -> dict[str, np.ndarray] | None:
-        """Return the row of the list that is in use when a run ends."""
+        """Return the table row of the neighbor list that is in use when a run ends."""
         return None if self.current is None else self._close(self.current, "end")
 
     def _audit(self, segment: Segment, moved, epoch: Epoch) -> None:
@@ -488,14 +487,14 @@ class ListHealth:
         return {name: np.array([value]) for name, value in values.items()}
 
     def to_dict(self) -> dict:
-        """Return the monitor's counts as plain values for a checkpoint."""
+        """Return the counts of the monitor as plain values, for storage in a checkpoint."""
         values = {k: v for k, v in self.__dict__.items() if k not in ("simulation", "current", "lost")}
         current = None if self.current is None else self.current.to_dict()
         return {**values, "lost": sorted(self.lost), "current": current}
 
     @classmethod
     def from_dict(cls, simulation: Simulation, values: dict) -> ListHealth:
-        """Restore a monitor from the values of `to_dict`."""
+        """Restore a monitor from the values that `to_dict` returned."""
         current = None if values["current"] is None else Epoch.from_dict(values["current"])
         rest = {k: v for k, v in values.items() if k not in ("lost", "current")}
         return cls(simulation, current=current, lost=set(values["lost"]), **rest)

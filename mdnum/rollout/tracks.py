@@ -1,4 +1,4 @@
-"""Consecutive steps of one run, and the flips among them, in the labels and axes of another run."""
+"""Steps and flips of one run, converted to the atom labels and axes of another run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mdnum.systems.simulation import Simulation
 
 @dataclass(frozen=True)
 class Rows:
-    """Consecutive steps of one run, in the labels and axes of the first run."""
+    """Consecutive steps of a run, with the atom labels and axes of the first run of a comparison."""
 
     first: int  # step of the first row
     # x, v: wrapped positions and full-step velocities, shape (rows, 3, atoms), float64
@@ -41,16 +41,16 @@ class Rows:
 
     @property
     def last(self) -> int:
-        """Step of the last row."""
+        """Time step of the last row."""
         return self.first + len(self) - 1
 
     @property
     def boxes(self) -> tuple[Cell, ...]:
-        """Box of each row."""
+        """Simulation box of each row."""
         return self.cells or (self.box,) * len(self)
 
     def seen_by(self, frame: ReferenceFrame) -> Rows:
-        """Return the rows in the labels and axes of another run."""
+        """Return the rows with the atom labels and axes of another run."""
         if frame.is_same:
             return self
         by = np.array([self.box.deformation(cell) for cell in self.cells]) if self.cells else None
@@ -69,7 +69,7 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: list[Rows]) -> Rows:
-        """Join consecutive rows."""
+        """Join consecutive groups of rows into one group."""
         if len(parts) == 1:
             return parts[0]
         columns = {name: [getattr(part, name) for part in parts] for name in _COLUMNS}
@@ -86,7 +86,7 @@ _COLUMNS = ("x", "v", "energy", "nearest", "overridden", "furthest")
 
 
 def taken(ahead: list[Rows], last: int) -> Rows | None:
-    """Remove the rows up to a step from those already read, and return them; None if there are none."""
+    """Remove all rows up to a step from a list of rows, and return these rows; None if there are none."""
     parts: list[Rows] = []
     while ahead and ahead[0].first <= last:
         rows = ahead.pop(0)
@@ -98,15 +98,15 @@ def taken(ahead: list[Rows], last: int) -> Rows | None:
 
 
 class Track:
-    """One run, read forward.
+    """A run whose segments are read in the order of time steps.
 
     Args:
         simulation: the run.
         last: last step.
         start: initial state; by default the system's own start.
         frame: mapping of this run's atoms and axes to those of the first run.
-        flips: whether to read the run's flips.
-        listener: called with each segment as it is read, while its decisions are still on the device.
+        flips: whether to compute the flips of the run.
+        listener: called with each segment that is read, while its decisions are still on the device.
         pins: decisions imposed on the run.
     """
 
@@ -135,7 +135,7 @@ class Track:
         self.failed = ""
 
     def segment(self) -> Segment | None:
-        """Read the next segment of this run; keep its rows and flips for `until`. Return None at the end."""
+        """Read the next segment of the run, and keep its rows and flips; return None after the last."""
         segment = next(self._segments, None)
         if segment is None:
             return None
@@ -154,24 +154,24 @@ class Track:
 
     @property
     def ready(self) -> int:
-        """Last step that has been read."""
+        """Last time step that has been read."""
         return self._ahead[-1].last
 
     def until(self, last: int) -> Rows | None:
-        """Rows up to a step that were not returned before; fewer if the run ends, None if there are none."""
+        """Return all rows up to a step that were not returned before; None if there are none."""
         while not self._ahead or self.ready < last:
             if self.segment() is None:
                 break
         return taken(self._ahead, last)
 
     def flips(self, last: int) -> PairFlips:
-        """Return the flips up to a step that have not been returned before."""
+        """Return all flips up to a step that were not returned before."""
         every = PairFlips.concatenate(self._flips)
         self._flips = [every[every.step > last]]
         return every[every.step <= last]
 
     def doubts(self, last: int) -> AmbiguousPairs:
-        """Ambiguous decisions up to a step that were not returned before, in the labels of the first run."""
+        """Return ambiguous decisions up to a step that were not returned yet, in the first run's labels."""
         every = AmbiguousPairs.concatenate(self._doubts)
         taken = every[every.step <= last]
         self._doubts = [every[every.step > last]]
@@ -180,7 +180,7 @@ class Track:
 
 
 def rows_of(simulation: Simulation, segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
-    """Return a segment's rows in the user's order of atoms, in the labels and axes of another run."""
+    """Return the rows of a segment in the user's order of atoms, with labels and axes of another run."""
     x, v = (in_user_order(segment.rows_of(name), segment.table.order) for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
     nearest = segment.rows_of("nearest").astype(np.float64)
