@@ -1,7 +1,7 @@
-"""Reverse-mode derivatives of a rollout at its recorded states and decisions.
+"""Reverse-mode derivatives of a simulation at its recorded states and decisions.
 
-Inside jax.value_and_grad a compiler makes another forward pass, which rounds differently and, after some
-thousand steps, makes other decisions. Here the run is made first, by the same program as every other run.
+With jax.value_and_grad, the compiled forward pass rounds differently from an ordinary run and, after some
+thousand steps, makes other decisions. Here, the run is made first, by the same program as every other run.
 
 A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
 times that vector. For a pair potential this product is a tangent evaluation, pair by pair, gathered like the
@@ -44,7 +44,7 @@ ALL = frozenset((MODEL, SCALE, FORCE, WEIGHT))
 
 
 class ForceCotangents(NamedTuple):
-    """Cotangents obtained by transposing one evaluation of forces."""
+    """Cotangents of the inputs of one evaluation of forces."""
 
     x: Float[Array, "3 atoms"]  # on the positions
     model: Any  # on the parameters, a pytree of arrays like theirs; zeros where it was not asked for
@@ -64,7 +64,7 @@ def pull_back(
     onto_virial: Float[Array, "*axes"],
     wanted: frozenset[str] = frozenset(),
 ) -> ForceCotangents:
-    """Propagate cotangents back through one evaluation of forces, energy and virial at given decisions.
+    """Propagate cotangents backward through one evaluation of forces, energy and virial at given decisions.
 
     Args:
         x: sorted, wrapped positions, length. bits: the packed decisions that this evaluation used.
@@ -109,15 +109,15 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return r2, jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
 
     def virials(d, r2):
-        """Return the virial's cotangent V contracted with the pair vector d: d·V·d, and V·d for a tensor."""
+        """Return d·V·d for the pair vector d and the virial's cotangent V, and also V·d if V is a tensor."""
         if not virial.ndim:
             return virial * r2, None
         turned = [reduce(add, (virial[a, b] * d[b] for b in range(3))) for a in range(3)]
         return reduce(add, (d[a] * turned[a] for a in range(3))), turned
 
     def through(r2, along, inside, types, weights):
-        """Return energy and slope as a function of r², slot parameters (with cutoff values) and shared
-        parameters; the values of the slot parameters; and the cotangents of energy and slope.
+        """Return a function for energy and slope (of r², slot parameters and shared parameters), the values
+        of the slot parameters including those at the cutoff, and the cotangents of energy and slope.
         """
         # each slot has parameters of its own, so that no sum over slots stands inside the loop
         slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
@@ -131,8 +131,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return ended, slots, onto
 
     def with_shared(r2, along, inside, types, weights):
-        """Compute the slope of each slot and the cotangents of r², of its own parameters and of shared
-        parameters; one reverse pass for all of them is cheaper than two for a neural network.
+        """Compute slopes, and cotangents of r², of each slot's parameters and of shared parameters. For a
+        neural network, one reverse pass for all cotangents is cheaper than two.
         """
         ended, slots, onto = through(r2, along, inside, types, weights)
 
@@ -146,14 +146,14 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return slope, *back(onto)
 
     def onto_weights(r2, along, inside, types, weights, others):
-        """Compute the terms of each neighbor slot for its atom; every pair occupies a slot of both atoms."""
+        """Compute the cotangents of the atoms' weights from each neighbor slot; each pair has two slots."""
         onto = jnp.where(inside, energy, 0), -2 * jnp.where(inside, along, 0)
         by = jax.vjp(lambda *weights: model.evaluate(r2, types, at, *weights), *weights)[1](onto)
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
     def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
-        """Return the terms of a neighbor slot for positions, forces, scale and wanted parameters, in this
-        order, and the terms of a block of slots for the parameters that all pairs share.
+        """Return the terms of each neighbor slot for positions, forces, scale and wanted parameters (in this
+        order), and the terms of a block of slots for the parameters that all pairs share.
         """
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
@@ -220,15 +220,15 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
 
 def _differences(cell, own, other):
-    """Return pair differences of position and vector, products of weights, and the other atom's weights."""
+    """Return a pair's differences of positions and vectors, products of weights, and second weights."""
     d = [b - a for a, b in zip(own[:6], other[:6], strict=True)]
     products = (a * b for a, b in zip(own[6:], other[6:], strict=True))
     return [*cell.minimum_image(*d[:3]), *d[3:], *products, *other[6:]]
 
 
 def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
-    """Sum the terms of each atom's neighbor slots, which depend on differences between the two atoms; also
-    sum the terms that belong to all slots together.
+    """Sum the terms of each atom's neighbor slots, which depend on differences between the two atoms of a
+    pair; also sum the terms of parameters that all pairs share.
     """
 
     def pair(own, other, types, inside):
@@ -257,7 +257,7 @@ def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
 
 
 def _added(totals: tuple[Array, ...], terms: list[Array]) -> tuple[Array, ...]:
-    """Add the terms of four neighbor slots in a fixed order, so that the compiler vectorizes over atoms."""
+    """Add the terms of four neighbor slots in a fixed order, which lets the compiler vectorize over atoms."""
     out = []
     for total, term in zip(totals, terms, strict=True):
         for k in range(term.shape[0]):
@@ -304,9 +304,9 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
 class AdjointCarry(NamedTuple):
     """Cotangents that the reverse pass carries from step to step.
 
-    Row k of a trace holds the cotangents of the state (x, half-kicked v) at the beginning of step first + k,
-    before the reverse pass transposes the crossings that lead to this state, with atoms in the order of the
-    neighbor list; rows beyond the used ones are undefined, and the origin is omitted.
+    A trace contains these cotangents at every step, without the origin. Row k of a trace belongs to the state
+    (x, half-kicked v) at the beginning of step first + k, before the crossings that lead to this state are
+    transposed. Atoms are in the order of the neighbor list. Unused rows at the end are undefined.
     """
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
@@ -333,7 +333,7 @@ def reverse(
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[TapeStretch, AdjointCarry], None] | None = None,
 ) -> tuple[Cotangents, list[Crossings]]:
-    """Compute the derivatives of the loss of a recorded run with respect to all inputs of the run.
+    """Compute derivatives of the loss of a recorded run with respect to all inputs of the run.
 
     Args:
         wanted: derivatives to compute beyond the start: MODEL, SCALE, FORCE (the integrator's numbers),
@@ -343,7 +343,7 @@ def reverse(
         watch: called with every stretch, last first, and the cotangents carried at its steps.
 
     Returns:
-        The derivatives, and the crossings of every stretch with their weights, last stretch first.
+        The derivatives, and the crossings of every stretch of steps with their weights, last stretch first.
 
     Raises:
         InputError: saltation was requested for a many-body potential that makes its own decisions.
@@ -364,12 +364,12 @@ def reverse(
 
 
 class StretchReversal:
-    """State of a reverse pass through a recorded run, from its last step to its first; see `reverse`.
+    """State of a reverse pass, which goes through a recorded run from last to first step; see `reverse`.
 
     Attributes:
-        carry: the carried cotangents, atoms in the user's order. guard: radial speed of grazing flips; None
-            if flips are not included.
-        met: the crossings of the stretch that was transposed last.
+        carry: the cotangents at the current step, atoms in the user's order. guard: radial speed below which
+            flips are grazing; None if the contribution of flips is not included.
+        met: the crossings of the stretch of steps that was transposed last.
     """
 
     def __init__(self, tape: RunTape, wanted: frozenset[str], guard: float | None):
@@ -402,7 +402,7 @@ class StretchReversal:
         )
 
     def arguments(self, stretch: TapeStretch) -> tuple[Any, ...]:
-        """Return the arguments of `transposed` for a stretch of steps, from the state of the reverse pass."""
+        """Return the arguments of the function `transposed` for a stretch of steps."""
         simulation, order = self.tape.simulation, stretch.table.order
         self.met = None if self.guard is None else crossings(simulation, stretch, self.guard)
         tape, tables = self.tape, simulation.tables(stretch.table)
@@ -414,12 +414,12 @@ class StretchReversal:
         )  # fmt: skip
 
     def through(self, stretch: TapeStretch) -> tuple[Float[np.ndarray, "room most"], AdjointCarry]:
-        """Transpose a stretch of steps; return the weights of its crossings and each step's cotangents."""
+        """Propagate cotangents through a stretch; return the weights of its crossings and all cotangents."""
         self.carry, (weights, trace) = transposed(*self.arguments(stretch))
         return np.asarray(weights), trace
 
     def cotangents(self) -> Cotangents:
-        """Return the derivatives of the loss, after the reverse pass has reached the start of the run."""
+        """Return the derivatives of the loss, once the reverse pass has reached the start of the run."""
         simulation, carry, start = self.tape.simulation, self.carry, self.tape.start.state
         through = carry.integrator, carry.x, carry.v
         if jax.tree.leaves(carry.extra):
@@ -448,12 +448,12 @@ def transposed(
     carry: AdjointCarry,
     wanted: frozenset[str],
 ):
-    """Transpose a stretch of steps; return the cotangents before it, its crossings' weights, and its trace.
+    """Propagate cotangents backward through a stretch of steps with one neighbor list.
 
-    The part of a step between two force evaluations is transposed by JAX, with respect to positions,
-    velocities, extra state, forces, virial and box. For a linear `KickDrift` integrator this derivative does
-    not depend on the forces, so the recorded rows need not contain forces; `pull_back` computes them for the
-    derivatives by the integrator's numbers.
+    Returns the cotangents before the stretch, the weights of its crossings, and the cotangents of every step.
+    JAX transposes the part of a step between two force evaluations. For a linear `KickDrift` integrator this
+    derivative does not depend on the forces, so the recorded steps need not contain forces; `pull_back`
+    computes forces that derivatives with respect to the integrator's parameters need.
     """
     loss, origin, around, onto_total, pace = looking
     order, moves = tables.order, integrator.moves_cell
@@ -476,7 +476,7 @@ def transposed(
         return end.x, end.kicked, ahead, end.cell.matrix, end.v
 
     def look(row):
-        """Return the cotangents of one frame and of the origin, given the cotangents of the loss's sums."""
+        """Return the cotangents of one frame and of the first frame, from those of the loss's sums."""
 
         def seen_at(x, v, potential, virial, origin, timestep, *box):
             here = (in_box(around, *box) if box else around)._replace(timestep=timestep)

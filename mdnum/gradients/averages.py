@@ -1,10 +1,10 @@
-"""Derivatives of averages over states, from one run that is not differentiated.
+"""Derivatives of averages over states, from the frames of one run; the dynamics are not differentiated.
 
-An average over states does not depend on the time order of the frames. The derivative of an average by a
-parameter has up to three contributions. First, the term of each frame changes at fixed positions. Second, a
-term that jumps when a pair enters changes with the cutoff radius by the jump times the density of pairs
-there; derivatives at fixed decisions lack this change. Third, under a thermostat, the weight exp(-U/kT) of
-each frame changes.
+The derivative of an average with respect to a parameter has up to three contributions. First, the observable
+in each frame changes at fixed positions. Second, if the observable jumps when a pair enters the cutoff, it
+changes with the cutoff radius by the jump times the density of pairs at the cutoff. Derivatives at fixed
+decisions lack this contribution. Third, with a thermostat, the statistical weight exp(-U/kT) of each frame
+changes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ WIDTHS = 5
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames that a loss uses, each treated independently."""
+    """Frames of a run that a loss uses: terms of the loss, energies, and derivatives of each frame."""
 
     step: Int[np.ndarray, "frames"]  # of each
     x: Float[np.ndarray, "frames 3 atoms"]  # wrapped positions, user's order, length
@@ -57,12 +57,12 @@ class Frames:
 
 
 def known(name: str) -> bool:
-    """Return whether a frame's term or energy depends on the named parameter at fixed positions."""
+    """Return whether loss or energy of a single frame, at fixed positions, can depend on the parameter."""
     return name.startswith(("potential.", "cutoff.")) or name == "box.scale"
 
 
 def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], None] | None = None) -> Frames:
-    """Evaluate the loss of a recorded run in each frame, with derivatives by the named parameters.
+    """Evaluate the loss in each frame of a recorded run, with derivatives with respect to parameters.
 
     Args:
         tape: the run, of a pair potential.
@@ -154,7 +154,7 @@ def _look(forces: tuple[PairForce, PairForce], tables, rows, bits, seen, looking
 
 
 def standard_error(series: Float[np.ndarray, "frames"]) -> float:
-    """Return the standard error of the mean of a correlated series, the largest over a few numbers of blocks.
+    """Return the standard error of the mean of a correlated series: the largest for 8, 16 and 32 blocks.
 
     Source: H. Flyvbjerg, H. G. Petersen, J. Chem. Phys. 91, 461 (1989).
     """
@@ -170,7 +170,7 @@ def standard_error(series: Float[np.ndarray, "frames"]) -> float:
 
 @dataclass(frozen=True)
 class Density:
-    """Number of pairs per length at the cutoff; each frame has its own weight."""
+    """Weighted number of pairs per length at the cutoff distance, with its error."""
 
     # each frame's share of the estimate that was chosen, shape (frames, types)
     frames: Float[np.ndarray, "frames types"]
@@ -184,7 +184,7 @@ class Density:
 def distances(
     simulation: Simulation, x: Float[np.ndarray, "3 atoms"], reach: float
 ) -> list[Float[np.ndarray, "pairs"]]:
-    """Return distance minus cutoff of all pairs within `reach` of their cutoff, one array per pair type.
+    """Return r - r_cut of all pairs with |r - r_cut| < reach, in one array per pair type.
 
     Args:
         x: wrapped positions.
@@ -206,12 +206,12 @@ def density(
     reach: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> Density:
-    """Sum, over all frames, a weight times the density of pairs at the cutoff, delta(r_cut - r_ij).
+    """Estimate the weighted sum over frames of the pair density at the cutoff, delta(r_cut - r_ij).
 
-    The delta function is replaced by a parabola of finite width. The bias is even in the width; extrapolation
-    from three widths, each half of the previous one, removes the second and fourth orders. The result comes
-    from the widest three kernels whose estimate differs from that of no narrower three by more than twice the
-    standard error of the difference.
+    The delta function is replaced by a parabolic kernel of finite width. The bias is even in the width;
+    extrapolation from three widths, each half of the previous width, removes the second and fourth orders.
+    The result is from the widest three kernels that agree with all narrower sets of three kernels within
+    twice the standard error of the difference.
 
     Args:
         weights: one per frame and pair type. reach: the largest width, length.
@@ -249,7 +249,7 @@ def density(
 
 @dataclass(frozen=True)
 class BoundaryTerm(Method):
-    """The derivative of an average over given states, with a term for pairs that cross the cutoff."""
+    """Gradient method: derivative of an average over given states, including pairs that cross the cutoff."""
 
     # half the width of the widest kernel as a share of the cutoff; less where the box is narrow
     reach: float = 0.1
@@ -285,7 +285,7 @@ class BoundaryTerm(Method):
         return self.result(tape.value, gradient, details={"frames": len(seen), **details})
 
     def terms(self, simulation: Simulation, seen: Frames, names: Sequence[str], progress=None):
-        """Return each frame's contribution to the derivatives, by parameter name, and further details."""
+        """Return the contribution of each frame to each derivative, and details such as errors."""
         energy, force = simulation.jumps()
         radii = np.asarray(simulation.decider.r_cut)
         # what a pair that enters adds to the loss of each frame
@@ -317,14 +317,14 @@ class BoundaryTerm(Method):
 
 @dataclass(frozen=True)
 class Reweighting(Method):
-    """Differentiable trajectory reweighting: the explicit derivative plus the response of the weights.
+    """Gradient method: differentiable trajectory reweighting, for averages over a canonical ensemble.
 
-    The explicit part is that of `BoundaryTerm`; the response is minus the covariance of the loss's terms with
-    the derivative of the energy, divided by kT.
+    The derivative is the sum of the explicit derivative (see `BoundaryTerm`) and of the response of the
+    weights, which is minus the covariance of the loss and the derivative of the energy, divided by kT.
 
-    Error: statistical; `details` holds a standard error from block averages. With few correlated frames the
-    error is large; its estimate covers only the variation within this run. Source: S. Thaler, J. Zavadlav,
-    Nature Communications 12, 6884 (2021).
+    Error: statistical; `details` contains a standard error from block averages. With few independent frames
+    the error is large, and its estimate covers only the variation within this run. Source: S. Thaler, J.
+    Zavadlav, Nature Communications 12, 6884 (2021).
     """
 
     at_states: BoundaryTerm = field(default_factory=BoundaryTerm)  # the explicit part
@@ -378,7 +378,7 @@ class Reweighting(Method):
 
 
 def _score(simulation: Simulation, seen: Frames, name: str) -> Float[np.ndarray, "frames *types"]:
-    """Return the derivative of the logarithm of each frame's weight by the named parameter."""
+    """Return d ln(weight)/d(parameter) for each frame, where the weight is that of a canonical ensemble."""
     bath = simulation.integrator
     kT = float(getattr(bath, bath.keys()["temperature"].name))
     if name == "dynamics.temperature":

@@ -1,11 +1,11 @@
-"""Derivatives of a ball's rollout: a program with decisions has several derivatives, one for each method.
+"""Gradient methods for a simulated ball. A program with decisions has a different derivative per method.
 
-The methods here differentiate the operations that ran (unrolled), the program with every decision pinned
-(frozen), or the loss averaged over random parameters (randomized). Methods that change the contact are in
-`ball_contacts`.
+The methods in this module differentiate the operations that ran (unrolled), the program with all decisions
+fixed (frozen), or the loss averaged over random parameters (randomized). Methods that replace the contact by
+another model are in `ball_contacts`.
 
-JAX has no `requires_grad`: the derivative is 0.0 both for a parameter that the run never used and for one
-whose derivative underflowed or was clamped to zero. `dependence` distinguishes the two cases.
+JAX returns a derivative of 0.0 both if the run did not use a parameter and if the derivative underflowed or
+was clamped to zero. The function `dependence` distinguishes the two cases.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from mdnum.registry import Registry
 
 
 class Use(NamedTuple):
-    """Whether the run used a parameter to compute the loss, with a description in words."""
+    """Whether the run used a parameter to compute the loss, with an explanation."""
 
     depends: bool
     note: str
 
 
 class BallMethod(Method):
-    """Base class of methods that differentiate a ball's rollout: a `Method` called with a `BallProblem`.
+    """Base class of gradient methods for a ball, which are called with a `BallProblem`.
 
-    The parameters y0 and v0 shift all balls of a batch together.
+    The parameters y0 and v0 (height and velocity at the start) shift all balls of a batch together.
     """
 
     def known(self, problem: BallProblem, names: Sequence[str]) -> tuple[str, ...]:
-        """Check that the parameters exist, and return their names unchanged."""
+        """Return the names of parameters unchanged; raise an error for an unknown name."""
         problem.values(names)
         return tuple(names)
 
     def of(
         self, value: float, slopes: dict[str, float], use: dict[str, Use], details: dict[str, Any]
     ) -> Gradient:
-        """Create a `Gradient` from derivatives and notes on which parameters the run used."""
+        """Create a `Gradient` from derivatives, details, and notes on whether the run used each parameter."""
         gradient = {name: np.asarray(slope, np.float64) for name, slope in slopes.items()}
         made = self.result(value, gradient, {name: one.note for name, one in use.items()}, details)
         return replace(made, depends={name: one.depends for name, one in use.items()})
@@ -69,7 +69,7 @@ for _name, _class in {
 
 @result
 class BallGradients:
-    """Derivatives of one problem by several methods."""
+    """Derivatives of one loss by several methods, and reasons why other methods do not apply."""
 
     gradients: tuple[Gradient, ...]  # of the methods that apply, in the order asked for
     refused: Mapping[str, str]  # why another does not, by its name
@@ -105,7 +105,7 @@ def compare(
 
 
 class Dependence(NamedTuple):
-    """Whether any path of operations leads from a parameter to the loss, and whether such a path ran."""
+    """Whether a path of operations leads from a parameter to the loss, and whether it was executed."""
 
     written: bool
     used: bool
@@ -117,10 +117,10 @@ def dependence(
     names: Sequence[str] | None = None,
     rest: tuple[Any, ...] = (),
 ) -> dict[str, Dependence]:
-    """Determine whether a scalar loss depends on its parameters, in the branches and iterations that ran.
+    """Determine whether a scalar loss depends on each parameter, in the branches and iterations that ran.
 
-    The test sets the tangent of a parameter to NaN, which propagates through every operation that carries a
-    derivative, whatever the factor, and through no other operation.
+    The test sets the tangent of a parameter to NaN. The NaN propagates through every operation that has a
+    derivative, even a derivative of zero, and through no other operation.
 
     Args:
         function: maps a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as
@@ -157,7 +157,7 @@ def _used(function: Any, values: dict[str, jax.Array], rest: tuple, names: tuple
 
 
 def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str) -> bool:
-    """Return whether the traced derivative contains the tangent in any branch or iteration."""
+    """Return whether any branch or loop of the program uses the parameter, even one that did not run."""
 
     def slope(tangent):
         return jax.jvp(lambda q: function(values | {name: q}, *rest), (values[name],), (tangent,))[1]
@@ -167,8 +167,8 @@ def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str
 
 
 def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
-    """Replace the custom derivative rule of `stopping.elementwise` by its loops: zeros in the Jacobian of the
-    rule would not distinguish a loop with zero slope from a loop that did not run.
+    """Return the program with loops in place of the custom derivative rule of `stopping.elementwise`. A zero
+    in the Jacobian of this rule would not show whether a loop has zero slope or did not run.
     """
 
     def run(*inputs):
@@ -197,7 +197,7 @@ def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 class _Rollout(eqx.Module):
-    """Loss after a given number of steps; functions of equal problems are equal and compiled once."""
+    """Loss after a given number of steps, as a function that is compiled only once for equal problems."""
 
     steps: int = eqx.field(static=True)
     loss: BallLoss
@@ -253,7 +253,7 @@ def _note(name: str, found: Dependence, slope: float, problem: BallProblem, run:
 
 @dataclass(frozen=True)
 class ThroughIterations(BallMethod):
-    """The derivative of the operations that ran, iteration by iteration."""
+    """Gradient method: derivative of the operations that ran, including all iterations of the solver."""
 
     # the reverse pass starts with it instead of 1 (`mdnum.numerics.formats`); a power of two
     loss_scale: float = 1.0
@@ -264,12 +264,12 @@ class ThroughIterations(BallMethod):
     )
 
     def __call__(self, problem: BallProblem, names: Sequence[str], run: BallRun | None = None) -> Gradient:
-        """Compute the derivative by reverse mode.
+        """Compute the derivatives by reverse-mode differentiation.
 
         Args:
             run: a run of this problem, if there already is one.
 
-        Error: rounding of the reverse pass in the dtypes of the policy.
+        Error: rounding errors of the reverse pass in the precision of the run.
         """
         names = self.check(problem, names)
         run = problem.run(keep=False) if run is None else run
@@ -280,10 +280,10 @@ class ThroughIterations(BallMethod):
 
 @dataclass(frozen=True)
 class Frozen(BallMethod):
-    """The derivative of the program whose decisions and iteration counts are those of a recorded run.
+    """Gradient method: derivative of the program with decisions and iteration counts fixed to a recorded run.
 
-    The pinned program has no branches, so its finite differences exist; in float64 they are computed as a
-    check.
+    The program with fixed decisions has no branches, so finite differences converge; in float64 they are
+    computed as a check.
     """
 
     name = "frozen"
@@ -292,9 +292,9 @@ class Frozen(BallMethod):
     )
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """Compute the derivative by reverse mode, and central differences of the pinned program as a check.
+        """Compute derivatives by reverse mode, and central differences at fixed decisions as a check.
 
-        Error: rounding for the derivative; about u^(2/3), relative, for the finite differences.
+        Error: rounding errors for the derivative; relative error of about u^(2/3) for finite differences.
         """
         run = problem.run(keep=False)
         decisions = jax.tree.map(jnp.asarray, run.decisions())
@@ -311,18 +311,18 @@ class Frozen(BallMethod):
 
 
 def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
-    """Return the largest magnitude of each parameter, or 1 for a parameter that is 0."""
+    """Return the largest magnitude among the entries of each parameter; 1 if all entries are 0."""
     at = problem.values(names)
     return {name: float(np.max(np.abs(np.asarray(value, np.float64)))) or 1.0 for name, value in at.items()}
 
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(BallMethod):
-    """The derivative of E[loss(parameters + width * noise)], estimated from loss values alone.
+    """Gradient method: derivative of E[loss(parameters + width * noise)], estimated from values of the loss.
 
-    The estimate includes the effect of jumps (of iteration counts and contacts) and is the derivative of a
-    smoother loss; the same seed gives the same bits. Each noise sample is paired with its mirror image, so
-    that the loss itself does not add to the variance.
+    The estimate includes the effect of jumps (changes of iteration counts and contacts). Each noise sample is
+    used with both signs, so that a constant in the loss does not add to the variance. The same seed gives the
+    same result, bit for bit.
     """
 
     # standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0)
@@ -338,12 +338,12 @@ class RandomizedSmoothing(BallMethod):
     )
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """Estimate the derivative; `details` holds its standard error for each name.
+        """Estimate the derivatives; `details` contains the standard error of each derivative.
 
         Raises:
-            InputError: width or samples are out of range.
+            InputError: the width is not positive, or fewer than two samples were requested.
 
-        Error: the standard error, plus a bias of order width² from the averaging.
+        Error: the standard error, plus a bias of order width² due to the average over noise.
 
         Source: Nesterov and Spokoiny (2017), with antithetic samples.
         """

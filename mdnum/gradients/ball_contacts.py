@@ -1,4 +1,4 @@
-"""Derivatives of a ball's motion, with contacts treated by a fixed point, a soft floor, or as true motion."""
+"""Gradient methods for a ball that treat a contact as a fixed point, a soft floor, or an exact impact."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ _NARROW = 1e-6
 
 
 def _moving(x: Any) -> Any:
-    """Return a zero that has the derivative of x and can be added to a value to give it this derivative."""
+    """Return x minus its constant value: a zero whose derivative is that of x."""
     return x - lax.stop_gradient(x)
 
 
 class FixedPointRule(eqx.Module):
-    """Rule that gives the result of a projection the derivative of the fixed point that it approximates.
+    """Derivative rule for the contact projection: the derivative of the fixed point of its iteration.
 
-    For a ball in contact the fixed point of y ← y + gain max(0, -y) that is reached from below is y = 0. This
-    point lies on the kink of max(0, -y), where dG/dy has two values: the value from below is used, because
-    the ball comes from there (a choice of branch, like the active set of a complementarity problem). By the
-    implicit function theorem (1 - dG/dy) dy = dG/dgain dgain, for each ball: gain dy = -y dgain.
+    For a ball in contact, the iteration y ← G(y) = y + gain max(0, -y) approaches the fixed point y = 0 from
+    below. At y = 0, dG/dy is discontinuous. The value for y < 0 is used, because the iteration comes from
+    there (like the active set of a complementarity problem). The implicit function theorem, (1 - dG/dy) dy =
+    dG/dgain dgain, gives gain dy = -y dgain for each ball.
     """
 
     # added to 1 - dG/dy; moves the answer by about regularization / gain, relative
@@ -58,7 +58,7 @@ class FixedPointRule(eqx.Module):
     def attach(
         self, y: Float[Array, "balls"], gain: Float[Array, "balls"], contact: Bool[Array, "balls"]
     ) -> Float[Array, "balls"]:
-        """Return the heights y unchanged, with the derivative of the fixed point.
+        """Return the heights y unchanged, but with the derivative of the fixed point.
 
         Args:
             y: heights where the iteration stopped.
@@ -71,7 +71,7 @@ class FixedPointRule(eqx.Module):
 
 
 class _Settled(eqx.Module):
-    """Rule that puts every ball in contact at the fixed point of its iteration."""
+    """Rule that moves every ball in contact to the fixed point of its iteration, the floor."""
 
     def attach(self, y, gain, contact):
         """Return the fixed point: 0 for balls in contact below the floor, otherwise y."""
@@ -80,10 +80,10 @@ class _Settled(eqx.Module):
 
 @dataclass(frozen=True)
 class Implicit(BallMethod):
-    """The derivative of the projection's fixed point, by the implicit function theorem.
+    """Gradient method: derivative of the fixed point of the projection, by the implicit function theorem.
 
-    The loss uses the iterations that ran; the derivative uses the limit of the iterations, the floor for any
-    gain. The method `unrolled` gives a nonzero derivative by k, which is an artifact of the tolerance.
+    The loss uses the iterations that ran. The derivative uses their limit, the floor, independent of k. The
+    method `unrolled` gives a nonzero derivative with respect to k, an artifact of the solver's tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
@@ -101,7 +101,7 @@ class Implicit(BallMethod):
         Raises:
             InputError: the contact is not solved by iteration, or 1 - dG/dy is too ill conditioned.
 
-        Error: rounding times the condition number of 1 - dG/dy, plus the change caused by regularization.
+        Error: rounding error times the condition number of 1 - dG/dy, plus the effect of regularization.
         """
         contact = problem.world.contact
         if not isinstance(contact, Projection):
@@ -139,12 +139,12 @@ def _with_contact(problem: BallProblem, contact: Any) -> BallProblem:
 
 
 class SoftImpact(eqx.Module):
-    """An impact without a decision: a soft spring that pushes harder on the way in than on the way out.
+    """Smooth model of an impact: a soft spring that is stiffer while the ball falls than while it rises.
 
-    The spring has stiffness k while the ball falls and restitution² k while it rises, with smooth transitions
-    between the two and at the floor, so that the ball leaves with restitution times its speed.
+    The stiffness is k while the ball falls and restitution² k while it rises, with smooth transitions between
+    the two values and at the floor. The ball therefore leaves with restitution times its impact speed.
 
-    Source: the latching spring of Walton and Braun (1986), smoothed.
+    Source: latching spring of Walton and Braun (1986), here with smooth transitions.
     """
 
     restitution: Any  # speed after over speed before, in the limit of small widths
@@ -159,7 +159,7 @@ class SoftImpact(eqx.Module):
         return free + self.k * depth * (share + (1 - share) * jax.nn.sigmoid(-v / self.slow))
 
     def move(self, motion: Motion) -> Moved:
-        """Integrate one step under the force of the spring; the contact decision is only recorded."""
+        """Integrate one step with the force of the spring; the contact decision is recorded but not used."""
 
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, motion.rounding)
@@ -170,7 +170,7 @@ class SoftImpact(eqx.Module):
 
 @dataclass(frozen=True)
 class SoftFloor(BallMethod):
-    """The derivative of a program with a soft floor: softplus contact, softened restitution."""
+    """Gradient method: derivative of another program, whose floor is soft (see `softened`)."""
 
     # width, m. Small: near the given program, with derivatives that peak at its contacts. Large: a tame
     # derivative, of something else. None for one that suits the problem: a tenth of the depth to which a
@@ -184,13 +184,13 @@ class SoftFloor(BallMethod):
     )
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """Compute derivative and loss of the smooth program by reverse mode.
+        """Compute the loss of the smooth program and its derivatives by reverse mode.
 
         Raises:
             InputError: eps is not positive, or the smooth program does not have the parameter.
 
-        Error: rounding; relative to the given program, also a bias that shrinks with eps only if this program
-        has a derivative.
+        Error: rounding error for the smooth program. Compared with the given program there is a bias, which
+        decreases with eps only if the given program has a derivative.
         """
         eps = _suitable(problem) if self.eps is None else self.eps
         if not eps > 0:
@@ -210,10 +210,10 @@ class SoftFloor(BallMethod):
 
 
 def softened(problem: BallProblem, eps: float) -> BallProblem:
-    """Return the problem with a soft floor: a softplus penalty, or a spring of depth about eps for an impact.
+    """Return the problem with a soft floor: a softplus penalty, or for impacts a spring of depth about eps.
 
     Raises:
-        InputError: the ball would cross the floor of width eps in too few steps.
+        InputError: the ball would cross the soft floor of width eps in too few steps.
     """
     world = problem.world
     contact, dtype = world.contact, world.policy.dtype("arithmetic")
@@ -256,13 +256,13 @@ def _suitable(problem: BallProblem) -> float:
 
 @dataclass(frozen=True)
 class ThroughContacts(BallMethod):
-    """The derivative of the ball's true motion, contacts included, rather than of the discrete steps.
+    """Gradient method: derivative of the ball's motion in continuous time, including the times of contacts.
 
-    Contact is decided at the end of a step, so the derivative of the steps does not contain the later arrival
-    of a ball that starts higher. This method uses the saltation matrix of every contact. If impacts are
-    located inside the step, the program's own derivative already contains this matrix. A projection is
-    treated as the impact that it approximates. The force of a spring without a damper does not jump: for such
-    a spring the result equals the unrolled derivative, and the description of the gradient says so.
+    Contact is decided at the end of a step. The derivative of the discrete steps therefore lacks the effect
+    that a ball that starts higher arrives later. This method adds the saltation matrix of every contact. If
+    impacts are located within a step, the program's own derivative already contains this matrix. A projection
+    is treated like the impact that it approximates. The force of a spring without a damper does not jump; for
+    such a spring the result equals that of the method `unrolled`.
     """
 
     name = "event-aware"
@@ -275,8 +275,8 @@ class ThroughContacts(BallMethod):
         Raises:
             NumericalError: a contact grazes the floor, so that its time has no derivative.
 
-        Error: only rounding if impacts are located inside the step; otherwise of the order of the time step,
-        like the error of the rollout itself.
+        Error: only rounding errors if impacts are located within a step; otherwise of the order of the time
+        step, like the error of the simulation itself.
         """
         world = problem.world
         located = isinstance(world.integrator, EventLocated)
@@ -310,10 +310,10 @@ class ThroughContacts(BallMethod):
 
 
 class _SaltatingReset:
-    """A contact that resets the velocity at the end of a step and has the derivative of the true motion."""
+    """Contact that resets the velocity at the end of a step, with the derivative of continuous motion."""
 
     def move(self, motion: Motion) -> Moved:
-        """Compute one step with a contact; its derivative uses only the flight and the saltation matrix."""
+        """Compute one step with a contact; its derivative is that of the flight and of the saltation."""
         made = super().move(motion)  # type: ignore[misc]
         height, v = motion.integrator.fly(motion.y, motion.v, motion.free, motion.rounding)
         arrived, nothing, bounce = lax.stop_gradient(v), jnp.zeros_like(v), self.restitution.astype(v.dtype)  # type: ignore[attr-defined]
@@ -343,7 +343,7 @@ class _SaltatingProjection(_SaltatingReset, Projection):
 
 class _SaltatingPenalty(Penalty):
     def move(self, motion: Motion) -> Moved:
-        """Compute one step with a spring; the force of a damper jumps by -damping v, so tangents change."""
+        """Compute one step with a spring whose damper force jumps by -damping v at contact (saltation)."""
         contact = super().move(motion).record.contact
         y, v = lax.stop_gradient((motion.y, motion.v))
         jump = jnp.where(contact, -1.0, 1.0).astype(v.dtype) * lax.stop_gradient(self.damping) * v
@@ -365,7 +365,7 @@ def _normal(v):
 
 
 def _events(problem: BallProblem, run: BallRun) -> tuple[int, int]:
-    """Count the contacts of a run, and the grazing contacts among them."""
+    """Return the number of contact events of a run, and the number of grazing events among them."""
     world, contact = problem.world, run.contact
     free = jax.vmap(lambda step: world.free(step, contact.shape[1:]))(jnp.arange(run.steps))
     free, v = np.asarray(free, np.float64), run.v[:-1].astype(np.float64)

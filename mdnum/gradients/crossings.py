@@ -1,10 +1,10 @@
-"""Contributions of flips to a gradient, through the times at which pairs cross their cutoff.
+"""Contributions of flips to a gradient through the times at which pairs cross their cutoff (saltation).
 
-If the force jumps at the cutoff, a perturbed pair crosses earlier or later, and its momentum differs from
-then on. Derivatives of a program's steps miss this effect, and their error does not shrink with the time
-step. The contribution is the saltation term of mdnum.numerics, with the cutoff sphere as the threshold, in
-the form for a reverse pass. A loss that uses the potential energy or the virial also jumps at a crossing: if
-its frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
+A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the momentum of the
+pair differs after the crossing. Derivatives of a program's steps lack this effect, however short the time
+step is. The contribution is the saltation term of mdnum.numerics, with the cutoff sphere as threshold, in
+reverse mode. A loss that contains the potential energy or the virial also jumps at a crossing: if its frames
+are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
 
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
 dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.
@@ -36,7 +36,7 @@ _ROOM_BITS = 6
 
 
 class Met(NamedTuple):
-    """Crossings of one step or of all steps in sequence, padded to a fixed size for a compiled program."""
+    """Cutoff crossings of one step, or of all steps in sequence, padded to a fixed size for compilation."""
 
     # i, j: sorted atoms; beyond the last one where there is no crossing
     i: Int[Array, "most"]
@@ -52,14 +52,14 @@ class Met(NamedTuple):
 
 
 class MetRows(NamedTuple):
-    """The crossings of a stretch of steps, in the padded form that a compiled program needs."""
+    """Cutoff crossings of a stretch of steps, padded to a fixed size for compilation."""
 
     met: Met  # of all rows
     spans: Int[np.ndarray, "room 2"]  # where each row begins, and how many crossings it has
     slots: Int[np.ndarray, "most"]  # numbers from 0, as many as the row with the most has, or a few more
 
     def row(self, span: Int[Array, "2"], atoms: int) -> Met:
-        """Return the crossings of one row, given the row's first crossing and number of crossings."""
+        """Return the crossings of one step, given the index of the first crossing and their number."""
         most = len(self.slots)
         own = Met(*(lax.dynamic_slice_in_dim(column, span[0], most, -1) for column in self.met))
         # behind them are those of the next row
@@ -70,7 +70,7 @@ class MetRows(NamedTuple):
 
 @dataclass(frozen=True)
 class Crossings:
-    """The flips of one stretch of steps, as events with a time."""
+    """The flips of one stretch of steps as crossings of the cutoff, with normals, radial speeds and jumps."""
 
     ledger: FlipTable  # the flips
     row: Int[np.ndarray, "crossings"]  # row of each in its stretch, ascending
@@ -97,18 +97,18 @@ class Crossings:
 
     @property
     def kick(self) -> Float[np.ndarray, "crossings"]:
-        """Change of the momentum along the pair per change of its distance at the crossing, energy/length per
-        (length/time): the saltation of (distance, momentum) with the cutoff as threshold.
+        """Change of a pair's radial momentum per change of its distance at the crossing, energy/length per
+        (length/time): force jump over radial speed, the saltation at the cutoff.
         """
         return self.force / self.speed
 
     def spans(self, room: int) -> Int[np.ndarray, "room 2"]:
-        """Return the index of the first crossing of each row, and the number of its crossings."""
+        """Return, for each of `room` steps, the index of the first crossing and the number of crossings."""
         starts = np.searchsorted(self.row, np.arange(room + 1))
         return np.stack([starts[:-1], np.diff(starts)], axis=1)
 
     def rows(self, room: int) -> MetRows:
-        """Return the crossings of `room` rows in the padded form for a compiled program."""
+        """Return the crossings of `room` steps, padded to a fixed size for compilation."""
         spans = self.spans(room)
         most = _padded(int(spans[:, 1].max(initial=0)))
         # a slice of so many fits everywhere
@@ -128,16 +128,16 @@ class Crossings:
         return MetRows(Met(*map(padded, columns)), spans, np.arange(most))
 
     def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
-        """Return the values of padded rows without the padding, one entry per crossing."""
+        """Return values without the padding of each step, one entry per crossing."""
         return values[np.arange(values.shape[1]) < self.spans(len(values))[:, 1:]]
 
     def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
-        """Return the crossings with the weights that the reverse pass computed."""
+        """Return the crossings with their weights, as computed by the reverse pass."""
         return replace(self, weight=self.gathered(weights))
 
 
 def _padded(count: int) -> int:
-    """Return a power of four that is at least the count, so that few sizes are compiled."""
+    """Round a count up to a power of four, so that programs are compiled for few array sizes."""
     bits = max(_ROOM_BITS, count.bit_length())
     return 1 << (bits + bits % 2)
 
@@ -153,13 +153,12 @@ def onto_crossings(
     pull: Float[Array, "most"] | None = None,
     squeeze: Float[Array, "*axes"] | None = None,
 ) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"], Float[Array, "3 3"]]:
-    """Transpose the saltation of one step's crossings.
+    """Propagate cotangents backward through the crossings (saltation) of one step.
 
-    A crossing lies between two steps, on average in their middle, where positions are half a drift before
-    those of the later step. Let n be the unit vector from i to j, f the force jump and s = n · (v_j - v_i) +
-    n · (dh/dt h^-1) r the radial speed, including the motion of the box. If the distance there is longer by
-    dr (n · (dx_j - dx_i), less the change of the lattice vectors between the two), the jump acts for a time
-    that differs by dr/s:
+    A crossing lies between two steps, on average at half of the drift between them. Let n be the unit vector
+    from i to j, f the force jump and s = n · (v_j - v_i) + n · (dh/dt h^-1) r the radial speed, including the
+    motion of the box. A perturbation of the distance at the crossing by dr = n · (dx_j - dx_i), minus the
+    change of the lattice vectors between the images, changes the time for which the jump acts by dr/s:
 
         d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
         d(W) = (f r_cut n ⊗ n) dr/s        on the integrator's use of the virial tensor W
@@ -208,10 +207,11 @@ def of_energy(
     onto: tuple[Float[Array, "3 atoms"], Float[Array, ""], Float[Array, ""]],
     squeeze: Float[Array, "*axes"] | None = None,
 ) -> Float[Array, "most"]:
-    """Compute cotangents of the distances at which an energy gains or loses a pair: E(with) - E(without).
+    """Compute cotangents of crossing distances for an energy function, with jumps E(with pair) - E(without).
 
-    Besides the pair, all atoms whose energy includes the pair are affected. The pair is placed at its cutoff;
-    other pairs that cross in the same step are taken as at the end of the step.
+    The jump affects all atoms whose energy depends on the pair. The jump is evaluated with the pair at its
+    cutoff distance. For other pairs that cross in the same step, the decisions at the end of the step are
+    used.
 
     Args:
         met: crossings whose `push` is one over the radial speed, negative where the pair leaves.
@@ -251,8 +251,8 @@ def of_energy(
 def _along(
     met: Met, vectors: Float[Array, "3 atoms"], matrix: Float[Array, "3 3"] | None = None
 ) -> Float[Array, "most"]:
-    """Return the component, along each pair, of the difference of a vector between the two atoms; with
-    lattice vectors, the difference is that of nearest images.
+    """Return the difference of a vector between the two atoms of each pair, projected on the direction of the
+    pair; if `matrix` contains lattice vectors, nearest images are used.
     """
     dtype = vectors.dtype
     there = vectors.at[:, met.j].get(mode="fill", fill_value=0)
@@ -272,7 +272,7 @@ def push_through(
     r_cut: Float[Array, "types"],
     matrix: Float[Array, "3 3"],
 ) -> tuple[Float[Array, "most"], tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]], Float[Array, "2"]]:
-    """Apply the saltation of one step's crossings to one tangent.
+    """Propagate one tangent forward through the crossings (saltation) of one step.
 
     Args:
         met: the crossings between the previous step and this one.
@@ -296,7 +296,7 @@ def push_through(
 
 
 def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Crossings:
-    """Return the flips of a stretch of steps as events, with their normals and radial speeds.
+    """Return the flips of a stretch of steps as crossings, with their normals and radial speeds.
 
     Args:
         stretch: recorded with its flips.
@@ -319,13 +319,13 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
     atoms = stretch.x.shape[2]
 
     def positions(rows: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return the positions of given atoms in given rows; row -1 is the step before the first row."""
+        """Return the positions of atoms at given rows (steps); row -1 is the step before the first row."""
         axes = [of + k * atoms for k in range(3)]
         seen = [x.take(3 * atoms * rows + at, mode="clip") for at in axes]
         return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)
 
     def apart(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return minimum-image displacements of pairs, and lattice vectors to the wrapped displacements."""
+        """Return minimum-image displacements of pairs, and their differences from wrapped displacements."""
         start, end = positions(rows, i).astype(np.float64), positions(rows, j).astype(np.float64)
         inverse = inverses[rows + 1]
         if stretch.cell.size:

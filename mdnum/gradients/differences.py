@@ -1,11 +1,11 @@
-"""Gradients from many runs: differences that estimate their own error, and means over replicas.
+"""Gradient methods that use many runs: finite differences with error estimates, and means over replicas.
 
-A replica is the same system with different velocities, and with different noise under a thermostat. Each
-replica is a run with its own neighbor lists, so replicas run one after another on the available devices.
+A replica is the same system with different initial velocities and, with a thermostat, different noise.
+Replicas have different neighbor lists and are therefore run one after another on each device.
 
-When a parameter changes, crossings move from one step to the next. If the force jumps, the loss jumps at each
-such move, and between two moves it follows the derivative of its steps. The event-aware gradient predicts the
-slope over many jumps of the loss, so a finite difference for comparison must span many jumps.
+When a parameter changes, cutoff crossings move to other steps. If the force jumps, the loss jumps at each
+such parameter value; between these values its slope is the derivative of the steps. The event-aware gradient
+is the slope over many jumps. A finite difference for comparison must therefore span many jumps.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _TRIES = 4
 
 
 class Differentiated(NamedTuple):
-    """A derivative computed from function values."""
+    """A derivative computed from function values, with an estimate of its error."""
 
     value: float  # the derivative
     error: float  # what truncation and noise leave uncertain: the disagreement of the last two extrapolations
@@ -64,8 +64,8 @@ class Differentiated(NamedTuple):
 def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
     """Differentiate f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
-    Steps shrink by a factor of 1.4, and the extrapolation with the least estimated error is returned: it
-    avoids both the truncation error of wide steps and the noise of narrow steps.
+    Steps decrease by factors of 1.4, and the extrapolation with the smallest estimated error is returned,
+    which is a compromise between truncation errors of large steps and noise of small steps.
 
     Args:
         f: function of one number. x: point. step: the largest step. levels: number of steps.
@@ -92,9 +92,9 @@ def richardson(f: Callable[[float], float], x: float, step: float, levels: int =
 
 
 def noise_of(values: Float[np.ndarray, "points"]) -> float:
-    """Estimate the standard deviation of the noise in values at equal, tiny spacings; 0 if all are equal.
+    """Estimate the standard deviation of noise in function values at small equal spacings.
 
-    Differences of order k remove the smooth part and keep the noise, enlarged by a known factor.
+    Differences of order k cancel the smooth function and amplify the noise by a known factor.
 
     Args:
         values: at least 4, so closely spaced that the function is nearly linear over all of them.
@@ -118,14 +118,14 @@ def noise_of(values: Float[np.ndarray, "points"]) -> float:
 
 
 class DifferenceStep(NamedTuple):
-    """A step for central differences, and the standard deviation of the function's noise."""
+    """Step for central differences, and standard deviation of the function's noise."""
 
     size: float
     noise: float
 
 
 def choose_step(f: Callable[[float], float], x: float, first: float, spacing: float) -> DifferenceStep:
-    """Choose the step at which truncation and noise of a central difference are about equal.
+    """Choose the step at which truncation error and noise of a central difference are about equal.
 
     Args:
         first: the initial step, which is also the largest, because the function may differ in kind beyond it.
@@ -157,7 +157,7 @@ def choose_step(f: Callable[[float], float], x: float, first: float, spacing: fl
 
 
 def nonzero(problem: Problem, name: str) -> float:
-    """Return the value of a scalar parameter, to which finite-difference steps are relative.
+    """Return the value of a scalar parameter; raise an error if it is 0, because steps are relative to it.
 
     Raises:
         InputError: the value is 0.
@@ -173,9 +173,9 @@ def nonzero(problem: Problem, name: str) -> float:
 
 @dataclass(frozen=True)
 class FiniteDifferences(Method):
-    """Central differences of the loss at shifted values of a scalar parameter, extrapolated to zero shift.
+    """Gradient method: central differences of the loss at shifted parameters, extrapolated to zero shift.
 
-    Errors, steps and the noise are in the details.
+    The details of the gradient contain errors, steps and the noise of the loss.
     """
 
     # the largest step as a share of the parameter; None for one that the noise of the loss and its third
@@ -189,7 +189,7 @@ class FiniteDifferences(Method):
 
     @property
     def runs(self) -> int:
-        """Approximate number of runs per parameter."""
+        """Approximate number of runs for each parameter."""
         return 2 * self.levels + (0 if self.relative is not None else _CHOOSING)
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
@@ -225,7 +225,7 @@ class FiniteDifferences(Method):
 
 
 def _counter(progress: Progress | None, runs: int, phase: str) -> Callable[[], None]:
-    """Return a function that counts runs and reports progress; call it once per run."""
+    """Return a function to be called once per run, which counts runs and reports progress."""
     done = 0
 
     def count() -> None:
@@ -239,10 +239,9 @@ def _counter(progress: Progress | None, runs: int, phase: str) -> Callable[[], N
 
 @dataclass(frozen=True)
 class ShadowDifferences(Method):
-    """Differences of the same run in a wider format than its own: the derivative without the run's rounding.
+    """Gradient method: finite differences in float64 for a run in a narrower format.
 
-    For float64 no wider format is practical in a long run; finite differences in float64 estimate their own
-    noise.
+    For runs in float64 no wider format is practical; use finite differences, which estimate their own noise.
     """
 
     relative: float = 1e-4  # the largest step as a share of the parameter
@@ -271,7 +270,7 @@ class ShadowDifferences(Method):
 
 @dataclass(frozen=True)
 class Replicas:
-    """Starts of a system that differ only in their random numbers."""
+    """Initial states of a system that differ only in random numbers."""
 
     count: int = 8  # how many
     seed: int = 0  # of the first one; the others count on from there
@@ -284,7 +283,7 @@ class Replicas:
             raise InputError(f"{seen}; expected at least 2 replicas, and at least 0 steps to settle")
 
     def of(self, problem: Problem) -> list[Problem]:
-        """Return the problem with each of these starts, as a list."""
+        """Return a list of problems, one for each replica (initial state)."""
         return [
             replace(problem, simulation=replica(problem.simulation, self.seed + k, self.settle))
             for k in range(self.count)
@@ -292,7 +291,7 @@ class Replicas:
 
 
 def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
-    """Return the same system with new velocities at its temperature, and with noise of its own.
+    """Return the system with new random velocities at its temperature and, with a thermostat, new noise.
 
     Args:
         seed: of velocities and noise. settle: steps to run before the start.
@@ -314,7 +313,7 @@ def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
 
 
 def settled(simulation: Simulation, steps: int) -> Simulation:
-    """Run a simulation for this many steps and return the final state as a new start.
+    """Return a simulation that starts from the state after the given number of steps.
 
     Raises:
         NumericalError: the run blew up.
@@ -332,7 +331,7 @@ def settled(simulation: Simulation, steps: int) -> Simulation:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over replicas."""
+    """Mean over replicas, with its standard error and the value of each replica."""
 
     # mean, error: the mean and its standard error, of the shape of the parameter
     mean: Float[np.ndarray, "..."]
@@ -341,16 +340,16 @@ class Estimate:
 
     @classmethod
     def from_replicas(cls, values: Sequence[Any] | np.ndarray) -> Estimate:
-        """Create an estimate of mean and standard error from the values of all replicas."""
+        """Compute mean and standard error from the values of all replicas."""
         of = np.stack([np.asarray(value, np.float64) for value in values])
         return cls(np.asarray(of.mean(axis=0)), np.asarray(of.std(axis=0, ddof=1) / np.sqrt(len(of))), of)
 
 
 @dataclass(frozen=True)
 class Ensemble(Method):
-    """The mean over replicas of another method's gradient, at several horizons.
+    """Gradient method: mean over replicas of another method's gradient, for several numbers of steps.
 
-    Standard errors and the noise horizon are in the details.
+    The details of the gradient contain standard errors, and the number of steps at which noise dominates.
     """
 
     method: Method = field(default_factory=EventAware)  # applied to each replica
@@ -394,7 +393,7 @@ class Ensemble(Method):
         return replace(made, description=f"the mean over replicas of {self.method.description}")
 
     def _horizons(self, problem: Problem) -> list[int]:
-        """Return the horizons in steps, shortest first, without those at which the loss uses no frame."""
+        """Return horizons in steps, shortest first; horizons at which the loss uses no frame are omitted."""
         found = []
         for k in reversed(range(self.halvings + 1)):
             steps = problem.steps >> k
@@ -408,7 +407,7 @@ class Ensemble(Method):
 
 
 def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
-    """Yield a method's gradient of every problem, in order; several devices get one worker each."""
+    """Yield the gradient of each problem, in order; problems are distributed over all devices."""
     devices = jax.local_devices()
     if len(devices) < 2:
         yield from (method(one, names) for one in problems)
@@ -423,7 +422,7 @@ def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
 
 
 def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
-    """Return the first horizon from which on the standard error exceeds the mean; None if there is none."""
+    """Return the first horizon from which the standard error is at least the mean; None if never."""
     mine = [row for row in rows if row["name"] == name]
     kept = [k for k, row in enumerate(mine) if row["error"] < row["mean"]]
     after = max(kept, default=-1) + 1
@@ -432,11 +431,11 @@ def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
 
 @dataclass(frozen=True)
 class SmoothedDifferences(Method):
-    """Central differences with wide steps over replicas that share their random numbers.
+    """Gradient method: mean over replicas of central differences with steps that span many flips.
 
-    Each pair of successive difference steps, one twice the other, is extrapolated to zero. The widest pair is
-    used that differs from no narrower pair by more than twice the standard error of the difference: narrower
-    steps have more noise from single events. Standard errors, steps and moved crossings are in the details.
+    Both runs of a difference use the same random numbers. Two successive steps, h and h/2, are extrapolated
+    to zero. The result is from the widest pair of steps that agrees with all narrower pairs within twice the
+    standard error of the difference, because single events cause more noise at narrower steps.
     """
 
     relative: float = 0.002  # the widest step as a share of the parameter
@@ -483,7 +482,7 @@ class SmoothedDifferences(Method):
 
 
 def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable[[], None]):
-    """Return the loss of every start at shifted parameters, and the set of crossings by step and pair."""
+    """Return, for each start, the loss at given parameter values and the set of crossings (step, i, j)."""
     found = []
     for start in starts:
         made, met = start.at(values), set()
@@ -500,14 +499,14 @@ def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable
 
 
 def _share(high, low) -> float | None:
-    """Return the fraction of crossings that are not in both runs at the same step; None without crossings."""
+    """Return the fraction of crossings that do not occur at the same step in both runs of a difference."""
     total = sum(len(a[1]) + len(b[1]) for a, b in zip(high, low, strict=True))
     differing = sum(len(a[1] ^ b[1]) for a, b in zip(high, low, strict=True))
     return differing / total if total else None
 
 
 def _chosen(found: Float[np.ndarray, "steps replicas"]) -> tuple[Estimate, float, int]:
-    """Return the extrapolated derivative, its error, and the index of its step, from differences by step."""
+    """Choose among extrapolated differences; return the derivative, its error and the index of its step."""
     if len(found) == 1:
         only = Estimate.from_replicas(found[0])
         return only, float(only.error), 0

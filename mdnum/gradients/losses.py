@@ -1,9 +1,9 @@
-"""Losses of a trajectory, evaluated frame by frame: the trajectory is never stored whole.
+"""Losses of a trajectory, evaluated frame by frame, so that the trajectory need not be stored.
 
-A loss observes some frames, each together with the first frame, sums its observations, and computes a number
-from the sums. Such sums cover averages, correlations with the start, and histograms; the derivative also
-needs only one frame at a time. A loss available on the command line is a class here with a name, a label and
-a unit.
+A loss computes observations from a frame and the first frame, sums observations over frames, and computes a
+number from the sums. Averages, correlations with the start and histograms have this form, and their
+derivatives need only one frame at a time. Each loss of the command line is a class in this module with a
+name, a label and a unit.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NOT_REAL = ("it is complex; expected a real number", "Use gradients.value_and_gr
 
 
 class LossFrame(NamedTuple):
-    """One step of a trajectory as input of a loss, atoms in the user's order."""
+    """State and energies at one step of a trajectory, the input of a loss; atoms are in the user's order."""
 
     step: Int[Array, ""]  # its number
     x: Float[Array, "3 atoms"]  # positions as if the box had no faces, length
@@ -41,7 +41,7 @@ class LossFrame(NamedTuple):
 
 
 class LossContext(NamedTuple):
-    """Quantities that a loss may use in addition to a frame, such as masses and the box of the frame."""
+    """Quantities that a loss can use in addition to a frame, such as masses and the box."""
 
     masses: Float[Array, "atoms"]  # of the atoms
     matrix: Float[Array, "3 3"]  # lattice vectors as rows, length
@@ -71,33 +71,33 @@ class Loss(eqx.Module):
             )
 
     def wrong(self, seen: str, remedy: str | None = None) -> InputError:
-        """Return an error for inconsistent options of this loss."""
+        """Create an error with the given message about options of this loss."""
         return InputError(seen, remedy=remedy, where=f"loss {self.name}")
 
     @classmethod
     def named(cls, options: dict[str, Any], simulation: Simulation, steps: int) -> Loss:
-        """Create the loss of a system from the options of the command line."""
+        """Create the loss for a system from options of the command line."""
         return cls(**options)
 
     def looks_at(self, steps: Int[np.ndarray, "rows"], last: int) -> Bool[np.ndarray, "rows"]:
-        """Return for each step whether the loss uses its frame, in a run with a given last step."""
+        """Return, for each step, whether the loss uses this step in a run with the given last step."""
         return (steps >= self.first) & ((steps - self.first) % self.every == 0)
 
     @abstractmethod
     def observe(self, frame: LossFrame, origin: LossFrame, around: LossContext) -> Any:
-        """Return a frame's contribution as a pytree, differentiable in both frames; `origin` is step 0."""
+        """Return the observations of a frame, to be summed over frames; `origin` is the frame of step 0."""
 
     def value(self, total: Any, frames: Int[Array, ""] | int) -> Inexact[Array, ""]:
-        """Compute the loss from the sum of observations and the number of frames: the mean by default."""
+        """Compute the loss from the sum of observations and the number of frames; the default is the mean."""
         return total / frames
 
     def reason_unavailable(self, around: LossContext) -> str | None:
-        """Return why the loss is not defined for this system and box; None if it is defined."""
+        """Return the reason why the loss is not defined for this system; None if the loss is defined."""
         return None
 
 
 class _OfLast(Loss):
-    """A loss that uses only the last step."""
+    """Base class of losses that use only the last step."""
 
     def looks_at(self, steps, last):
         return steps == last
@@ -107,7 +107,7 @@ class _OfLast(Loss):
 
 
 class Custom(Loss):
-    """A user-defined loss: any function of sums over frames.
+    """A user-defined loss, which is a function of sums over frames.
 
     Attributes:
         see: maps (frame, origin, surroundings) to a pytree of arrays that is summed over frames.
@@ -134,7 +134,7 @@ class Custom(Loss):
 
 
 class ComplexPart(Loss):
-    """The real part of a factor times a complex loss; the factor -i gives the imaginary part."""
+    """The real part of a constant factor times a complex loss; a factor of -i gives the imaginary part."""
 
     name = "part of a complex loss"
     inner: Loss = eqx.field(kw_only=True)
@@ -148,7 +148,7 @@ class ComplexPart(Loss):
 
 
 class FinalProjection(_OfLast):
-    """Projection of the last positions on fixed directions, divided by the number of atoms."""
+    """Projection of the final positions onto a fixed vector per atom, averaged over atoms."""
 
     name, label, unit = "final-projection", "mean of the last positions along x", "{length}"
     # shape (3, atoms), or (3,) for all atoms alike
@@ -179,7 +179,7 @@ class VelocityAutocorrelation(_OfLast):
 
 
 class MeanPotential(Loss):
-    """Potential energy of an atom, averaged over frames."""
+    """Potential energy per atom, averaged over frames."""
 
     name, label, unit = "potential", "potential energy of an atom, averaged over steps", "{energy}"
     of_single_frames = True
@@ -212,7 +212,7 @@ class MeanPressure(Loss):
 
 
 class MeanVolume(Loss):
-    """Volume of the box, averaged over frames, length³."""
+    """Volume of the periodic box, averaged over frames, length³."""
 
     name, label, unit = "volume", "volume of the box, averaged over steps", "{length}³"
     of_single_frames = True
@@ -236,8 +236,8 @@ class MeanDensity(MeanVolume):
 class EinsteinDiffusion(Loss):
     """Diffusion constant from the slope of the mean squared displacement, length² per unit of time.
 
-    A straight line is fitted to the displacements since step 0 of all frames, and D is a sixth of its slope.
-    Displacements are ballistic at first: set `first` to a step after the ballistic regime.
+    The mean squared displacement since step 0 is fitted by a straight line, and D is a sixth of its slope.
+    Motion is ballistic at first: set `first` to a step after the ballistic regime.
 
     Source: M. P. Allen, D. J. Tildesley, Computer Simulation of Liquids (2017), section 2.7.
     """
@@ -267,10 +267,10 @@ class EinsteinDiffusion(Loss):
 class GreenKuboDiffusion(Loss):
     """Diffusion constant as the integral of the velocity autocorrelation, length² per unit of time.
 
-    D is a third of the integral of v(0) · v(t), averaged over atoms, from step 0 to `until`, by the
-    trapezoidal rule over every n-th step.
+    D is a third of the integral of v(0) · v(t), averaged over atoms, from step 0 to step `until`. The
+    integral is computed by the trapezoidal rule with a spacing of `every` steps.
 
-    Error: of order (every × timestep)² times the correlation's slope at `until`; at 0 the slope vanishes.
+    Error: of order (every × timestep)² times the slope of the autocorrelation at `until`.
     Source: as for `EinsteinDiffusion`.
     """
 
@@ -306,13 +306,13 @@ class GreenKuboDiffusion(Loss):
 
 
 class RadialDistribution(Loss):
-    """A number computed from g(r), the pair density relative to an ideal gas, averaged over frames.
+    """Loss computed from the radial distribution function g(r), averaged over frames.
 
-    Cubic B-splines, which add up to one, share every distance among the four nearest bins: g(r) has two
-    continuous derivatives by every position. The cost of a frame is of order atoms² in time and of order
-    atoms in memory.
+    Each distance is distributed over the four nearest bins with cubic B-spline weights, so that g(r) has two
+    continuous derivatives with respect to positions. For each frame, the time is of order atoms² and the
+    memory of order atoms.
 
-    Source: of the loss, J. P. Hansen, I. R. McDonald, Theory of Simple Liquids (2013), section 2.5.
+    Source: J. P. Hansen, I. R. McDonald, Theory of Simple Liquids (2013), section 2.5.
     """
 
     name, label = "rdf", "mean squared difference of g(r) from 1"
@@ -344,16 +344,16 @@ class RadialDistribution(Loss):
 
     @property
     def width(self) -> float:
-        """Width of a bin, length."""
+        """Width of a bin of g(r), length."""
         return self.r_max / self.bins
 
     @property
     def centers(self) -> Float[Array, "bins"]:
-        """Centers of the bins, length."""
+        """Centers of the bins of g(r), length."""
         return (jnp.arange(self.bins, dtype=jnp.float64) + 0.5) * self.width
 
     def reason_unavailable(self, around: LossContext) -> str | None:
-        """Return why g(r), which uses nearest images, is not defined for a box; None if it is defined."""
+        """Return the reason why g(r) is not defined for a box (nearest images, volume), or None."""
         if why := _bulk(around):
             return why
         half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2
@@ -385,7 +385,7 @@ class RadialDistribution(Loss):
         return counts * around.volume / (atoms * (atoms - 1) * shells)
 
     def curve(self, total, frames) -> Float[Array, "bins"]:
-        """Return g(r) at the centers of the bins, from the sum over frames."""
+        """Compute g(r) at the bin centers from the sum over frames."""
         return total / frames
 
     def value(self, total, frames):
@@ -396,7 +396,7 @@ class RadialDistribution(Loss):
 
 
 def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Array, "bins"]:
-    """Count distances in bins centered at (k + 1/2) width; a cubic B-spline shares each among bins."""
+    """Histogram of distances with bin centers (k + 1/2) width and cubic B-spline weights."""
     u = r / width - 0.5
     left = lax.stop_gradient(jnp.floor(u))
     t = u - left
@@ -416,7 +416,7 @@ def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Ar
 
 
 def _bulk(around: LossContext) -> str | None:
-    """Return a message if the box has no volume; otherwise None."""
+    """Return a message if the system is not periodic in all directions (no volume); otherwise None."""
     return None if float(around.volume) > 0 else "the box has no volume: it is not periodic everywhere"
 
 
@@ -440,7 +440,7 @@ for _loss in (
 
 
 def parse(text: str, simulation: Simulation, steps: int) -> Loss:
-    """Return the loss that a text from the command line describes.
+    """Create a loss from its description on the command line.
 
     Args:
         text: a name of `LOSSES`, optionally with options after a colon: "potential:every=10,first=500".

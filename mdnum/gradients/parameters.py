@@ -1,6 +1,6 @@
-"""Parameters that a rollout can be differentiated by, and where each one enters the rollout.
+"""Parameters with respect to which a simulation can be differentiated, and the inputs that they change.
 
-Names, values and units are those of `mdnum.systems.parameters`.
+Names, values and units of parameters are those of `mdnum.systems.parameters`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _INTEGERS = {
 
 @dataclass(frozen=True)
 class Cotangents:
-    """Derivatives of a loss with respect to all inputs of a rollout."""
+    """Derivatives of a loss with respect to all inputs of a simulation."""
 
     model: Any  # by the quantities of the force (`quantities`)
     integrator: Integrator  # by the leaves of the integrator that are numbers
@@ -49,7 +49,7 @@ class Cotangents:
 
 
 class Direction(NamedTuple):
-    """Derivatives of all inputs of a rollout by one number, or by several numbers along a first axis."""
+    """Derivatives of all inputs of a simulation with respect to one number, or to several (first axis)."""
 
     # x, v: of the positions and velocities of step 0, user's order
     x: Float[Array, "*columns 3 atoms"]
@@ -61,23 +61,23 @@ class Direction(NamedTuple):
 
 
 def quantities(force: PairForce | ManyBodyForce) -> Any:
-    """Return the differentiable quantities of a force, as a pytree of arrays.
+    """Return the differentiable parameters of a force, as a pytree of arrays.
 
-    For a many-body potential, the quantities are its arrays and constants, by name.
+    For a many-body potential, the result contains its arrays and constants by name.
     """
     return force.model if isinstance(force, PairForce) else manybody.quantities_of(force.potential)
 
 
 def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce | ManyBodyForce:
-    """Return the force with its quantities replaced; the function also works inside jit."""
+    """Return a force with other values of its differentiable parameters; can be used inside jit."""
     if isinstance(force, PairForce):
         return replace(force, model=values)
     return replace(force, potential=manybody.with_quantities(force.potential, values))
 
 
 def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Array, Array]:
-    """Propagate cotangents of the initial extra state to the integrator's numbers and to the initial
-    positions and velocities.
+    """Propagate cotangents of the integrator's initial extra state (such as a thermostat's) backward, to the
+    parameters of the integrator and the initial positions and velocities.
 
     Args:
         start: the state of step 0.
@@ -92,7 +92,7 @@ def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Arr
 
 
 def names(simulation: Simulation) -> tuple[str, ...]:
-    """Return the names of all parameters that a simulation can be differentiated by."""
+    """Return the names of all parameters with respect to which a simulation can be differentiated."""
     # there is no derivative by a temperature of 0
     cold = () if value(simulation, "dynamics.temperature") else ("dynamics.temperature",)
     model = simulation.model
@@ -103,7 +103,7 @@ def names(simulation: Simulation) -> tuple[str, ...]:
 
 
 def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
-    """Return full names of parameters given by full or short names; a path ("potential") means all below it.
+    """Return full names of parameters; a table such as "potential" stands for all its parameters.
 
     Raises:
         InputError: a parameter does not exist, or is not a differentiable quantity.
@@ -129,7 +129,7 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any], Any]]:
-    """Return where a parameter enters a rollout, each place with its derivative (None for the identity)."""
+    """Return the inputs that a parameter changes, as pairs (function that selects the input, derivative)."""
     if name in ("initial.positions", "initial.velocities"):
         return [((lambda of: of.x) if name == "initial.positions" else (lambda of: of.v), None)]
     v = simulation.velocities.T
@@ -153,7 +153,7 @@ def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any
 
 
 def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.ndarray, "..."]:
-    """Return the derivative by a named parameter, in the shape of the parameter's value."""
+    """Return the derivative with respect to a named parameter, in the shape of the parameter's value."""
     entry = parameters.entry(simulation, name)
     if name == "box.scale":
         return np.asarray(parts.scale)
@@ -172,7 +172,7 @@ def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.n
 
 
 def moved(simulation: Simulation, still: Direction, column: ParameterEntry) -> Direction:
-    """Return the derivatives of all inputs of a rollout by one number, with all other numbers fixed."""
+    """Return derivatives of all inputs of a simulation with respect to one number, with others fixed."""
     entry = parameters.entry(simulation, column.name)
     unit_entry = np.zeros(np.shape(value(simulation, entry.whole)))
     unit_entry[(*entry.index, *column.index)] = 1 / entry.factor
@@ -188,7 +188,7 @@ def moved(simulation: Simulation, still: Direction, column: ParameterEntry) -> D
 
 @dataclass(frozen=True)
 class ParameterEntry:
-    """One number of a parameter: a scalar, or one entry of an array."""
+    """One number to differentiate by: a scalar parameter, or one entry of an array parameter."""
 
     name: str  # full name of the parameter
     index: tuple[int, ...] = ()  # which of its entries; empty for a scalar
@@ -198,7 +198,7 @@ class ParameterEntry:
 
 
 def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterEntry, ...]:
-    """Return all single numbers of the given parameters, in order."""
+    """Return all entries of the given parameters, in order."""
     return tuple(
         ParameterEntry(name, tuple(int(k) for k in index))
         for name in names
@@ -209,7 +209,7 @@ def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterE
 def gathered(
     simulation: Simulation, names: Sequence[str], values: Float[np.ndarray, "columns"]
 ) -> dict[str, Float[np.ndarray, "..."]]:
-    """Put one value per column back into the shapes of the parameters."""
+    """Split a vector with one value per entry into arrays with the shapes of the parameters."""
     shapes = {name: value(simulation, name).shape for name in names}
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
     parts = np.split(np.asarray(values, np.float64), ends[:-1])
@@ -217,7 +217,7 @@ def gathered(
 
 
 def directions(simulation: Simulation, columns: Sequence[ParameterEntry]) -> Direction:
-    """Return the derivatives of all inputs of a rollout by each number, stacked along a first axis."""
+    """Return derivatives of all inputs of a simulation with respect to each number (first axis)."""
     nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
     still = Direction(
         nothing,

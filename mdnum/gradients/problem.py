@@ -1,4 +1,4 @@
-"""Definition of a derivative of a rollout: the problem, the result, and the base class of the methods."""
+"""Classes for gradients of a simulation: the problem, the result, and the base class of methods."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Problem:
-    """A loss of a rollout that is to be differentiated.
+    """A differentiation problem: a simulation, a number of steps and a loss of the trajectory.
 
     Example:
         >>> loss = mdnum.gradients.losses.MeanPotential()
@@ -82,27 +82,27 @@ class Problem:
             object.__setattr__(self, "parts", tuple(replace(self, loss=one) for one in parts))
 
     def at(self, values: Values) -> Problem:
-        """Return the problem with the same loss for a rollout with other parameter values."""
+        """Return the problem with other values of parameters."""
         return replace(self, simulation=parameters.with_values(self.simulation, values)) if values else self
 
     def value(self, values: Values | None = None) -> Any:
-        """Run the rollout and return its loss: a float, or a complex number for a complex loss."""
+        """Run the simulation and return its loss, a float (a complex number for a complex loss)."""
         made = self.at(values or {})
         runs = (RunTape(one.simulation, one.loss, one.steps, budget=0) for one in made.parts or (made,))
         return sum(factor * run.value for factor, run in zip((1, 1j), runs, strict=False))
 
     @property
     def jumps(self) -> bool:
-        """Whether the force jumps at the cutoff."""
+        """True if the force jumps at the cutoff."""
         return bool(np.any(self.simulation.jumps()[1] != 0))
 
 
 @dataclass(frozen=True)
 class Gradient:
-    """A derivative of a loss, with a description of which derivative it is.
+    """Gradient of a loss by one method, with a description of the method's derivative.
 
     Attributes:
-        method: name of the method. description: which derivative this is, one sentence.
+        method: name of the method. description: one sentence on the derivative that the method computes.
         value: the loss of the program that was differentiated.
         gradient: derivatives by full name of the parameter, in the shape of its value; complex for a complex
             loss.
@@ -122,10 +122,9 @@ class Gradient:
 
 
 class Method:
-    """A way to differentiate a rollout: a frozen dataclass of options, with a row in the table METHODS.
+    """Base class of gradient methods: frozen dataclasses of options, registered in METHODS.
 
-    This base class serves both molecular dynamics and the ball; `ball.BallMethod` takes the problem of a
-    ball.
+    Methods for molecular dynamics derive from this class, and methods for a ball from `ball.BallMethod`.
 
     Attributes:
         name: name on the command line. description: which derivative the method computes, one sentence.
@@ -137,14 +136,14 @@ class Method:
     kind: ClassVar[Kind] = "steps"
 
     def reason_unavailable(self, problem: Any, names: Sequence[str]) -> str | None:
-        """Return why the method gives no derivative for a problem; None if it gives one."""
+        """Return the reason why the method does not apply to a problem; None if the method applies."""
         return None
 
     def __call__(self, problem: Any, names: Sequence[str], progress: Progress | None = None) -> Gradient:
-        """Compute the derivative by the named parameters; a complex loss takes one run for each of its parts.
+        """Compute the gradient; for a complex loss, the real and the imaginary part require a run each.
 
         Raises:
-            InputError: the derivative does not exist for this problem, or a parameter does not exist.
+            InputError: the method does not apply to this problem, or a parameter does not exist.
         """
         full = self.check(problem, names)
         if not getattr(problem, "parts", ()):
@@ -157,11 +156,11 @@ class Method:
         return replace(real, value=real.value + 1j * imag.value, gradient=gradient, **told)
 
     def known(self, problem: Any, names: Sequence[str]) -> tuple[str, ...]:
-        """Return the full names of the parameters; an unknown name is an error."""
+        """Return the full names of parameters; raise an error for an unknown name."""
         return parameters.resolve(problem.simulation, names)
 
     def check(self, problem: Any, names: Sequence[str]) -> tuple[str, ...]:
-        """Return the full names of the parameters, after checking that the method applies.
+        """Return the full names of parameters; raise an error if the method does not apply.
 
         Raises:
             InputError: a parameter does not exist, or the method does not apply.
@@ -173,11 +172,11 @@ class Method:
         return full
 
     def differentiate(self, problem: Any, names: tuple[str, ...], progress: Progress | None) -> Gradient:
-        """Compute the derivative by parameters whose names were already checked."""
+        """Compute the gradient with respect to parameters whose names were already checked."""
         raise NotImplementedError
 
     def result(self, value: float, gradient: dict[str, Any], notes=None, details=None) -> Gradient:
-        """Create a `Gradient` with the name, description and kind of this method."""
+        """Create a `Gradient` that contains name, description and kind of this method."""
         return Gradient(self.name, self.description, value, gradient, notes or {}, details or {}, self.kind)
 
 
@@ -198,19 +197,19 @@ _SPELLINGS = {"epochs": "unrolled", "recursive": "unrolled"}
 
 
 def method(name: str) -> Method:
-    """Return the gradient method of a given name, with its default options.
+    """Return the gradient method with the given name and default options.
 
     Example:
         >>> mdnum.method("symmetric")
 
     Raises:
-        InputError: there is no such method.
+        InputError: no method has this name.
     """
     return METHODS.parse(_SPELLINGS.get(name, name))
 
 
 def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: bool) -> dict[str, str]:
-    """Return notes on parameters whose derivative is exactly zero or lacks the contribution of the flips."""
+    """Return notes on derivatives that are exactly zero or lack the contribution of flips, by parameter."""
     notes = {}
     missing = problem.jumps and not saltation
     for name, value in gradient.items():
@@ -229,7 +228,7 @@ def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: boo
 
 
 def pairs_only(simulation: Simulation, *, any_step: bool = False) -> str | None:
-    """Return why the reverse pass for pair potentials does not apply; None if it applies.
+    """Return the reason why a method for pair potentials does not apply; None if the method applies.
 
     Args:
         any_step: whether every integrator is supported.
@@ -240,14 +239,14 @@ def pairs_only(simulation: Simulation, *, any_step: bool = False) -> str | None:
 
 
 def one_term(simulation: Simulation) -> str | None:
-    """Return why a method for a single pair potential does not apply; None if it applies."""
+    """Return the reason why a method for a single pair potential does not apply, or None."""
     if simulation.pairwise and "" not in simulation.model.terms:
         return f"it is for one pair potential, and {simulation.potential.name} are several terms"
     return pairs_only(simulation)
 
 
 def rounded(simulation: Simulation) -> str | None:
-    """Return why forces in a type below 32 bits have no derivative: every operation is rounded."""
+    """Return the reason why forces in a type below 32 bits have no derivative (rounding), or None."""
     if simulation.policy.dtype("force").itemsize < 4:
         precision = simulation.policy.force
         return f"forces in {precision} are rounded after every operation, which has no derivative"
@@ -255,13 +254,13 @@ def rounded(simulation: Simulation) -> str | None:
 
 
 def scalars_only(problem: Problem, names: Sequence[str]) -> str | None:
-    """Return why finite differences do not apply: a parameter has several entries; None otherwise."""
+    """Return the reason why finite differences do not apply (a parameter with several entries), or None."""
     large = [name for name in names if np.ndim(parameters.value(problem.simulation, name))]
     return f"{', '.join(large)}: a value for each shift of each entry would be needed" if large else None
 
 
 def in_phase(progress: Progress | None, phase: str) -> Callable[[int, int], None] | None:
-    """Return a progress callback that takes only steps, and adds the name of the phase."""
+    """Return a progress callback for steps, which adds the name of the phase."""
     if progress is None:
         return None
     return lambda step, steps: progress(step, steps, phase)

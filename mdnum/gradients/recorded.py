@@ -1,7 +1,7 @@
-"""Gradient methods that linearize a recorded run: backward by symmetric Jacobians, forward by tangents.
+"""Gradient methods that linearize a recorded run, in reverse mode (cotangents) or forward mode (tangents).
 
-The run is made first, by the same program as every other run. Then the run is linearized at the states and
-decisions that were recorded, or that are recomputed when a fixed-point run is reversed.
+The run is made first, by the same program as every other run. The steps are then linearized at the recorded
+states and decisions; for a reversible run with a fixed-point state, the states are recomputed.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ Watch = Callable[[TapeStretch, AdjointCarry], None]
 
 @dataclass(frozen=True)
 class ReversePass:
-    """Result of a reverse pass."""
+    """Result of a reverse pass: the recorded run, the gradient, and the crossings of cutoffs."""
 
     tape: RunTape  # the run
     parts: Cotangents  # derivatives by all that it is made of
@@ -75,7 +75,7 @@ def passed(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> ReversePass:
-    """Run a problem and its reverse pass; callbacks receive the cotangents of every stretch of steps.
+    """Run a problem and the reverse pass; callbacks receive the cotangents of each stretch of steps.
 
     Args:
         names: full names of the parameters. saltation: whether to include the contribution of flips.
@@ -111,7 +111,7 @@ def passed(
 
 
 def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progress | None = None) -> RunTape:
-    """Run a problem and return its tape, which is the recorded run."""
+    """Run a problem and return the recorded run."""
     return RunTape(
         problem.simulation, problem.loss, problem.steps, flips=flips, budget=budget,
         progress=in_phase(progress, "run"),
@@ -120,7 +120,7 @@ def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progres
 
 @dataclass(frozen=True)
 class Symmetric(Method):
-    """The derivative of the steps that ran, by one reverse pass without a tape of operations."""
+    """Gradient method: derivative of the steps at fixed decisions, by one reverse pass with little memory."""
 
     # bytes of the recorded run that are kept in memory; what does not fit is run again, stretch by stretch,
     # with the same bits
@@ -147,7 +147,7 @@ class Symmetric(Method):
 
 @dataclass(frozen=True)
 class EventAware(Method):
-    """The derivative of the flow: the steps' derivative plus a contribution from the time of every flip."""
+    """Gradient method: derivative of the steps plus the contributions of the times of all flips."""
 
     # radial speed below which a crossing grazes and is left out, as a share of the rms radial speed of a
     # pair. Left in, single crossings would dominate: their terms go with one over that speed
@@ -182,7 +182,7 @@ class EventAware(Method):
 
 @dataclass(frozen=True)
 class Forward(Method):
-    """The derivative of the steps that ran, by tangents that are propagated along with the steps."""
+    """Gradient method: derivative of the steps at fixed decisions, in forward mode (tangents)."""
 
     # whether every flip adds what moving its time does, as the method event-aware has it
     saltation: bool = False
@@ -231,12 +231,12 @@ class Forward(Method):
 
 @dataclass(frozen=True)
 class Reversible(Method):
-    """The derivative of the steps that ran, for a run with a fixed-point integer state that is reversed.
+    """Gradient method: derivative of the steps of a fixed-point run, which is reversed instead of stored.
 
-    The forward pass keeps only its last state. Rounding to integers is differentiated as the identity.
+    The forward pass stores only the last state. Rounding to integers is differentiated as the identity.
 
     Raises:
-        NumericalError: the reversed run differs from the forward run.
+        NumericalError: the states of the reversed run differ from those of the forward run.
     """
 
     name = "reversible"
@@ -267,7 +267,7 @@ class Reversible(Method):
 
 @dataclass(frozen=True)
 class Surrogate(Method):
-    """The gradient of a system with a switched cutoff: another program, whose force does not jump."""
+    """Gradient method: gradient of another program with a switched cutoff, whose force does not jump."""
 
     cutoff: str = "quintic"  # of the twin; one with an onset
     onset: float = ONSET_FRACTION  # where its switching begins, as a share of the cutoff
@@ -285,7 +285,7 @@ class Surrogate(Method):
         return self.method.reason_unavailable(self.twin(problem), names)
 
     def twin(self, problem: Problem) -> Problem:
-        """Return the problem with the switched cutoff, which is differentiated in place of the given one."""
+        """Return the problem with a switched cutoff, which is differentiated instead of the given problem."""
         made = problem.simulation.with_cutoff(self.cutoff)
         onset = parameters.value(made, "cutoff.radius") * self.onset
         return replace(problem, simulation=made).at({"cutoff.onset": onset})
@@ -298,7 +298,7 @@ class Surrogate(Method):
 
 
 def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
-    """Return counts of the crossings, and the crossings with the largest weights."""
+    """Return the number of crossings and of grazing crossings, and the crossings with the largest weights."""
     speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
     flips = {name: joined(crossings, name, ledger=True) for name in ("step", "i", "j", "entered")}
     key, heavy = -np.abs(weight), np.arange(len(weight))
@@ -320,18 +320,18 @@ def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
 
 
 def joined(crossings: Sequence[Crossings], name: str, *, ledger: bool = False) -> np.ndarray:
-    """Concatenate one column of the crossings, or of their ledgers, over several stretches of steps."""
+    """Concatenate one column of the crossings, or of their table of flips, over stretches of steps."""
     return np.concatenate([getattr(one.ledger if ledger else one, name) for one in crossings])
 
 
 def radial_speed(simulation: Simulation) -> float:
-    """Return the root mean square speed along the line between two atoms, length per internal time."""
+    """Return the root mean square radial speed of a pair of atoms, length per internal time."""
     speed2 = float(np.mean(np.sum(simulation.velocities**2, axis=1)))
     return float(np.sqrt(2 * speed2 / 3))
 
 
 def wanted(names: Sequence[str]) -> frozenset[str]:
-    """Return which derivatives the reverse pass has to compute for these parameters."""
+    """Return the kinds of derivatives that a reverse pass must compute for the named parameters."""
     parts = {name: {MODEL} for name in ("potential", "cutoff", "terms")}
     parts |= {"dynamics": {FORCE}, "box": {SCALE}}
     return frozenset(

@@ -1,7 +1,7 @@
 """Forward-mode derivatives: tangents of a few parameters along the recorded run.
 
-A tangent is propagated through each step at the recorded state and decisions. Tangents need no memory beyond
-that of the run, and one force evaluation per step and parameter.
+A tangent is propagated through each step at the recorded state and decisions. Each parameter requires one
+additional force evaluation per step, and no memory beyond that of the recorded run.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mdnum.rollout.epoch import over_rows
 
 
 class TangentCarry(NamedTuple):
-    """Tangents of the state between two steps, one for each column, with atoms in the user's order."""
+    """Tangents of the state between two steps, one per parameter entry, with atoms in the user's order."""
 
     # of the positions as if the box had no faces, at the step that comes next
     x: Float[Array, "columns 3 atoms"]
@@ -48,7 +48,7 @@ class TangentCarry(NamedTuple):
 
 @dataclass(frozen=True)
 class StretchTangents:
-    """Tangents along one stretch of steps of a run."""
+    """Tangents along one stretch of steps (with one neighbor list) of a run."""
 
     stretch: TapeStretch  # the steps
     columns: tuple[ParameterEntry, ...]  # the numbers by which it is differentiated
@@ -72,10 +72,10 @@ def tangents(
     states: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[StretchTangents]:
-    """Yield tangents by named parameters along a recorded run, for one stretch of steps after another.
+    """Yield tangents with respect to named parameters along a recorded run, for each stretch of steps.
 
-    For tangents that do not jump and weights of an event-aware reverse pass, the sum of weight times
-    (dr_cut - dr) over crossings is the contribution of the flips to the derivative by each column.
+    If saltation is False, the contribution of the flips to a derivative is the sum over all crossings of
+    weight times (dr_cut - dr), with the weights from an event-aware reverse pass.
 
     Args:
         tape: the run; recorded with flips if crossings are needed. names: full names of parameters.
@@ -117,7 +117,7 @@ def tangents(
 
 
 def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
-    """Return the derivatives of the loss, from the tangents of its sums at the end."""
+    """Return the derivatives of the loss from the tangents of the loss's sums at the end."""
 
     def one(tangent):
         return jax.jvp(lambda total: tape.loss.value(total, tape.frames), (tape.total,), (tangent,))[1]
@@ -126,7 +126,7 @@ def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
 
 
 def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, told, values, matrix) -> Forces:
-    """Evaluate forces with other quantities in another box; the choice of nearest images does not change."""
+    """Evaluate forces with other parameters and lattice vectors, but with the same nearest images."""
     other: Any = with_quantities(force, values)
     other = replace(other, cell=replace(force.cell, matrix=matrix))
     if isinstance(force, PairForce):
@@ -187,7 +187,7 @@ def _stretch(
         return jax.tree.map(jnp.add, total, seen)
 
     def push(row, told, see, span, carry: TangentCarry, along: Direction):
-        """Propagate the tangent by one number through one step."""
+        """Propagate the tangent with respect to one number through one step."""
         number, x, v = row[0], row[1], row[2]
         dx, dv = carry.x, carry.v
         half, first = (0.5 * integrator.timestep).astype(dtype), number == 0
@@ -227,11 +227,11 @@ def _stretch(
 
 
 def _whole(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the lattice vectors with a unit vector for each axis that has none."""
+    """Return the lattice vectors, with a unit vector in place of each zero vector."""
     missing = jnp.all(matrix == 0, axis=1)
     return jnp.where(missing[:, None], jnp.eye(3, dtype=matrix.dtype), matrix)
 
 
 def _still(integer: Array) -> Any:
-    """Return the zero tangent of an integer."""
+    """Return the zero tangent that JAX requires for an integer."""
     return np.zeros(jnp.shape(integer), jax.dtypes.float0)

@@ -1,9 +1,9 @@
-"""The recorded forward run of a gradient: its steps, also in reverse order, and the sums of the loss.
+"""A recorded run for gradients: its steps, in forward or reverse order, and the sums of the loss.
 
-Recorded stretches of steps are kept as long as memory allows. Other stretches are run again from their first
-states: the same compiled program from the same state with the same list gives the same bits. A run with a
-fixed-point integer state need not be kept at all: it is reversed step by step, and must return to its start
-bit for bit.
+Recorded stretches of steps are kept as far as memory allows. Other stretches are run again from their first
+states: the same compiled program with the same state and neighbor list gives the same bits. A run with a
+fixed-point integer state need not be stored: its steps are reversed, and must return to the start bit for
+bit.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _FINGERPRINTS = 256
 
 @dataclass(frozen=True)
 class TapeStretch:
-    """Successive steps with one neighbor list, with atoms in the order of this list."""
+    """Recorded states and decisions of successive steps with one neighbor list, atoms in the list's order."""
 
     # first, rows: its first step and the number of rows in use; those beyond are void
     first: int
@@ -62,12 +62,12 @@ class TapeStretch:
 
     @property
     def nbytes(self) -> int:
-        """Memory used by the stretch, bytes."""
+        """Memory that the recorded stretch of steps uses, bytes."""
         kept = ([getattr(self, name) for name in _COLUMNS], self.x_before, self.table.index)
         return sum(array.nbytes for array in jax.tree.leaves(kept))
 
     def cut(self, room: int | None = None) -> TapeStretch:
-        """Return a copy with room for `room` rows; by default only the rows in use."""
+        """Return a copy with arrays for `room` steps, by default for the number of recorded steps."""
 
         def copied(rows: np.ndarray) -> np.ndarray:
             kept = np.zeros((room or self.rows, *rows.shape[1:]), rows.dtype)
@@ -77,23 +77,23 @@ class TapeStretch:
         return replace(self, **{name: jax.tree.map(copied, getattr(self, name)) for name in _COLUMNS})
 
     def roomy(self) -> TapeStretch:
-        """Return a copy with a standard number of rows, so that not every length needs a compilation."""
+        """Return a copy padded to one of a few standard numbers of steps, to limit compilations."""
         columns = jax.tree.leaves([getattr(self, name) for name in _COLUMNS])
         per_row = sum(column[0].nbytes for column in columns)
         return self.cut(room_for(self.rows - 1, per_row))
 
     @property
     def steps(self) -> Int[np.ndarray, "room"]:
-        """Step number of each row."""
+        """Step number of each row of the recorded arrays."""
         return self.first + np.arange(len(self.x))
 
     @property
     def columns(self):
-        """Columns that a loss needs (step, x, v, images, potential, virial, cell), and the steps' inputs."""
+        """Columns step, x, v, images, potential, virial and cell (for a loss), and inputs of each step."""
         return (self.steps, *(getattr(self, name) for name in ("x", "v", "images", *_COLUMNS[4:])))
 
     def cell_of(self, row: int, cell: Cell) -> Cell:
-        """Return the box at a row, on the host; row -1 is the step before the first.
+        """Return the box at a row (step); row -1 is the step before the first row.
 
         Args:
             cell: the box of a run whose box does not move.
@@ -108,7 +108,7 @@ _COLUMNS = ("x", "v", "images", "bits", "potential", "virial", "cell", "inputs")
 
 
 def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) -> TapeStretch:
-    """Copy the recorded columns of a segment, because the segment's own record is reused."""
+    """Copy the record of a segment of the run, because its memory is reused."""
     columns: dict[str, Any] = {name: getattr(segment.record, name) for name in _COLUMNS}
     x_before = np.asarray(start.state.x_before)[:, segment.table.order]
     before = jax.tree.map(np.asarray, start.state.cells[len(start.state.cells) > 1])
@@ -120,14 +120,14 @@ def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) 
 
 
 class Pace(NamedTuple):
-    """Spacing of the frames that a loss uses."""
+    """Spacing and first step of the frames that a loss uses."""
 
     between: Int[Array, ""]  # steps from one frame to the next; 0 where they are not a series at equal times
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the number of frames per time around a step: if a jump just before the step comes earlier by
-        dt, it changes dt times this number of frames on average, since frames are taken at whole steps.
+        """Return the number of frames per time around a step. If a jump just before the step occurs earlier
+        by dt, on average dt times this number of frames change, because frames are taken at whole steps.
         """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
@@ -135,7 +135,7 @@ class Pace(NamedTuple):
 
 
 def pace_of(loss: Loss, steps: int) -> Pace:
-    """Return how often a loss uses a frame in a run of this many steps."""
+    """Return the spacing of the frames that a loss uses in a run with the given number of steps."""
     seen = np.flatnonzero(loss.looks_at(np.arange(steps + 1), steps))
     spacings = np.unique(np.diff(seen))
     between = int(spacings[0]) if len(spacings) == 1 else 0
@@ -143,7 +143,7 @@ def pace_of(loss: Loss, steps: int) -> Pace:
 
 
 class RunTape:
-    """A completed run and its loss.
+    """A recorded run, its flips, and the value of the loss.
 
     Args:
         steps: last step. flips: whether to write the ledger too.
@@ -217,14 +217,14 @@ class RunTape:
 
     @property
     def replayed(self) -> int:
-        """Number of stretches of steps that are run again in a reverse pass."""
+        """Number of stretches of steps that were not stored and are run again in a reverse pass."""
         return sum(isinstance(one, tuple) for one in self._made)
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
-        """Derivatives of the loss by the energy and by the virial, if these jump at a flip and the loss uses
-        single frames: such a jump of the loss has no slope. Both derivatives are 0 for equally spaced frames,
-        where averages account for the jumps.
+        """Derivatives of the loss with respect to energy and virial of a frame, if these quantities jump at
+        flips and the loss uses single frames: such jumps of the loss have no derivative. Both derivatives are
+        0 for equally spaced frames, for which gradients include the jumps.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0
@@ -246,15 +246,15 @@ class RunTape:
         return stretch_of(self._engine.again(one[0]), *one) if isinstance(one, tuple) else one.roomy()
 
     def backward(self) -> Iterator[TapeStretch]:
-        """Yield the stretches of steps, from last to first."""
+        """Yield the recorded stretches of steps, from last to first."""
         return map(self._whole, reversed(self._made))
 
     def forward(self) -> Iterator[TapeStretch]:
-        """Yield the stretches of steps, from first to last."""
+        """Yield the recorded stretches of steps, from first to last."""
         return map(self._whole, self._made)
 
     def seen(self, stretch: TapeStretch) -> Bool[np.ndarray, "room"]:
-        """Return which rows of a stretch the loss uses."""
+        """Return a mask of the steps of a stretch that the loss uses."""
         steps = stretch.steps
         return self.loss.looks_at(steps, self.steps) & (np.arange(len(steps)) < stretch.rows)
 
@@ -269,13 +269,13 @@ class RunTape:
 
 
 class ReversibleTape(RunTape):
-    """A completed run with a fixed-point integer state, which is reversed instead of stored, and its loss.
+    """A completed run with a fixed-point integer state, which is reversed instead of stored.
 
-    `backward` reverses the steps, with newly built neighbor lists, and raises NumericalError if the states
+    The method `backward` reverses the steps with new neighbor lists, and raises NumericalError if states
     differ from those of the forward run.
 
     Attributes:
-        baths: bits discarded by a thermostat's friction, by step: the only memory that grows with the run.
+        baths: bits that a thermostat's friction discarded, by step; only this memory grows with the run.
         stretches: number of stretches reversed so far.
     """
 
@@ -303,11 +303,11 @@ class ReversibleTape(RunTape):
 
     @property
     def nbytes(self) -> int:
-        """Memory that grows with the run: the bits discarded by friction, bytes."""
+        """Memory of the bits that friction discarded, which grows with the run, bytes."""
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:
-        """Run the steps again, because a reversible run is not stored, and yield its stretches in order."""
+        """Run the steps again, because they are not stored, and yield the stretches in order."""
         return RunTape(self.simulation, self.loss, self.steps, flips=self.flips).forward()
 
     def backward(self) -> Iterator[TapeStretch]:
@@ -330,7 +330,7 @@ class ReversibleTape(RunTape):
                 self._astray(0, min(self._every, self.steps))
 
     def _compare(self, made: Stretched) -> None:
-        """Compare the reversed states with the fingerprints of the forward run."""
+        """Compare hashes of the reversed states with those of the forward run."""
         for row in range(made.rows - 1, -1, -1):
             step, record = made.first + row, made.record
             if step % self._every:
@@ -349,7 +349,7 @@ class ReversibleTape(RunTape):
 
 
 def fingerprint(order, *parts) -> bytes:
-    """Return a digest of a state, in the user's order of atoms; the sign of a zero is ignored."""
+    """Return a hash of a state with atoms in the user's order; the sign of a zero is ignored."""
     digest = hashlib.blake2b(digest_size=8)
     for part in map(np.asarray, parts):
         out = np.empty_like(part)
@@ -359,20 +359,20 @@ def fingerprint(order, *parts) -> bytes:
 
 
 def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pairs of a list, each once: first and second atom in the list's order, and pair type."""
+    """Return each pair of a neighbor list once: indices of both atoms in the list's order, and pair type."""
     first, second, i, j = table.listed(simulation.channels)
     return first, second, np.asarray(simulation.type_of(i, j), np.int64)
 
 
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:
-    """Return a row as a frame, in the user's order, with positions unwrapped by the lattice vectors."""
+    """Convert a recorded step to a frame with unwrapped positions and atoms in the user's order."""
     step, x, v, images, potential, virial = row[:6]
     whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(x.dtype)
     return LossFrame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
 
 
 def seen_in(row, order: Int[Array, "atoms"], origin: LossFrame, around: LossContext):
-    """Return the arguments of a loss for a row: frame, origin, and surroundings with the row's box."""
+    """Return the arguments of `Loss.observe` for a recorded step: frame, first frame and context."""
     around = in_box(around, row[6]) if row[6].size else around
     return frame_of(row, order, around.matrix), origin, around
 
@@ -392,13 +392,13 @@ def _summed(loss, total, rows, used, seen, origin, around, order):
 
 
 def in_box(around: LossContext, matrix: Float[Array, "3 3"]) -> LossContext:
-    """Return the context of a loss with other lattice vectors."""
+    """Return the context of a loss (masses, box, constants) with other lattice vectors."""
     volume = jnp.abs(jnp.dot(matrix[0], jnp.cross(matrix[1], matrix[2])))
     return around._replace(matrix=matrix, volume=jnp.where(around.volume > 0, volume, 0.0))
 
 
 def surroundings(simulation: Simulation) -> LossContext:
-    """Return the context of a loss (masses, box, constants, time step) at the start of a simulation."""
+    """Return the context of a loss (masses, initial box, constants, time step) of a simulation."""
     cell = simulation.cell
     volume = cell.volume if all(simulation.pbc) else 0.0
     parts = (
@@ -409,13 +409,13 @@ def surroundings(simulation: Simulation) -> LossContext:
 
 
 def no_sums(loss: Loss, origin: LossFrame, around: LossContext) -> Any:
-    """Return the sums of a loss before its first frame: zeros."""
+    """Return the initial sums of a loss, which are zeros."""
     shapes = jax.eval_shape(loss.observe, origin, origin, around)
     return jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
 
 
 def frame_of_start(start: Start, simulation: Simulation) -> LossFrame:
-    """Return the frame of step 0; its energies are not known yet, and losses do not use them."""
+    """Return the frame of step 0, with NaN for energies, which are not known at this point."""
     state = start.state
     matrix = jnp.asarray(np.asarray(simulation.cell.matrix), jnp.float64)
     whole = state.x + (matrix.T @ state.images.astype(matrix.dtype)).astype(state.x.dtype)

@@ -1,13 +1,13 @@
-"""Reverse mode by JAX itself, through the program's own steps, like `jax.grad` of a rollout.
+"""Reverse-mode differentiation by JAX through all operations of the steps, like `jax.grad` of the run.
 
-A chunk is a scan over a fixed number of steps with one neighbor list, which bounds the memory of reverse
-mode. When the list expires, the remaining steps of the chunk do nothing, and the host builds the next list
-at the positions that this program has reached. States between chunks are kept, every second one if they are
-too many, and the steps between kept states are run again.
+A chunk is a scan over a fixed number of steps with one neighbor list; the number limits the memory of reverse
+mode. When the list expires, the remaining steps of the chunk do nothing, and the host builds the next list at
+the current positions. States between chunks are stored. If they are too many, every second state is dropped,
+and the steps between stored states are run again.
 
-The differentiated program makes its own decisions. Reverse mode needs a forward pass of its own, which a
-compiler may round differently; the gradient then belongs to a trajectory that nobody simulated. Therefore
-every step's state and decisions are compared with those of the run.
+The forward pass of the differentiated program may round differently from an ordinary run, and therefore make
+other decisions; the gradient then belongs to another trajectory. For this reason, state and decisions of
+every step are compared with those of an ordinary run.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _CHUNK_BYTES, _PER_SLOT = 2**28, 256
 
 
 class Inputs(NamedTuple):
-    """All inputs that a rollout can be differentiated by."""
+    """All inputs with respect to which a run can be differentiated."""
 
     model: Any  # the quantities of the force
     numbers: Any  # those of the integrator
@@ -56,8 +56,8 @@ class Inputs(NamedTuple):
 
 
 class StepEnds(NamedTuple):
-    """Differentiable results of one step and inputs of the next, user's order: wrapped positions, half-kicked
-    velocities, sums of the loss, the floating-point part of the extra state, and the box.
+    """Differentiable state between two steps, atoms in the user's order: wrapped positions, half-kicked
+    velocities, sums of the loss, floating-point part of the extra state, and the box.
     """
 
     x: Float[Array, "3 atoms"]
@@ -68,7 +68,7 @@ class StepEnds(NamedTuple):
 
 
 class RunConstants(NamedTuple):
-    """Constants of a run, not differentiated; the quantities of the force are taken from `Inputs`."""
+    """Constants of a run that are not differentiated; the parameters of the force are those of `Inputs`."""
 
     force: Any
     integrator: Any
@@ -83,7 +83,7 @@ class RunConstants(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Data without a derivative that are needed to continue the program: integers and the list."""
+    """State without derivatives that is needed to continue a run: integers, and data of the neighbor list."""
 
     step: Int[Array, ""]  # the step whose forces come next
     images: Int[Array, "3 atoms"]  # lattice vectors taken off so far
@@ -94,7 +94,7 @@ class Place(NamedTuple):
 
 
 class ChunkRecord(NamedTuple):
-    """Results of a chunk of steps besides its final state."""
+    """Results of a chunk of steps other than its final state: status, states and decisions of each step."""
 
     place: Place  # where it ended
     rows: Int[Array, ""]  # steps done
@@ -116,7 +116,7 @@ def chunk(
     tables: Tables,
     rule: tuple[int, int, bool],
 ) -> tuple[StepEnds, ChunkRecord]:
-    """Run a chunk of steps with one neighbor list; differentiable by the first two arguments.
+    """Run a chunk of steps with one neighbor list; differentiable in the first two arguments.
 
     Args:
         limit: largest number of steps. seen: which of the chunk's steps the loss uses.
@@ -202,13 +202,13 @@ def keep(inputs, between, *rest, rule):
 
 @jax.jit
 def pull(back, onto_between: StepEnds, onto_inputs: Inputs) -> tuple[StepEnds, Inputs]:
-    """Apply the reverse function of a chunk to cotangents; cotangents of the inputs are summed."""
+    """Propagate cotangents backward through a chunk of steps, and sum the cotangents of the inputs."""
     by_inputs, by_between = back(onto_between)
     return by_between, jax.tree.map(jnp.add, onto_inputs, by_inputs)
 
 
 class Snapshot(NamedTuple):
-    """A state between two chunks of steps; `slots` is the capacity of its list, 0 if set from the density."""
+    """A state between two chunks of steps; `slots` is the capacity of the neighbor list (0: default)."""
 
     between: StepEnds
     place: Place
@@ -216,7 +216,7 @@ class Snapshot(NamedTuple):
 
 
 class ChunkedProgram:
-    """The program of a problem, run in chunks of steps."""
+    """A simulation with a loss, run in chunks of steps, each of which JAX can differentiate."""
 
     def __init__(self, problem: Problem):
         simulation = problem.simulation
@@ -260,12 +260,12 @@ class ChunkedProgram:
         return Snapshot(between, record.place, self.list_of(at)[0].slots)
 
     def keep(self, at: Snapshot, rows: int) -> tuple[ChunkRecord, Any]:
-        """Return the record and the reverse function of one chunk of steps."""
+        """Run one chunk of steps; return its record and its reverse function."""
         _, back, record = keep(*self._arguments(at, rows), rule=self.rule)
         return record, back
 
     def list_of(self, at: Snapshot) -> tuple[PairTable, Tables]:
-        """Return the neighbor list in use at a snapshot."""
+        """Return the neighbor list of a snapshot."""
         key = (int(at.place.built), at.slots)
         if self._used is None or self._used[0] != key:
             self._verlet.slots = at.slots
@@ -277,7 +277,7 @@ class ChunkedProgram:
         return self._used[1]
 
     def cotangents(self, start: StepEnds, inputs: Inputs) -> Cotangents:
-        """Return the derivatives by all inputs, from the cotangents of `Inputs` and of the start."""
+        """Convert cotangents of `Inputs` and of the start to derivatives with respect to all inputs."""
         numbers, x, v = onto_start(self.simulation, self.start.between, start.extra)
         inputs = inputs._replace(numbers=jax.tree.map(jnp.add, inputs.numbers, numbers))
         start = start._replace(x=start.x + x, v=start.v + v)
@@ -298,7 +298,7 @@ class ChunkedProgram:
 
 @dataclass(frozen=True)
 class Unrolled(Method):
-    """The derivative of the steps that ran, computed by JAX."""
+    """Gradient method: derivative of the steps, computed by JAX in reverse mode."""
 
     # bytes of states that are kept, evenly spread; those between two of them are made again
     budget: int = KEPT
@@ -366,7 +366,7 @@ Marks = dict[int, tuple[bytes, tuple[int, int]]]
 
 
 def marks(first: int, rows: range, x, v, bits, table: PairTable) -> Iterator[tuple[int, Any]]:
-    """Yield digests of the states and decisions of steps with one list, in whose order the arrays are."""
+    """Yield (step, hashes of state and decisions) for steps with one neighbor list."""
     x, v, bits = (np.asarray(part) for part in (x, v, bits))
     for row in rows:
         state = fingerprint(table.order, x[row], v[row])
@@ -374,7 +374,7 @@ def marks(first: int, rows: range, x, v, bits, table: PairTable) -> Iterator[tup
 
 
 def departure(run: Mapping[int, Any], other: Mapping[int, Any]) -> dict[str, int | None]:
-    """Return the first steps at which two programs differ in the bits of the state or in pairs inside."""
+    """Return the first steps at which the states, and the pairs inside the cutoff, of two programs differ."""
     both = sorted(run.keys() & other.keys())
     different = [[step for step in both if run[step][k] != other[step][k]] for k in (0, 1)]
     state, decision = (steps[0] if steps else None for steps in different)

@@ -1,8 +1,8 @@
-"""Diagnosis of the gradient of a rollout: how far the gradient can be trusted, and what contributes to it.
+"""Diagnosis of a simulation's gradient: how far the gradient can be trusted, and what contributes to it.
 
-Methods answer different questions: the derivative of the steps that ran, the derivative of the flow including
-the times of its flips, the slope of the loss between shifted runs, the slope of an average, the derivative of
-another program. Two derivatives that differ need not contradict one another: `agreement` names the reason.
+Gradient methods compute different quantities: the derivative of the steps that ran, the derivative of the
+flow including the times of flips, the slope of the loss between runs at shifted parameters, the slope of an
+average, or the derivative of another program. The function `agreement` gives the reason for each difference.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _ERRORS = 5.0
 
 @dataclass(frozen=True)
 class Opinion:
-    """The gradient computed by one method."""
+    """The gradient computed by one method, or the reason why there is none."""
 
     method: str  # its name
     description: str  # which derivative it gives, one sentence
@@ -66,7 +66,7 @@ class Opinion:
 
 @dataclass(frozen=True)
 class GradientDifference:
-    """Comparison of two methods' derivatives with respect to one parameter."""
+    """Comparison of the derivatives with respect to one parameter from two methods."""
 
     name: str  # full name of the parameter
     # method, reference: names of the two methods
@@ -83,7 +83,7 @@ class GradientDifference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Comparison of all applicable gradient methods, for one run."""
+    """Gradients of one run by several methods, and comparisons with a reference method."""
 
     horizon: int  # steps
     reference: str  # name of the method that the others are compared with
@@ -92,7 +92,7 @@ class Agreement:
     comparisons: tuple[GradientDifference, ...]
 
     def gradient(self, method: str) -> Gradient | None:
-        """Return the gradient computed by a given method."""
+        """Return the gradient computed by the method with this name; None if there is none."""
         return next((one.found for one in self.opinions if one.method == method), None)
 
 
@@ -105,7 +105,7 @@ def agreement(
     growth: float = 1.0,
     progress: Progress | None = None,
 ) -> Agreement:
-    """Compute the gradient by several methods, and explain their differences.
+    """Compute the gradient by several methods, and give a reason for each difference.
 
     Args:
         names: parameters; a method that does not support all of them is applied to those that it supports.
@@ -144,7 +144,7 @@ def agreement(
 
 
 def _asked(method: Method, problem: Problem, names: Sequence[str], progress: Progress | None) -> Opinion:
-    """Compute the gradient by one method, for all parameters or for those that the method supports."""
+    """Compute the gradient by one method, for all parameters that the method supports."""
     began = time.perf_counter()
 
     def report(done: int, steps: int, phase: str) -> None:
@@ -164,7 +164,7 @@ def _asked(method: Method, problem: Problem, names: Sequence[str], progress: Pro
 def compare(
     name: str, one: Gradient, reference: Gradient, unit: float, growth: float, *, jumps: bool
 ) -> GradientDifference:
-    """Compare the derivatives by one parameter in two gradients.
+    """Compare the derivatives with respect to one parameter in two gradients.
 
     Args:
         unit: unit roundoff of the run's state or forces, whichever is coarser.
@@ -189,7 +189,7 @@ def _meaning(
     name: str, one: Gradient, reference: Gradient, size: float, relative: float, rounding: float,
     grown: float, jumps: bool,
 ) -> tuple[str, dict[str, float] | None]:  # fmt: skip
-    """Return why two derivatives differ, and the supporting numbers; None stands for the rounding bound."""
+    """Return the reason why two derivatives differ, and supporting numbers (None: the rounding bound)."""
     kinds = {one.kind: one, reference.kind: reference}
     if not np.isfinite(relative):
         return "unexplained", {}
@@ -223,15 +223,15 @@ def _meaning(
 
 @result
 class GradientDiagnosis:
-    """Whether a gradient can be trusted, and how far. Parts that were not requested are None.
+    """Results on whether and how far a gradient can be trusted. Results that were not requested are None.
 
     Attributes:
         horizon: steps. names: full names of the parameters. value: the loss.
-        agreement, growth, spectrum, trust, flips, detective, scaling: results of the functions of the same
-            name.
+        agreement, growth, spectrum, trust, flips, detective, scaling: results of the functions with these
+            names.
         edges: boundaries of decisions, by parameter.
         notes: warnings about single parameters: no dependence, a missing term.
-        failed: parts that were requested and are not available, with the reason.
+        failed: results that were requested and are not available, with the reason.
     """
 
     horizon: int
@@ -262,7 +262,7 @@ def diagnose(
     format: str = "float16",
     progress: Progress | None = None,
 ) -> GradientDiagnosis:
-    """Examine whether a gradient can be trusted, how far, and what contributes to it.
+    """Examine whether and how far a gradient can be trusted, and what contributes to the gradient.
 
     Args:
         names: parameters, full or short names. parts: which of PARTS to compute.
@@ -358,7 +358,7 @@ def diagnose(
 
 
 def _methods(asked: Sequence[str | Method] | None) -> list[Method]:
-    """Return the given gradient methods as objects; all methods if none were given."""
+    """Return gradient methods as objects, given as names or objects; all methods if none are given."""
     return [by_name(one) if isinstance(one, str) else one for one in (METHODS if asked is None else asked)]
 
 

@@ -1,10 +1,10 @@
-"""Search for the first operation of a reverse pass that is not finite although its run is finite.
+"""Search for the first operation in a reverse pass whose result is not finite, although the run is finite.
 
-A force can be finite while its derivative is not, a loss can have a square root at zero, a sum can overflow
-its format in the reverse pass. The reverse pass is repeated up to the step at which a number stops being
-finite, and this step is run operation by operation. An operation is at fault if its inputs are finite and its
-result is not, and if repairing it repairs the program's result: a number that is masked out later does no
-harm.
+For example, a force can be finite while its derivative is not, a loss can contain a square root at zero, or a
+sum can overflow in the reverse pass. The reverse pass is repeated up to the first step with a number that is
+not finite, and this step is run operation by operation. An operation is the cause if its inputs are finite
+and its result is not, and if a finite result in its place makes the program's result finite: a number that is
+masked out later has no effect.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _PARTS = (
 
 @dataclass(frozen=True)
 class NotFinite:
-    """Location at which a reverse pass stops being finite."""
+    """The step, the operation and the pair at which numbers in a reverse pass become infinite or NaN."""
 
     found: bool = False  # whether it does at all
     forward: bool = True  # whether the forward run, its loss included, is finite
@@ -66,7 +66,7 @@ def detective(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> NotFinite:
-    """Find the first step and operation of the reverse pass that is not finite, and the pair at fault.
+    """Find the first step, operation and pair with a result that is not finite in the reverse pass.
 
     Args:
         problem: the loss of a rollout of a pair potential.
@@ -106,7 +106,7 @@ def detective(
 
 
 def _in_forward(tape: RunTape) -> NotFinite:
-    """Find the first frame at which the loss of a finite run is not finite."""
+    """Find the first frame of a finite run at which the loss is not finite."""
     for stretch in tape.forward():
         seen = tape.seen(stretch)
         for row in np.flatnonzero(seen[: stretch.rows]):
@@ -120,7 +120,7 @@ def _in_forward(tape: RunTape) -> NotFinite:
 
 
 def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFinite:
-    """Run the reverse pass of one step, operation by operation, and find the operation at fault."""
+    """Run the reverse pass of one step operation by operation, and find the operation that is the cause."""
     whole = back.arguments(stretch)
     loss, origin, *rest = whole[8]
     # the energy of the frame of step 0 is not known there, and nothing that is finite has used it
@@ -138,7 +138,7 @@ def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFi
 
 
 def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
-    """Return the arguments of a reverse pass over a range of rows."""
+    """Return the arguments of a reverse pass over a range of rows (steps of a stretch)."""
     out = list(arguments)
     for k in (4, 5, 7):
         out[k] = jax.tree.map(lambda leaf: leaf[first:end], out[k])
@@ -152,7 +152,7 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 def _pair(
     back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
-    """Return labels and distance of the pair to which an operation's result belongs; -1, -1, NaN if none."""
+    """Return atoms and distance of the pair to which an operation's result belongs; -1, -1, NaN if none."""
     nowhere = (-1, -1, float("nan"))
     if made is None or not made.index:
         return nowhere

@@ -1,13 +1,13 @@
-"""Contribution of each flip to a gradient, and the gradient's jump at the nearest boundaries of decisions.
+"""Contribution of each flip to a gradient, and jumps of a gradient where decisions change.
 
-The contribution of a crossing is the derivative of the loss by its own cutoff, times the distance by which
-the cutoff moves ahead of the pair. The first factor, from a reverse pass, includes all later flips; the
-second factor, from tangents, includes no earlier flip. So the contributions of all flips sum exactly to the
-total contribution of flips.
+The contribution of a crossing is a product of two factors. The first factor, from a reverse pass, is the
+derivative of the loss with respect to the cutoff of this crossing alone; it includes the effect of all later
+flips. The second factor, from tangents without flips, is the distance by which the cutoff moves ahead of the
+pair. The contributions of all flips therefore sum exactly to the total contribution of flips.
 
-Between two boundaries every run makes the same decisions, and loss and gradient are smooth functions of the
-parameter. At a boundary the decision on one pair differs between two adjacent floats: an optimizer step
-across the boundary changes the decisions, and the two gradients show how useful such a step is.
+A decision boundary is a value of a parameter at which the decision on a pair changes, between two adjacent
+floats. Between two boundaries all runs make the same decisions, and loss and gradient are smooth functions of
+the parameter. The gradients on both sides of a boundary show how useful an optimizer step across it is.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ _FIRST, _FACTOR = 1e-12, 8.0
 
 @dataclass(frozen=True)
 class FlipTerms:
-    """Contribution of each flip to the gradient, largest first.
+    """Contributions of all flips to the derivative with respect to each number, largest first.
 
-    Here a number is a scalar parameter, or one entry of an array parameter such as "potential.sigma[1]".
+    A number is a scalar parameter, or one entry of an array parameter such as "potential.sigma[1]".
     """
 
     # a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the decision,
@@ -68,7 +68,7 @@ def flips(
     made: ReversePass | None = None,
     progress: Progress | None = None,
 ) -> FlipTerms:
-    """Compute the contributions of all flips to a gradient, largest first.
+    """Compute the contribution of each flip to a gradient, and sort flips by contribution.
 
     Args:
         problem: of a pair potential. names: parameters, full or short names.
@@ -170,10 +170,10 @@ class DecisionEdges:
 def edges(
     problem: Problem, name: str, *, reach: float = REACH, progress: Progress | None = None
 ) -> DecisionEdges:
-    """Find the nearest decision boundaries below and above a parameter, and the gradients on both sides.
+    """Find the nearest decision boundaries below and above a parameter's value, with gradients on both sides.
 
-    Tangents predict where a pair first crosses differently; then runs on either side are compared, until two
-    adjacent floats differ.
+    Tangents predict the parameter shift at which a decision first changes. Runs near this value are then
+    compared, until two adjacent floats with different decisions are found.
 
     Args:
         problem: of a pair potential. name: a parameter of one entry.
@@ -211,7 +211,7 @@ def edges(
 
 
 def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[int, float]:
-    """Predict the smallest positive and negative parameter shifts at which a pair crosses; else infinity."""
+    """Predict by tangents the smallest parameter shift of either sign at which a pair crosses its cutoff."""
     if name == "box.scale":
         # the images move too, which these differences of positions leave out
         return {-1: np.inf, 1: np.inf}
@@ -285,7 +285,7 @@ def _edge(
 
 
 def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:
-    """Return the loss of another simulation, and its derivatives by one parameter for each method."""
+    """Return the loss of a simulation, and its derivative with respect to one parameter by two methods."""
     there = Problem(simulation, problem.loss, problem.steps)
     tape = tape_of(there, True)
     found = {

@@ -1,13 +1,13 @@
-"""Growth of a gradient with the horizon, its fit into a narrow type, and the growth of perturbations.
+"""Growth of a gradient with the number of steps, its range in a narrow type, and growth of perturbations.
 
-The cotangent of the state h steps before the end is the gradient of a run of h steps that starts there. So
-one reverse pass over T steps holds a gradient for every horizon up to T, each with a different start on the
-same trajectory. Cotangents of a chaotic run span many powers of two: one loss scale helps if they are small
-everywhere, but not if they span more powers than the narrow format.
+The cotangent of the state h steps before the end is the gradient of a run of h steps (horizon h) from this
+state. One reverse pass over T steps therefore gives a gradient for every horizon up to T, each with a
+different start on the same trajectory. Cotangents of a chaotic run span many powers of two: a loss scale
+helps if all cotangents are small, but not if their range exceeds that of the narrow format.
 
-The largest singular values of a run's Jacobian bound every gradient of a loss of the last state. The singular
-values come from subspace iteration with a random block (Halko, Martinsson and Tropp 2011), orthonormalized
-after every stretch, so that lengths do not overflow and the vectors do not become parallel.
+The largest singular value of a run's Jacobian bounds the gradient of any loss of the last state. Singular
+values are computed by subspace iteration with a random block (Halko, Martinsson and Tropp 2011), which is
+orthonormalized after every stretch of steps to prevent overflow and parallel vectors.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _RANGE = 30.0
 
 @dataclass(frozen=True)
 class GradientGrowth:
-    """Growth of the gradient with the horizon, from one reverse pass."""
+    """Norms of the gradient for every horizon (number of steps), and their rate of growth."""
 
     # a row for each horizon 0, 1, ..., T, of the state that many steps before the end: `horizon`, `step`,
     # `onto_positions` and `onto_velocities` (norms of the derivatives by all of them), `size` (norm of both,
@@ -73,7 +73,7 @@ class GradientGrowth:
 
 
 class GrowthWatch:
-    """Collector of the data of `GradientGrowth` during a reverse pass, by full names of parameters."""
+    """Collector of norms and derivatives at every step of a reverse pass, for `GradientGrowth`."""
 
     def __init__(self, simulation: Simulation, names: Sequence[str], steps: int):
         self.simulation, self.names, self.steps = simulation, tuple(names), steps
@@ -109,9 +109,8 @@ class GrowthWatch:
                 self.gradient[name][first + row] = value
 
     def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> GradientGrowth:
-        """Return the growth. The last row of the growth table is the gradient of the whole run, because a
-        loss may compare with the start, and this comparison is not in the cotangents carried from step to
-        step.
+        """Return the table of norms and its growth rate. The last row is the gradient of the whole run,
+        because a loss may depend on the first frame too, and cotangents of single steps lack this dependence.
         """
         units = self.simulation.units
         timestep = float(self.simulation.integrator.timestep)
@@ -142,7 +141,7 @@ class GrowthWatch:
 
 
 def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
-    """Return an entry of WORDS; a run is bounded if its rms speed stays within a factor of the median."""
+    """Classify a run by an entry of WORDS: from growth of the gradient and outliers of the rms speed."""
     usual = float(np.median(speed))
     if usual > 0 and not (np.isfinite(speed).all() and speed.max() <= _WILD * usual):
         return WORDS[2]
@@ -158,7 +157,7 @@ def growth(
         InputError: a parameter does not exist, or flips were requested without a pair potential.
         NumericalError: the run blew up.
 
-    Error: the error of the reverse pass; horizons below T belong to later starts of the same run.
+    Error: the error of the reverse pass. Horizons below T belong to later starts of the same run.
     """
     names = parameters.resolve(problem.simulation, names)
     watch = GrowthWatch(problem.simulation, names, problem.steps)
@@ -168,7 +167,7 @@ def growth(
 
 @dataclass(frozen=True)
 class Scaling:
-    """Whether the cotangents of a reverse pass fit a narrow type, step by step."""
+    """Overflow and underflow of the cotangents of each step in a narrow floating-point type."""
 
     format: str  # the type, one of numerics.formats
     numbers: int  # in each step
@@ -186,7 +185,7 @@ class Scaling:
 
 
 class ScalingWatch:
-    """Collector of overflow and underflow counts during a reverse pass."""
+    """Collector of overflow and underflow counts at every step of a reverse pass, for `Scaling`."""
 
     def __init__(self, steps: int, format: str = "float16"):
         self.format = formats.format_of(format)
@@ -203,7 +202,7 @@ class ScalingWatch:
             self.put(stretch.first + row, np.concatenate(list(both)))
 
     def put(self, step: int, values: Float[np.ndarray, "numbers"]) -> None:
-        """Count the cotangents of one step."""
+        """Count overflow and underflow among the cotangents of one step."""
         form, size, table = self.format, np.abs(values), self.table
         self.numbers = len(values)
         there = size[np.isfinite(size) & (size > 0)]
@@ -220,7 +219,7 @@ class ScalingWatch:
             table["largest"][step] = np.inf
 
     def result(self) -> Scaling:
-        """Return the counts without and with the best scale; exact except for numbers at a power of two."""
+        """Return the counts without scale and with the best scale of the loss, a power of two."""
         form = self.format
         largest = float(self.table["largest"].max())
         there = self.exponents.sum(axis=1, dtype=np.int64)
@@ -251,9 +250,9 @@ class ScalingWatch:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Growth of small perturbations of the start: singular values of the product of all step Jacobians.
+    """Growth of small perturbations of the initial state: singular values of the Jacobian of the whole run.
 
-    The norm of a perturbation combines positions, and velocities times `clock`.
+    The norm of a perturbation includes positions, and velocities times the internal time `clock`.
     """
 
     steps: int  # of the run
@@ -274,7 +273,7 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class TangentImage:
-    """Image of a block of orthonormal vectors, stored as basis @ mixing * exp(log_scale)."""
+    """Image of a block of orthonormal vectors under a Jacobian, stored as basis @ mixing * exp(log_scale)."""
 
     basis: Float[np.ndarray, "coordinates vectors"]  # orthonormal, shape (coordinates, vectors)
     mixing: Float[np.ndarray, "vectors vectors"]  # upper triangular, of size one, shape (vectors, vectors)
@@ -285,9 +284,9 @@ class TangentImage:
 
 
 class Jacobian:
-    """The derivative of the last state by the state of step 0, at fixed decisions.
+    """Derivative of the last state with respect to the state of step 0, at fixed decisions.
 
-    A state is a flat vector of positions and velocities times `clock`, an internal time.
+    A state is a vector of all positions, and of all velocities times the internal time `clock`.
 
     Raises:
         InputError: a many-body potential, or an integrator that is not a linear `KickDrift`.
@@ -304,7 +303,7 @@ class Jacobian:
         self.coordinates = 6 * tape.simulation.atoms
 
     def image(self, block: Float[np.ndarray, "coordinates vectors"], backward: bool = False) -> TangentImage:
-        """Return the image of an orthonormal block under the Jacobian (its transpose if `backward`)."""
+        """Return the image of a block under the Jacobian, or under its transpose if `backward`."""
         stretches = self.tape.backward() if backward else self.tape.forward()
         vectors, steps = block.shape[1], self.tape.steps
         mixing, log_scale = np.eye(vectors), 0.0
@@ -341,7 +340,7 @@ class Jacobian:
 
 
 def _orthonormal(block):
-    """Return the QR factors of a block, with a diagonal that is not negative."""
+    """Return the QR factors of a block of vectors, with no negative number on the diagonal of R."""
     q, r = np.linalg.qr(block)
     signs = np.where(np.diag(r) < 0, -1.0, 1.0)
     return q * signs, signs[:, None] * r
@@ -398,9 +397,9 @@ def spectrum(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> Spectrum:
-    """Compute singular values and finite-time Lyapunov exponents of the product of all step Jacobians.
+    """Compute singular values of the Jacobian of the whole run, and finite-time Lyapunov exponents.
 
-    Decisions are held fixed: the effect of flips on a perturbation is not included.
+    Decisions are fixed to the recorded decisions: the effect of flips on a perturbation is not included.
 
     Args:
         values: number of singular values. extra: additional vectors, for faster convergence.
@@ -453,7 +452,7 @@ def spectrum(
 
 
 def _defect(start, there: TangentImage, back: TangentImage) -> float:
-    """Return the relative error of the identity Q' (Phi q) = (Phi' Q)' q."""
+    """Return the relative error of Q' (Phi q) = (Phi' Q)' q, a test of the transposed Jacobian."""
     forward = there.mixing
     factor = np.exp(np.clip(back.log_scale - there.log_scale, -600, 600))
     backward = factor * (back.basis @ back.mixing).T @ start
@@ -461,7 +460,7 @@ def _defect(start, there: TangentImage, back: TangentImage) -> float:
 
 
 def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the logarithms of the singular values of a map on a block, and both sets of vectors."""
+    """Return logarithms of the singular values, left vectors and right vectors of a map on a block."""
     diagonal = image.stretches[-1]
     if diagonal.max() - diagonal.min() > _RANGE:
         # rounding has eaten the small ones in the product; the block is aligned, so its diagonal has them
@@ -473,7 +472,7 @@ def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _residual(jacobian: Jacobian, left, right, log_s) -> np.ndarray:
-    """Return |Phi' u - s v| / s of each pair of singular vectors."""
+    """Return the residual |Phi' u - s v| / s of each pair of singular vectors u and v."""
     back = jacobian.image(left, backward=True)
     with np.errstate(over="ignore"):
         image = (back.basis @ back.mixing) * np.exp(back.log_scale - log_s)

@@ -1,14 +1,14 @@
-"""Pairs that turn around near their cutoff: contributions of flips that almost happened.
+"""Pairs whose distance turns around near the cutoff: contributions of flips that almost happened.
 
-A pair that turns back just outside its cutoff leaves no flip. If the pair had come a little closer, it would
-have entered and left at a radial speed near zero, and each of the two crossings would have contributed a term
-proportional to one over this speed. So every turning point within reach of the cutoff counts, on either side
-and also between two steps: a pair that passes the cutoff contributes to the gradient, and this contribution
-could vanish.
+A pair that turns back just outside its cutoff causes no flip. If the pair came slightly closer, it would
+enter and leave at a radial speed near zero, and the contribution of each crossing to the gradient would be
+proportional to the inverse of this speed. Conversely, a pair that passes the cutoff by little contributes to
+the gradient, and this contribution could vanish. All turning points near the cutoff are therefore examined,
+on either side and also between two steps.
 
-Near the turning point r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth d crosses it
-twice with the speed sqrt(2 a d), and the two crossings contribute 2 w / sqrt(2 a d), where w is the
-contribution of one crossing at unit speed.
+Near the turning point the distance is r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth
+d crosses the cutoff twice at speed sqrt(2 a d), and the two crossings contribute 2 w / sqrt(2 a d), where w
+is the contribution of one crossing at unit speed.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _NUMBERS = ("gap", "bend", "side", "unseen", "part", "before", "after", *_LATER)
 
 @dataclass(frozen=True)
 class Turns:
-    """Turning points of pairs near their cutoff.
+    """Table of turning points of pair distances near the cutoff.
 
     Attributes:
         table: one row per turning point, in the order of steps:
@@ -78,12 +78,12 @@ class Turns:
 
     @property
     def gap(self) -> Float[np.ndarray, "turns"]:
-        """Distance left to the cutoff with the shorter steps; negative if the pair is beyond the cutoff."""
+        """Distance to the cutoff in the run with shorter steps; negative if the pair is beyond the cutoff."""
         return self.table["gap"] + self.table["side"] * self.table["finer"]
 
     @property
     def reach(self) -> Float[np.ndarray, "turns"]:
-        """Uncertainty of the distance at a turning point, from its own shift and those of adjacent points."""
+        """Uncertainty of the distance at each turning point, from its shifts in other runs."""
         if not len(self):
             return np.zeros(0)
         shift = self.table["shift"]
@@ -95,14 +95,14 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """Whether each pair may lie beyond its cutoff (or short of it), or did so without a recorded flip."""
+        """True if the cutoff is within the uncertainty, or was passed only between two steps."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """Magnitude of the contribution of the two crossings at each turning point. Within reach of the
-        cutoff, the pair is assumed to pass it by 1 % of the reach; beyond, the value is the change with
-        shorter steps.
+        """Magnitude of the possible contribution of the two crossings at each turning point. If the cutoff is
+        within the uncertainty, the pair is assumed to pass the cutoff by 1 % of the uncertainty; otherwise
+        the value is the change of the contribution with shorter steps.
         """
         bend, reach = self.table["bend"], self.reach
 
@@ -119,7 +119,7 @@ class Turns:
     def heaviest(
         self, words: tuple[str, ...], named: Callable[[Any], dict[str, Any]], most: int = 10
     ) -> list[dict[str, Any]]:
-        """Return the turning points with the largest contributions as plain rows, with terms by parameter.
+        """Return the turning points with the largest possible contributions, as rows of plain values.
 
         Args:
             named: returns further columns for a kind of decision.
@@ -140,7 +140,7 @@ class Turns:
 
 @dataclass
 class Near:
-    """Collector of turning points during a reverse pass, a tangent pass, and other runs."""
+    """Collector of turning points, their weights, and shifts in other runs, during passes through a run."""
 
     simulation: Simulation
     pace: Pace  # how often the loss looks
@@ -153,11 +153,11 @@ class Near:
 
     @property
     def jumps(self) -> bool:
-        """Whether a crossing contributes to the gradient, because the force or the energy of a pair jumps."""
+        """True if crossings contribute to the gradient: force or energy of a pair jumps at the cutoff."""
         return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
 
     def reverse(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Collect turning points and weights from a stretch of the event-aware reverse pass, last first."""
+        """Find turning points in a stretch of steps, and compute their weights from cotangents."""
         if not self.jumps:
             return
         simulation = self.simulation
@@ -183,7 +183,7 @@ class Near:
         found["weight"] = force * along + seen
 
     def tangents(self, part: StretchTangents) -> None:
-        """Compute from a stretch of tangents how far the distance at each turning point moves."""
+        """Compute from tangents how each parameter changes the distance to the cutoff at turning points."""
         simulation, stretch = self.simulation, part.stretch
         if part.dr is not None and part.dr_cut is not None:
             self.moved.append(part.dr_cut - part.dr)
@@ -207,7 +207,7 @@ class Near:
         found["moved"] = np.asarray(along.r_cut).T[found["kind"]] - dr
 
     def compared(self, stretch: TapeStretch, per: int) -> None:
-        """Process one stretch of another run, which takes `per` steps for each step of this run."""
+        """Compare distances at turning points with another run, which has `per` steps for each step."""
         cell, place = HostCell(self.simulation.cell), stretch.table.place
         for found in self._found.values():
             for earlier, name in ((1, "before"), (0, "after")):
@@ -226,7 +226,7 @@ class Near:
                     found["finer"][here] += (1 - part if earlier else part) * further
 
     def turns(self, columns: int) -> Turns:
-        """Return all turning points, in the order of their steps."""
+        """Return all turning points that were found, in the order of their steps."""
         rows = [
             # where no tangents have been, how far the cutoff moves is not known
             found | {"moved": found.get("moved", np.full((len(found["step"]), columns), np.nan))}
@@ -238,7 +238,7 @@ class Near:
 
 
 def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, np.ndarray]:
-    """Concatenate tables; without any tables, return a table without rows."""
+    """Concatenate tables of turning points; return an empty table if no table is given."""
     empty = {name: np.zeros(0, np.int64) for name in _WHOLE}
     empty |= {name: np.zeros((0, 3)) for name in _VECTORS} | {name: np.zeros(0) for name in _NUMBERS}
     empty |= more
@@ -249,7 +249,7 @@ def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, 
 def hermite(
     r0: np.ndarray, s0: np.ndarray, r1: np.ndarray, s1: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the extremum of the cubic through two distances and their rates, which have opposite signs.
+    """Find the extremum of the cubic through two distances whose rates of change have opposite signs.
 
     Args:
         r0, s0, r1, s1: distance and its rate at the two ends. time: between the ends.
@@ -270,7 +270,7 @@ def hermite(
 
 
 def turning(simulation: Simulation, stretch: TapeStretch) -> dict[str, np.ndarray]:
-    """Find turning points of pairs near their cutoff in a stretch of steps, from distances and their rates.
+    """Find turning points of pairs near their cutoff in a stretch of steps, by cubic interpolation.
 
     Returns:
         the table of `Turns`, with weights and shifts still 0, and without the column `moved`.

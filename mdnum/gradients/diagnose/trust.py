@@ -1,13 +1,13 @@
-"""The longest horizon at which a gradient can be trusted, and what limits the horizon.
+"""The largest number of steps (horizon) for which a gradient can be trusted, and what limits it.
 
-Five limits are examined: the run's rounding errors have grown until another precision gives another gradient;
-half the time step gives another gradient; a pair turned around so close to its cutoff that another time step
-could add or remove a flip with a relevant contribution; a decision was so close to its threshold that
-rounding determined it; the gradients of other starts of the same system scatter by more than their mean. Each
-limit is independent, and an unexamined one leaves the verdict undecided: recorded flips do not show which
-flips almost happened, and rounding errors do not show the error of the time step.
+A gradient ceases to be trusted in five cases. (1) Another precision gives a different gradient, because
+rounding errors have grown. (2) Half the time step gives a different gradient. (3) A pair turned around so
+close to its cutoff that another time step could add or remove a flip with a relevant contribution. (4) A
+decision was so close to its threshold that rounding determined the decision. (5) Gradients from other starts
+of the same system scatter by more than their mean. These limits are independent; if one is not examined, the
+verdict remains undecided.
 
-The gradients of all shorter runs come from one run and one pass of tangents.
+The gradients for all horizons are computed from one run and one pass of tangents.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ TRUSTED, LIMITED, UNDECIDED = "trusted", "limited", "undecided"
 
 
 class Shorter(Loss):
-    """One loss for several runs that are the first steps of one run; its sums have an axis of horizons."""
+    """A loss evaluated for several runs that start together and end at different steps (horizons)."""
 
     name = "shorter"
     inner: Loss = eqx.field(kw_only=True)  # the loss
@@ -88,17 +88,17 @@ class Shorter(Loss):
         return jax.tree.map(spread, seen)
 
     def value(self, total, frames):
-        """Return the loss of the run with the longest horizon."""
+        """Return the loss of the longest run."""
         return self.of(total, self.table.shape[1] - 1)
 
     def of(self, total: Any, k: int) -> Float[Array, ""]:
-        """Return the loss of the run that ends at horizon number k."""
+        """Return the loss of the run that ends at the horizon with index k."""
         frames = int(np.asarray(self.table)[:, k].sum())
         return self.inner.value(jax.tree.map(lambda leaf: leaf[k], total), frames)
 
 
 def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Problem:
-    """Return a problem whose loss covers every shorter run, with `per` steps for one step of the run.
+    """Return a problem that evaluates the loss at several horizons, with `per` steps for each given step.
 
     Args:
         at: horizons, rising; the last horizon is the length of the run.
@@ -115,7 +115,7 @@ def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Pr
 
 @dataclass(frozen=True)
 class Horizons:
-    """Losses and gradients of several runs that differ in length."""
+    """Losses and gradients of runs with the same start and different numbers of steps."""
 
     at: Int[np.ndarray, "points"]  # horizons, steps
     columns: tuple[ParameterEntry, ...]  # the numbers that are differentiated by
@@ -124,7 +124,7 @@ class Horizons:
     flips: Int[np.ndarray, "flips 4"]  # step, pair and whether it entered, of each flip of the run, in order
 
     def by_name(self) -> dict[str, Float[np.ndarray, "points entries"]]:
-        """Return the gradient at every horizon, by parameter."""
+        """Return the gradient at every horizon, with one array per parameter."""
         names = [column.name for column in self.columns]
         return {
             name: self.gradient[:, [k for k, one in enumerate(names) if one == name]]
@@ -133,7 +133,7 @@ class Horizons:
 
 
 def spread(problem: Problem, points: int) -> Int[np.ndarray, "points"]:
-    """Return evenly spaced horizons, up to the whole run, at which the loss uses at least one frame."""
+    """Return evenly spaced horizons up to the length of the run, each with at least one frame of the loss."""
     steps = np.unique(np.round(np.linspace(0, problem.steps, points + 1)).astype(np.int64))[1:]
 
     def looks(h: int) -> bool:
@@ -157,7 +157,7 @@ def horizons(
     watch: Callable[[StretchTangents], None] | None = None,
     progress: Progress | None = None,
 ) -> Horizons:
-    """Compute the gradient of the loss of every shorter run from the same start.
+    """Compute loss and gradient of runs from the same start with different numbers of steps (horizons).
 
     Args:
         problem: of a pair potential. names: full names of the parameters; each entry takes one tangent.
@@ -199,7 +199,7 @@ def horizons(
 
 
 def first_difference(a: Horizons, b: Horizons) -> int | None:
-    """Return the first step at which the flips of two runs differ; None if they are equal."""
+    """Return the first step at which the flips of two runs differ; None if all flips are equal."""
     common = min(len(a.flips), len(b.flips))
     differ = np.flatnonzero((a.flips[:common] != b.flips[:common]).any(axis=1))
     k = int(differ[0]) if len(differ) else common
@@ -208,7 +208,7 @@ def first_difference(a: Horizons, b: Horizons) -> int | None:
 
 @dataclass(frozen=True)
 class Limit:
-    """One of the limits on the horizon of a trustworthy gradient."""
+    """One of the limits on the number of steps for which a gradient can be trusted."""
 
     what: str  # ROUNDING, STEP, NEAR, FLIPS, AMBIGUOUS or SCATTER
     # the longest horizon, in steps, at which it did no harm; None where it was not examined
@@ -220,7 +220,7 @@ class Limit:
 
 @dataclass(frozen=True)
 class Judgment:
-    """The trust horizon of the derivatives by one parameter, or by all parameters together."""
+    """The trust horizon of derivatives with respect to one parameter or to all parameters, and its limits."""
 
     # "trusted" where every limit was examined and none was met, "limited" where one was met, else "undecided"
     verdict: str
@@ -232,7 +232,7 @@ class Judgment:
 
 @dataclass(frozen=True)
 class Trust(Judgment):
-    """How far a gradient can be trusted; the overall verdict covers all parameters together."""
+    """How far a gradient can be trusted: overall verdict on all parameters, and verdict on each parameter."""
 
     by: dict[str, Judgment]  # of each parameter, by full name
     tolerance: float  # relative difference above which two precisions, or two time steps, disagree
@@ -246,11 +246,11 @@ class Trust(Judgment):
 
 
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
-    """Return a comparison run, and the formats of the given run that are narrower than float64.
+    """Return a simulation with other rounding for comparison, and the given run's formats below float64.
 
-    If any role has a format narrower than float64, the comparison run uses float64 for all roles. No hardware
-    format is wider than float64: a float64 run is compared with a run whose start is shifted by one rounding,
-    which shows the effect of rounding on the gradient, up to a factor of order one.
+    If the given run uses formats narrower than float64, the comparison uses float64 throughout. No hardware
+    format is wider than float64: a float64 run is compared with a run whose start is shifted by one rounding
+    error. This shift shows the effect of rounding on the gradient up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -274,7 +274,7 @@ def trust(
     growth: GradientGrowth | None = None,
     progress: Progress | None = None,
 ) -> Trust:
-    """Determine the horizon up to which a gradient can be trusted, and what limits the horizon.
+    """Determine the number of steps (horizon) up to which a gradient can be trusted, and what limits it.
 
     Args:
         problem: the loss of a rollout of a pair potential.
@@ -355,7 +355,7 @@ def trust(
     moved, ambiguous, chaotic = near and near.moved, ambiguity(problem), grew(growth)
 
     def judged(*chosen: str) -> Judgment:
-        """Return the verdict on the derivatives by some parameters."""
+        """Return the judgment on the derivatives with respect to the chosen parameters."""
         apart, halved, scattered = (
             {name: one[name] for name in chosen if name in one} for one in (differing, steps, scatter)
         )
@@ -387,7 +387,7 @@ def trust(
 
 
 def grew(growth: GradientGrowth) -> bool:
-    """Return whether a gradient grew so much that it is specific to this start."""
+    """Return whether a gradient grew so much with the number of steps that other starts may differ."""
     # over the first horizons all of them grow: velocities turn into lengths, and averages gain frames
     size = growth.table["size"][min(CLOCK_STEPS, len(growth.table["size"]) - 1) :]
     there = size[np.isfinite(size) & (size > 0)]
@@ -396,14 +396,14 @@ def grew(growth: GradientGrowth) -> bool:
 
 
 def no_half_step(simulation: Simulation) -> bool:
-    """Return whether a run at half the time step would have different noise, because of a thermostat."""
+    """Return whether a thermostat's noise would differ in a run at half the time step."""
     return simulation.integrator.random is not None
 
 
 def verdict_of(
     limits: Sequence[Limit], steps: int, chaotic: bool, skipped: bool
 ) -> tuple[str, int, str, tuple[str, ...]]:
-    """Return the verdict, the horizon up to which no limit was met, the limit met first, and unknowns."""
+    """Return the verdict, the horizon before any limit is reached, the first limit, and unexamined limits."""
     examined = [one for one in limits if one.horizon is not None]
     horizon = min((one.horizon or 0 for one in examined), default=0)
     met = [one.what for one in examined if one.reached and one.horizon == horizon]
@@ -418,11 +418,11 @@ def verdict_of(
 
 
 def _unseen(part: StretchTangents) -> None:
-    """Ignore the tangents of a stretch of steps."""
+    """Ignore the tangents of a stretch of steps (a callback without effect)."""
 
 
 def _digits(*relative: float) -> int:
-    """Return the number of digits in which two derivatives agree, by their larger relative difference."""
+    """Return the number of decimal digits that correspond to the largest of some relative differences."""
     worst = max(relative)
     if not np.isfinite(worst):
         return 0
@@ -440,7 +440,7 @@ def _missed(
     problem: Problem, own: Horizons, turns: Turns | None, unseen, made: ReversePass, moved, tolerance: float,
     saltation: bool, names: Sequence[str],
 ) -> Limit:  # fmt: skip
-    """Find the step from which omitted terms or near misses of the cutoff matter for the derivatives."""
+    """Find the step from which excluded flips or near misses of the cutoff are relevant for derivatives."""
     if not np.any(np.asarray(problem.simulation.jumps())):
         return Limit(NEAR, problem.steps, False, "no jump")
     if not saltation:
@@ -475,7 +475,7 @@ def _missed(
 
 
 def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
-    """Return terms as shares of the derivatives, and cumulative shares with terms added in quadrature."""
+    """Divide terms by the derivatives; return these shares, and their cumulative sums in quadrature."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
         share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))
@@ -486,7 +486,7 @@ def _left_out(
     made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
     tolerance: float,
 ) -> Limit | None:  # fmt: skip
-    """Return a limit if grazing flips, or jumps of a loss that uses single frames, contribute too much."""
+    """Return a limit if excluded grazing flips, or jumps of a loss of single frames, are too large."""
     tape, met = made.tape, made.crossings[::-1]
     energy, virial, speed, weight, slow = (
         joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")
@@ -504,7 +504,7 @@ def _left_out(
 
 
 def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]:
-    """Return the norm of the difference of two gradients over the larger norm, by parameter and horizon."""
+    """Return the relative difference (of norms) of two gradients, by parameter and horizon."""
     out = {}
     second = b.by_name()
     for name, first in a.by_name().items():
@@ -515,7 +515,7 @@ def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]
 
 
 def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "points"]]:
-    """Return the standard error divided by the size of the mean, by parameter and horizon."""
+    """Return the standard error of the mean gradient, divided by its norm, by parameter and horizon."""
     out = {}
     for name in made[0].by_name():
         each = np.stack([one.by_name()[name] for one in made])
@@ -528,10 +528,10 @@ def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "poi
 def last_below(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the longest horizon before values exceed a limit at all later horizons, and whether they do so.
+    """Return the last horizon before values exceed a limit twice in succession, and whether they do so.
 
-    A single point beyond the limit does not count: a gradient that changes sign is small near its zero, where
-    any error is relatively large.
+    A single value beyond the limit is ignored (except at the last horizon), because the relative error is
+    large where a gradient changes sign.
     """
     beyond = ~(np.max(np.stack(list(values.values())), axis=0) <= limit)
     lasting = beyond & np.append(beyond[1:], True)
@@ -544,11 +544,11 @@ def last_below(
 def last_agreeing(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the longest horizon at which no value exceeds a limit, and whether it is short of the last one.
+    """Return the longest horizon without a value above a limit, and whether the last horizon has one.
 
-    Disagreement at shorter horizons is ignored: the error of a time step may shrink again, and the
-    contribution of few flips is coarse if there is little else. Agreement at a single horizon, among others
-    beyond the limit, is taken as chance.
+    Disagreement at shorter horizons is ignored: the relative error due to the time step may decrease again,
+    and a gradient over few flips changes in large steps. Agreement at a single horizon, with disagreement at
+    adjacent horizons, is regarded as chance.
     """
     within = np.max(np.stack(list(values.values())), axis=0) <= limit
     if len(within) > 1:
@@ -558,7 +558,7 @@ def last_agreeing(
 
 
 def ambiguity(problem: Problem) -> Limit:
-    """Find the first decision of the run that another legitimate rounding could have changed."""
+    """Find the first decision of the run whose margin is within its rounding bound."""
     recorder = PairRecorder(problem.simulation)
     for segment in Engine(problem.simulation, problem.steps).segments():
         close = recorder.doubtful(segment)
