@@ -1,4 +1,4 @@
-"""Analysis of flips as an MDAnalysis class: `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
+"""Analysis of flips as an MDAnalysis class, `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
 
 Frames may be distributed over processes. A flip is found by comparing two successive frames, so each process
 also reads the frame before its first frame. No flip is lost at a process boundary, and the results are
@@ -72,7 +72,7 @@ class RuleResult:
 
 @dataclass
 class _ProcessPart:
-    """Results of one process for one rule; frame numbers count from the first frame that the process read."""
+    """Results of one process for one membership rule; frame 0 is the first frame that this process reads."""
 
     flips: list[FlipTable] = field(default_factory=lambda: [FlipTable.none()])  # of frames that have any
     rows: list[tuple[int, int, float]] = field(default_factory=list)  # (pairs, near, smallest margin)
@@ -330,7 +330,7 @@ class NeighborFlips(AnalysisBase):
         return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
 
     def _bound_of(self, frame: Frame) -> float:
-        """Return the error bound of a distance in the frame read last, in length units."""
+        """Return the error bound of a distance in a frame, in length units."""
         if self._resolution is None:
             return 0.0
         atoms, raw = self._check.atoms, self.library.raw

@@ -58,7 +58,7 @@ class XdrFile:
     """Reader that returns frames of a GROMACS file by number, without reading or writing an index file.
 
     Raises:
-        ValueError: every method raises it if the data are invalid or the file ends early.
+        ValueError: the data are invalid or the file ends early (raised by every method).
     """
 
     def __init__(self, path: str | Path):

@@ -94,8 +94,8 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
     """Describe the plane, line or point into which all atoms have collapsed; None without a collapse.
 
     Rippled sheets may become flat, and bent chains may become straight, without an error. A collapse is
-    therefore reported only if the earlier spread across the sheet or chain exceeded the distance between
-    neighbors along the sheet or chain or, if a coordinate is constant, a fifth of the largest spread.
+    therefore reported only if the earlier spread across the sheet or chain was large: above the distance
+    between neighbors or, if a coordinate is constant, above a fifth of the largest spread.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):

@@ -347,7 +347,7 @@ class ComparedSide:
         return self.tracker.step(frame, bound=self.bound)
 
     def position_bound(self, periods: int) -> float:
-        """Return the error bound (length) of a position at the last frame, across `periods` box periods."""
+        """Return the error bound of a position (length), for separations across `periods` box periods."""
         # a distance has two atoms that are off
         return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
 
@@ -518,7 +518,7 @@ def _sets_at(
     now: Separation,
     before: Separation,
 ) -> None:
-    """Record the difference of one rule's neighbor sets at a frame, and write the newly differing pairs."""
+    """Record the difference of two files' neighbor sets at a frame; write the newly differing pairs."""
     difference, first = one.difference, False
     if one.certain is None and len(difference):
         # all that differ: one that came to differ within the resolution may be beyond it by now

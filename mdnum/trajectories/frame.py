@@ -1,8 +1,7 @@
 """One frame of a trajectory in float64, and checks for values that no simulation can produce.
 
 Formats with plain floats (dcd, trr, netcdf) accept any bytes as coordinates; file damage often produces a
-huge coordinate. Unless rejected, this coordinate would increase the rounding bound of every pair in the
-frame.
+huge coordinate. Unless the frame is rejected, a huge coordinate increases the rounding bound of every pair.
 """
 
 from __future__ import annotations
@@ -206,7 +205,7 @@ def far_out(
     The system size is also estimated from positions one frame earlier, since this frame may be damaged.
 
     Returns:
-        (the atom, the number of such atoms, the reason in words); None if there is no such atom.
+        (the atom, the number of impossibly distant atoms, the reason in words), or None.
     """
     x = frame.positions if atoms is None else frame.positions[atoms]
     if len(x) < 2:
@@ -241,7 +240,7 @@ def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, flo
     A jump by a lattice vector, when one atom or all atoms are wrapped into the box, does not count.
 
     Returns:
-        (the atom, the length of its displacement); None if there is no leap.
+        (the atom, the length of its displacement); None if no displacement is impossible.
     """
     x = now.positions if atoms is None else now.positions[atoms]
     moved = x - (before.positions if atoms is None else before.positions[atoms])

@@ -41,7 +41,7 @@ def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
 def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
     """Return the lattice shifts of images given by rank: the image of j is at x[j] + shift @ box.
 
-    This is the convention of ASE, vesin and jax-md. An atom's own images come in ± pairs; the shift whose
+    ASE, vesin and jax-md define shifts in the same way. An atom's own images come in ± pairs; the shift whose
     first nonzero component is positive is returned.
 
     Args:

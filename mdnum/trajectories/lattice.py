@@ -1,14 +1,11 @@
 """Lattice reduction of a box, sorting of atoms into bins, and the loop that finds pairs within a radius.
 
 Lattice vectors are reduced first, so that a search in a skewed box is as fast as in the compact box with the
-same lattice. Every decision is based on the length of the vector
+same lattice. Every decision is based on the length of (x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2, computed in
+this order from stored coordinates x, i < j, integers s and reduced vectors a. A decision therefore does not
+depend on the search algorithm that found the pair.
 
-    (x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2
-
-The vector is computed in this order from stored coordinates x, i < j, integers s and reduced vectors a. A
-decision therefore does not depend on the search algorithm that found the pair.
-
-Bins divide the coordinates of the reduced lattice. Coordinates along a nonperiodic direction are folded onto
+For a search, the reduced box is divided into bins. Coordinates along a nonperiodic direction are folded onto
 a limited number of bins, so that a distant atom does not enlarge the grid. For each bin, the atoms of all
 bins within reach are gathered at their nearby images (several per atom in a small box). Every atom of the bin
 is then compared with all gathered atoms.
@@ -109,7 +106,7 @@ def shortest(
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
     """Return (displacements to the nearest image, numbers of lattice vectors removed).
 
-    The result is correct for an atom that moved by less than half the width of the box. If the box is
+    Displacements are correct for atoms that moved by less than half the width of the box. If the box is
     invalid, displacements are returned unchanged.
     """
     try:
@@ -148,11 +145,11 @@ def square_of(x, i, j, s0, s1, s2, vectors):
 
 @njit(inline="never")
 def near_squares(x, i, j, lattice, y, squares):
-    """Compute `square_of` for pairs at their rounded nearest image; y is a work array of shape (3, block).
+    """Compute squared distances of pairs to the images found by rounding; y: work array of shape (3, block).
 
-    The loop has no branch: a zero shift changes no square, and lattice vectors are zero along nonperiodic
-    directions. Coordinates are gathered first, so that all other operations are vector instructions, and the
-    lattice is loaded only once.
+    The loop needs no branch: a zero shift changes no squared distance, and lattice vectors are zero along
+    nonperiodic directions. Coordinates are gathered first, so that all other operations are vector
+    instructions; the lattice is loaded only once.
     """
     vectors, inverse = lattice.vectors, lattice.inverse
     y0, y1, y2 = y[0], y[1], y[2]
@@ -328,7 +325,7 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
     """Sort atoms into bins for a search of pairs up to the distance `reach`.
 
     Raises:
-        InputError: the box is so small that too many images are within this distance.
+        InputError: the box is so small that too many images are within `reach`.
     """
     positions, lattice, atoms = placed.positions, placed.lattice, len(placed.positions)
     extent = np.zeros(3)
@@ -439,7 +436,7 @@ def lattice_vector(code):
 
 @njit
 def _run(d0, d1, d2, b0, b1, b2, bins, last):
-    """Return the contiguous bins at offset d from a bin: lattice vector, first and last bin, next d2."""
+    """Return a contiguous run of bins at offset d from a bin: lattice vector, first and last bin, next d2."""
     n0, n1, n2 = (b0 + d0) // bins[0], (b1 + d1) // bins[1], (b2 + d2) // bins[2]
     c0, c1, low = b0 + d0 - n0 * bins[0], b1 + d1 - n1 * bins[1], b2 + d2 - n2 * bins[2]
     high = min(bins[2] - 1, low + last - d2)
@@ -449,7 +446,7 @@ def _run(d0, d1, d2, b0, b1, b2, bins, last):
 
 @njit
 def _most_around(bins, reach, start):
-    """Return upper limits of the number of atoms and of contiguous runs of bins around any bin."""
+    """Return upper limits of the numbers of atoms, and of runs of contiguous bins, around any bin."""
     atoms, runs = 0, 0
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):

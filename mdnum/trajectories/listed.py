@@ -1,4 +1,4 @@
-"""Pairs inside a cutoff that are missing from the neighbor list of a program, with the duration of the gap.
+"""Pairs inside a cutoff that are missing from the neighbor list of a program, and for how long.
 
 A neighbor list may be incomplete because the skin was exceeded, a buffer overflowed, or images are not
 supported. In each case, the program omits the interactions of the missing pairs inside the cutoff. Missing
@@ -207,7 +207,7 @@ class ListCheck:
         flips: Mapping[str, np.ndarray],
         now: GivenList,
     ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """Compare list and pairs; return (results of the frame, table rows of pairs missing no longer).
+        """Compare list and pairs inside; return (results, table rows of pairs that are no longer missing).
 
         Args:
             at: index of the frame among the frames examined.

@@ -147,7 +147,7 @@ def lost_flips(
 
 
 def _of_motion(motion: FrameMotion, reach: float, bound: float) -> dict[str, Estimate]:
-    """Return the persistence estimate and, if there are velocities, the velocity estimate."""
+    """Estimate missed flips by persistence and, if velocities are known, by velocities."""
     taken, few = -np.diff(np.log(motion.growth)), 1 / math.sqrt(motion.atoms)
     found = {"persistence": _carried_on(taken, np.hypot((_LAW["persistence"] + few) * taken, _LEAST))}
     if math.isfinite(motion.moved):

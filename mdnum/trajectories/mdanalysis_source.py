@@ -56,7 +56,7 @@ class LibraryFrames:
 
     Attributes:
         raw: the last frame read, before transformations; None if there are no transformations.
-        replaced: True if transformations in memory have replaced the values from the file.
+        replaced: whether transformations in memory have replaced the values from the file.
     """
 
     def __init__(self, trajectory: Any):
@@ -213,7 +213,7 @@ class MDAnalysisTrajectory(Trajectory):
 
 
 def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
-    """Return a function that reads the atom labels of any frame, not only of the first as MDAnalysis does.
+    """Return a function that reads the atom labels of any frame; MDAnalysis reads only those of the first.
 
     The function returns None unless the file is an XYZ file or a PDB file with several models.
     """
@@ -252,7 +252,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factors(trajectory: Any) -> tuple[float, float]:
-    """Return the ratios of DCD time steps (in the file / in MDAnalysis, byte-swapped / in the file)."""
+    """Return ratios of DCD time steps: file value / MDAnalysis's value, byte-swapped value / file value."""
     read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
     if not read:
         return 1.0, math.nan

@@ -36,7 +36,7 @@ class RepeatedFrames:
     """Record of frames that repeat earlier frames, based on one stored digest per distinct frame.
 
     Attributes:
-        drop: True to omit repeated frames from the frames that are yielded.
+        drop: whether to omit repeated frames from the frames that are yielded.
         most: largest number of digests stored; the oldest digests are deleted.
         frames: number of repeated frames.
         again: ranges of frames that repeat times but not data, with numbers as in `stretches`, the first and

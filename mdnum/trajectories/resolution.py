@@ -213,7 +213,7 @@ def decimal_grid(
 
 
 def steps_of(values: Float[np.ndarray, "*shape"], step: float, digits: int) -> Float[np.ndarray, "*shape"]:
-    """Return the size of the last digit of each number, for a fixed step or for significant digits."""
+    """Return the size of the last digit of each number, for fixed decimals or fixed significant digits."""
     if digits == 0:
         return np.full_like(values, step)
     size = np.where(values == 0, 1.0, np.abs(values))

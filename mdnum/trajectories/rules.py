@@ -52,7 +52,7 @@ class _Membership:
 
     @property
     def shortest(self) -> float:
-        """Smallest cutoff radius of the rule, in length units; infinite if neighbors are defined by order."""
+        """Smallest cutoff radius, in length units; infinite if the order of distances defines neighbors."""
         return self.reach
 
     def table(

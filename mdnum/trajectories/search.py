@@ -326,7 +326,7 @@ def _guess(placed: Placed, who: Participants, most: int, everything: float) -> f
 
 
 class Changed(NamedTuple):
-    """Decisions that differ between two frames, unsorted, by indices of the participating atoms."""
+    """Pairs whose decision differs between two frames, unsorted, as indices of the participating atoms."""
 
     i: Int[np.ndarray, "flips"]
     j: Int[np.ndarray, "flips"]
@@ -340,7 +340,7 @@ class Changed(NamedTuple):
 
 
 def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
-    """Return all decisions that differ between two frames; `room` is the initial size of the buffers."""
+    """Return all pairs whose decision differs between two frames; `room` is the initial buffer size."""
     while True:
         made = Changed.room(room)
         total = _compared(before, now, made)
@@ -351,7 +351,7 @@ def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
 
 @njit
 def _compared(old, new, made):
-    """Write differing decisions; beyond the capacity, only count. seen[j] = (images before, images now)."""
+    """Write pairs whose decision differs; count those beyond the capacity. seen[j] = (images before, now)."""
     atoms = old.first.shape[0]
     seen = np.zeros((atoms, 2), np.int32)
     total, room = 0, made.i.shape[0]

@@ -68,7 +68,7 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
 def separation(
     one: Frame, other: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | None = None
 ) -> Separation:
-    """Return the separation of two frames minus a common shift, for the given atoms; None for all atoms."""
+    """Return the separation of two frames minus a common shift, for some or all of the atoms."""
     moved, whole = displacements(one, other, atoms, 0.0 if shift is None else shift)
     square = np.sum(moved**2, axis=1)
     at = int(np.argmax(square))
@@ -135,7 +135,7 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
     """Compare displacements between two frames with velocities; return None without velocities or motion.
 
     `moved` is near 1 for straight paths, below 1 if atoms turn around, and never far above 1. `factor` is
-    near 1 if velocities keep their directions, in units of position over time.
+    near 1 if velocities keep their directions and have the right unit.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None
@@ -157,7 +157,7 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
 
 
 def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
-    """Return the inconsistency of displacements with velocities and times, from medians over frames.
+    """Return the inconsistency between displacements, velocities and times, if any, by medians over frames.
 
     If atoms turn around between two frames, displacements are smaller than predicted from velocities, but not
     inconsistent. A smaller displacement counts only if it is parallel to velocities that kept their

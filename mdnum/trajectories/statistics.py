@@ -2,10 +2,10 @@
 
 Three quantities describe the durations of contacts:
 
-- The **lifetime** is the product-limit estimate (Kaplan and Meier, J. Am. Stat. Assoc. 53, 457, 1958) for
-  contacts whose beginning was observed. Contacts that continue after the last frame are right-censored.
-- The **mean by rate** is the total contact time divided by the number of departures. It includes contacts
-  whose beginning or end was not observed, and equals the mean lifetime if pairs leave at a constant rate.
+- The **lifetime** is estimated from contacts whose beginning was observed, with contacts that continue after
+  the last frame as right-censored data (Kaplan and Meier, J. Am. Stat. Assoc. 53, 457, 1958).
+- The **mean by rate** is the total contact time divided by the number of departures. This mean includes
+  partly observed contacts, and equals the mean lifetime if pairs leave at a constant rate.
 - The **residence** is the fraction of the pairs in contact at a frame that stay in contact, without a break,
   for a given lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more
   often, so the residence differs from the lifetime.
@@ -62,7 +62,7 @@ class Durations(Sums):
 
     @property
     def exposure(self) -> int:
-        """Number of times that a pair in contact at one frame was also observed at the next frame."""
+        """Number of times that a pair was in contact at a frame and was examined again at the next frame."""
         length = np.arange(len(self.seen))
         # a stay of n frames that goes on after the last one has been examined again n - 1 times
         whole, cut = self.seen + self.older, self.goes_on + self.throughout
@@ -116,7 +116,7 @@ def survival(found: Durations) -> Survival:
 def mean_by_rate(found: Durations) -> tuple[float, float]:
     """Return (contact frames per departure, standard error) over all contacts; inf without departures.
 
-    The error assumes independent departures (Poisson); repeated crossings make the true error larger.
+    The error is valid for independent departures; with repeated crossings, the true error is larger.
     """
     if not found.leaves:
         return float("inf"), float("nan")
@@ -140,13 +140,13 @@ def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.nd
 
 
 def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Count pairs inside both at a frame and at a later frame, whether or not they left in between.
+    """Count pairs inside both at a frame and at a later frame, with or without absences in between.
 
     The ratio of the two results is the intermittent counterpart of `residence`. Counts for disjoint subsets
     of the pairs can be added. Lags are between 0 and frames - 1.
 
     Returns:
-        for each lag, the number of pairs, summed over frames, inside at both frames and at the earlier frame.
+        two arrays by lag, summed over frames: numbers of pairs inside at both frames, and at the first frame.
     """
     both, once = np.zeros(len(lags), np.int64), np.zeros(len(lags), np.int64)
     pairs = np.append(np.flatnonzero(_new_pairs(stays)), len(stays))
@@ -197,7 +197,7 @@ class Classes:
 
 @dataclass(frozen=True)
 class Labels:
-    """Classes of atoms by species, residue name and residue; None for the latter two without residues."""
+    """Classes of atoms by species, residue name and residue; by species only if a file has no residues."""
 
     species: Classes
     residue_names: Classes | None

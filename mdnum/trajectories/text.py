@@ -4,9 +4,9 @@ This module reads three text formats itself, because other libraries lose inform
 tests/trajectories/test_source.py):
 
 - LAMMPS's `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org/dump.html,
-  Howto_triclinic): MDAnalysis reduces coordinates to float32 and ignores the tilt of a box.
+  Howto_triclinic); MDAnalysis reduces coordinates to float32 and ignores the tilt of a box.
 - GROMACS's gro files with any number of frames, whose column width is the distance of two decimal points
-  (manual.gromacs.org, reference manual, file formats): MDAnalysis and ASE read only the first frame.
+  (manual.gromacs.org, reference manual, file formats); MDAnalysis and ASE read only the first frame.
 - Extended XYZ, with ASE called for each frame: otherwise, ASE scans the whole file before the first frame.
 """
 
@@ -122,7 +122,7 @@ def format_of(path: Path) -> str:
     """Return ASE's name for the format of a trajectory file.
 
     Raises:
-        InputError: ASE does not know the format, or the file cannot be read.
+        InputError: the format is unknown to ASE, or the file cannot be read.
     """
     try:
         with reading(path, by="ASE"):

@@ -84,7 +84,7 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Update to a frame; return True if tiles contain all pairs within `clear` of their radius."""
+        """Update tiles to a frame; return True if they contain all pairs within `clear` of their radius."""
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
@@ -164,7 +164,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if a pair can be inside through one image only, before and after approaching by `moved`."""
+    """Return True if at most one image of a pair can be inside, even for pairs that approach by `moved`."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
@@ -252,7 +252,7 @@ def _tiled(
     shifts: Float32[np.ndarray, "27 3"],
     reach: np.float32,
 ) -> Tiled:
-    """Return the tiles of two kinds of atoms whose cluster boxes are within the cutoff."""
+    """Return the tiles of two kinds of atoms whose cluster boxes are closer than `reach`."""
     room = 32 * int(runs[a + 1] - runs[a]) + 64
     while True:
         made = np.empty((3, room), np.int32)
@@ -316,8 +316,8 @@ def _halved(x, order):
 def _nodes(boxes, runs):
     """Return a tree of bounding boxes: of each run of clusters, of its two halves, and so on.
 
-    Node n is followed by the first half of its clusters, at node n + 1. The second half is at node n + 2 c,
-    where c is the number of clusters in the first half.
+    The first half of the clusters of node n is node n + 1; the second half is node n + 2 c, where c is the
+    number of clusters in the first half.
     """
     nodes, spans = np.empty((2 * runs[-1], 6), np.float32), np.empty((2 * runs[-1], 2), np.int64)
     stack = [(0, 0, 0)]
@@ -425,7 +425,7 @@ def _follow(before, now, order, home, vectors, change, inverse, periodic, center
 
 @njit
 def _stays(boxes, around, drift):
-    """Return True if each cluster box is inside its enlarged box, reduced by `drift` on each side."""
+    """Return True if each cluster box is inside its enlarged box, which shrinks by `drift` on each side."""
     out = 0
     for k in range(boxes.shape[0]):
         for c in range(3):

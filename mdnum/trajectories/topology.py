@@ -1,10 +1,10 @@
 """Atoms and boxes from MDAnalysis and ASE: names, elements, residues, and boxes in their stored orientation.
 
-MDAnalysis stores three lengths and three angles of a box, and assumes the first vector along x and the second
-in the xy plane. Most programs use this orientation. For a box in another orientation, the periodic images
+MDAnalysis stores three lengths and three angles of a box, and assumes (like most programs) that the first
+vector is along x and the second in the xy plane. For a box in another orientation, the periodic images
 computed from MDAnalysis's box are silently wrong:
 
-- CHARMM's boxes are symmetric matrices in dcd files (since version 22, without a flag; see dcd_boxes).
+- CHARMM since version 22 writes symmetric box matrices to dcd files, which do not record it (see dcd_boxes).
 - HOOMD's boxes have tilt factors, which MDAnalysis interprets as cosines of angles (in gsd files).
 - Boxes in H5MD files and DL_POLY's HISTORY files have vectors in any direction.
 
@@ -143,7 +143,7 @@ class AtomTable:
         )  # fmt: skip
 
     def universe(self) -> Any:
-        """Return a Universe of these atoms, without coordinates."""
+        """Return an MDAnalysis Universe of the atoms in this table, without coordinates."""
         from MDAnalysis import Universe
 
         at = np.unique(self.residues, return_index=True)[1]
@@ -191,7 +191,7 @@ class Topology:
 
 
 def topology_universe(topology: str | Path) -> Any:
-    """Return a Universe of a topology; coordinates are not read, since readers may write files next to it.
+    """Return a Universe of a topology, without its coordinates, whose reader might write index files.
 
     Raises:
         InputError: MDAnalysis cannot read the file.
@@ -236,8 +236,8 @@ class Boxes:
     """Boxes of an MDAnalysis reader, in the same orientation as the coordinates.
 
     Attributes:
-        notes: notes for the user on the interpretation of the boxes, in sentences.
-        own: True if boxes are read directly from the file, and may differ from MDAnalysis's boxes.
+        notes: sentences for the user on the interpretation of the boxes.
+        own: whether boxes are read directly from the file, and may differ from MDAnalysis's boxes.
     """
 
     def __init__(self, trajectory: Any):
@@ -257,7 +257,7 @@ class Boxes:
         self.own = self._matrix is not None or bool(self._models)
 
     def other(self, ts: Any, number: int) -> tuple[str, Box] | None:
-        """Return another possible box of a frame and its timestep; see `Trajectory.other_box`."""
+        """Return another possible box of a frame, given its timestep; see `Trajectory.other_box`."""
         instead = getattr(self._matrix, "instead", None)
         if instead is not None and (matrix := instead(number)) is not None:
             return "BOX_UNDECIDED", Box(matrix, np.ones(3, bool))

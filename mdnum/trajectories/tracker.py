@@ -1,4 +1,4 @@
-"""Tracking of the pairs that enter or leave a membership rule from frame to frame."""
+"""Tracking, from frame to frame, of pairs that become or cease to be neighbors under a membership rule."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def atoms_of(groups: Groups) -> AtomIndices:
 
 @dataclass(frozen=True)
 class Moment(Placed):
-    """Positions of one frame with the neighbors decided for it."""
+    """Positions of one frame, with the neighbors found at this frame."""
 
     own: Int[np.ndarray, "species"]  # images of an atom itself that are inside, by species
     last_in: Float[np.ndarray, "limits"]  # thresholds of each atom, where the rule is directed
@@ -61,7 +61,7 @@ class Moment(Placed):
 class Tracker:
     """Tracker of the flips between consecutive frames, as defined by a membership rule.
 
-    A tracker can be pickled. It stores a single frame, so its memory does not grow with the number of frames.
+    A tracker stores a single frame, so its memory does not grow with the number of frames. It can be pickled.
 
     Args:
         rule: the membership rule that defines neighbors.
@@ -142,7 +142,7 @@ class Tracker:
         return flips
 
     def members(self) -> Members:
-        """Return the pairs inside at the last frame."""
+        """Return the pairs of neighbors at the last frame."""
         now = self._last
         if now is None:
             return Members.none()
@@ -164,7 +164,7 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return the threshold distances of each center of a directed rule at the last frame, otherwise nan.
+        """Return threshold distances of a directed rule at the last frame, by center; nan for others.
 
         Returns:
             (distance below which a neighbor stays one, distance below which another atom becomes a neighbor).
@@ -272,7 +272,7 @@ class Tracker:
         return self._table(before, now, Changed._make(map(np.concatenate, zip(*parts, strict=True))))
 
     def _table(self, before: Moment, now: Moment, changed: Changed) -> FlipTable:
-        """Return a table of flips from arrays that contain indices among the participating atoms."""
+        """Convert arrays of changed pairs, with indices of participating atoms, to a table of flips."""
         directed, who, count = self.rule.directed, self._who, len(changed.i)
         i, j, images = who.labels[changed.i], who.labels[changed.j], int(changed.rank.max(initial=0)) + 1
         if not directed:

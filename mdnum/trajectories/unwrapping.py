@@ -68,7 +68,7 @@ class Unwrapping:
         }  # fmt: skip
 
     def _pairs(self, here: np.ndarray, there: np.ndarray, cell: np.ndarray) -> dict[str, Any]:
-        """Return the change of distance of stiff pairs, separately for pairs across and within a cell."""
+        """Return relative length changes of stiff pairs, for pairs split by the box and for other pairs."""
         images = np.rint(there - here)
         split = images.any(axis=1) | (np.floor(here) != np.floor(there)).any(axis=1)
         lengths = np.linalg.norm((there - here - images) @ cell, axis=1)
