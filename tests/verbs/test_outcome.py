@@ -223,7 +223,7 @@ def test_text_from_files_is_escaped_wherever_it_is_shown(tmp_path, monkeypatch):
     hostile = "<img src=x onerror=alert(1)>\x1b[31m\u202e"
     text = (mdnum.systems.load("ball/drop").path).read_text(encoding="utf-8")
     (tmp_path / f"{hostile}.toml").write_text(text, encoding="utf-8")
-    outcome = mdnum.bounce(f"{hostile}.toml", steps=20, out=f"{hostile} here", report=False)
+    outcome = mdnum.bounce(f"{hostile}.toml", steps=600, out=f"{hostile} here", report=False)
     assert hostile in outcome.title
     html = outcome._repr_html_()
     assert "<img" not in html and "&lt;img src=x" in html
