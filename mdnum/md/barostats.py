@@ -68,7 +68,7 @@ def exponential(a: Rate) -> Rate:
 
 
 def unit(a: Rate) -> Rate:
-    """Return the unit rate, the number one or the unit matrix, in the form of a given rate."""
+    """Return one for a rate that is a number, or the unit matrix for a rate that is a matrix."""
     return jnp.eye(3) if a.ndim else jnp.ones(())
 
 
@@ -166,11 +166,11 @@ class MTK(Barostat):
     """Integrator for the isothermal-isobaric ensemble, deterministic and time-reversible.
 
     Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), with the operator splitting of Tuckerman et al.,
-    J. Phys. A 39, 5629 (2006), eq. 38 ff. Operators: thermostat chains of box and atoms, kick of the box by
-    its excess pressure, kick of the atoms, drift in the changing box, and the same in reverse order. The
-    inertia of the box is (N_f + 3) k_B T τ_p² (a third of this value for a full box). The box has one degree
-    of freedom (six for a full box). The drift at box rate a is exact: x' = x exp(a t) + v t exp(a t / 2)
-    sinh(a t / 2) / (a t / 2).
+    J. Phys. A 39, 5629 (2006), eq. 38 ff. A step applies the thermostat chains of box and atoms, the kick of
+    the box by its excess pressure, the kick of the atoms, the drift in the changing box, and the same
+    operators in reverse order. The inertia of the box is (N_f + 3) k_B T τ_p² (a third of this value for a
+    full box). The box has one degree of freedom, or six if it is full. The drift at box rate a is exact: x' =
+    x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -275,11 +275,11 @@ class Move(NamedTuple):
 class CellRescaling(Barostat):
     """Integrator for the isothermal-isobaric ensemble: first-order stochastic cell rescaling with CSVR.
 
-    Bernetti, Bussi, J. Chem. Phys. 153, 114107 (2020): in the middle of the drift, the square root of the
-    volume is propagated by an Euler step with the present forces. The noise of this variable does not depend
-    on the volume. Velocities are scaled inversely to the box (sec. II C of the paper). In a full box (del
-    Tatto, Raiteri, Bernetti, Bussi, Appl. Sci. 12, 1139, 2022) the traceless strain is also propagated by an
-    Euler step, with noise computed from the geometric mean of the volumes before and after the step. From the
+    In the middle of the drift, the square root of the volume is propagated by an Euler step with the present
+    forces. The noise of this square root does not depend on the volume. Velocities are scaled inversely to
+    the box (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section II C). In a full box, the traceless
+    strain is also propagated by an Euler step, with noise computed from the geometric mean of the volumes
+    before and after the step (del Tatto, Raiteri, Bernetti, Bussi, Appl. Sci. 12, 1139, 2022). From the
     probabilities of each step and its reverse, an effective energy (total energy minus heat and work) is
     computed, which is conserved within the time-step error.
 
@@ -322,7 +322,7 @@ class CellRescaling(Barostat):
         return root, (2 * part + self.kT) / root, excess - part * unit(excess)
 
     def _shear(self, root, after):
-        """Return the mobility of a traceless strain, from √V before and after; equal for the reverse step."""
+        """Return the mobility of a traceless strain, a symmetric function of √V before and after the step."""
         return 4 / 3 * self._mobility / (root * after)
 
     def finish(self, v, extra, at, time):

@@ -242,7 +242,7 @@ def stacked(cells: Sequence[Cell], dtype: DTypeLike = np.float64):
 
 @njit(inline="always")
 def box_of(boxes, row):
-    """Return the box of a row: lattice vectors, inverse matrix, periodicity, and an orthorhombic flag.
+    """Return the box of one row of stacked boxes: lattice vectors, inverse, periodicity, orthorhombic flag.
 
     The result consists of tuples: arrays would slow down a compiled loop by reference counting.
     """

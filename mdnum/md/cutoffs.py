@@ -146,7 +146,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
     derivatives beyond the sixth are not detected.
 
     Raises:
-        ValueError: the test fails; the message names the quantity and the distance.
+        ValueError: the test fails; the message contains the quantity and the distance.
     """
     import jax
 
@@ -229,7 +229,7 @@ class _Truncated(Cutoff):
 
 @_shipped
 class Hard(_Truncated):
-    """Truncated, not shifted: the energy jumps by u(radius) at every crossing."""
+    """Truncated without a shift: the energy jumps by u(r_cut) at every crossing."""
 
     name = "hard"
     smoothness = -1
@@ -247,7 +247,7 @@ class Hard(_Truncated):
 
 @_shipped
 class Shifted(_Truncated):
-    """Energy shifted to zero at the radius; forces and trajectory are the same as for `hard`."""
+    """Energy shifted to zero at r_cut; forces and trajectory are the same as for `hard`."""
 
     name = "shifted"
     smoothness = 0
@@ -261,7 +261,7 @@ class Shifted(_Truncated):
 
 @_shipped
 class ForceShifted(Cutoff):
-    """Energy and force shifted to zero at the radius: u(r) - u(r_cut) - (r - r_cut) u'(r_cut)."""
+    """Energy and force shifted to zero at r_cut: u(r) - u(r_cut) - (r - r_cut) u'(r_cut)."""
 
     name = "force-shifted"
     smoothness = 1
@@ -313,9 +313,9 @@ class _Switching(Cutoff):
 
 @_shipped
 class Switched(_Switching):
-    """The C1 switch in r² of jax-md, HOOMD-blue and ASE's smooth=True, from onset to radius.
+    """C1 switching function of r², from onset to r_cut, as in jax-md, HOOMD-blue and ASE (smooth=True).
 
-    S = (rc² - r²)² (rc² + 2 r² - 3 ro²) / (rc² - ro²)³ beyond the onset.
+    Beyond the onset ro, S = (rc² - r²)² (rc² + 2 r² - 3 ro²) / (rc² - ro²)³.
     """
 
     name = "switched"
@@ -369,7 +369,7 @@ class _SwitchedInDistance(_Switching):
 
 @_shipped
 class Quintic(_SwitchedInDistance):
-    """A C2 quintic switch from onset to radius: 1 - 10 t³ + 15 t⁴ - 6 t⁵."""
+    """C2 quintic switch 1 - 10 t³ + 15 t⁴ - 6 t⁵, with t from 0 at the onset to 1 at r_cut."""
 
     name = "quintic"
     smoothness = 2
@@ -386,7 +386,7 @@ class Quintic(_SwitchedInDistance):
 
 @_shipped
 class Cosine(_SwitchedInDistance):
-    """A C1 cosine switch from onset to radius, (1 + cos(pi t)) / 2, as in neural-network potentials."""
+    """C1 cosine switch (1 + cos(pi t)) / 2, t from 0 at the onset to 1 at r_cut, as in neural networks."""
 
     name = "cosine"
     smoothness = 1
@@ -404,7 +404,7 @@ class Cosine(_SwitchedInDistance):
 
 
 class Level(Cutoff):
-    """Another cutoff with its energy shifted to zero at the radius; the forces are unchanged."""
+    """Cutoff that shifts the energy of another cutoff to zero at r_cut; the forces are unchanged."""
 
     name = "level"
     smoothness = 0

@@ -1,7 +1,7 @@
-"""Decisions which pairs are inside the cutoff, by the comparison that the system file specifies.
+"""Decisions on which pairs are inside the cutoff, by the comparison that the system file specifies.
 
 The compared quantity and its threshold are defined only in this module. The force loop, the check of neighbor
-lists and the host code that writes the ledger use this module, and obtain the same bits.
+lists and the host code that writes the ledger use this module, so that their results are bitwise the same.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ CONVENTIONS = ("r2 <", "r2 <=", "r <", "r <=")
 
 @dataclass(frozen=True)
 class PairDecider:
-    """Decision whether a pair is inside: `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
+    """Decision rule for pairs inside, one of `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` and `r <= r_cut`."""
 
     r_cut: tuple[float, ...]  # cutoff of each pair type, length
     compare: str = "r2 <"  # quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <="
@@ -186,7 +186,7 @@ def packed(halves: UInt8[Array, "groups atoms"]) -> UInt8[Array, "words atoms"]:
 
 
 def halves_of(bits: UInt8[Array, "words atoms"]) -> UInt8[Array, "groups atoms"]:
-    """Unpack bytes into the decisions of two groups each, in the low bits: the inverse of `packed`."""
+    """Unpack each byte into the decisions of two groups of slots, in the low bits: inverse of `packed`."""
     mask = jnp.uint8((1 << GROUP) - 1)
     return jnp.stack([bits & mask, bits >> jnp.uint8(GROUP)], axis=1).reshape(-1, bits.shape[-1])
 
@@ -320,7 +320,7 @@ class Changes(NamedTuple):
         row: Int[Array, ""],
         most: int,
     ) -> tuple[Changes, UInt8[Array, "words atoms"]]:
-        """Record the decisions that changed; return the changes and the decisions, in the same memory.
+        """Append the changed decisions to the buffers; return buffers and decisions, reusing their memory.
 
         Args:
             most: largest number of changes recorded per step, on a device other than a CPU. If there are
@@ -366,7 +366,7 @@ class Changes(NamedTuple):
 
 @partial(jax.jit, static_argnames="room")
 def _cut(parts: tuple[Array, ...], room: int) -> tuple[Array, ...]:
-    """Return the given number of first rows of each array."""
+    """Return the first `room` rows of each array."""
     return tuple(part[:room] for part in parts)
 
 

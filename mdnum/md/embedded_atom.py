@@ -34,8 +34,8 @@ class Setfl:
 def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
     """Read a setfl table with all digits, whatever the line breaks between numbers.
 
-    In contrast, the reader of jax-md rounds all numbers to float32, which causes errors of 4e-4 eV/Å in the
-    forces of copper.
+    The reader of jax-md rounds all numbers to float32, which causes errors of 4e-4 eV/Å in the forces of
+    copper.
 
     Args:
         symbols: chemical symbols of the atoms, which must agree with the element of the table.
@@ -163,14 +163,14 @@ class EmbeddedAtom(ManyBody):
     """E = sum_i F(rho_i) + 1/2 sum_ij phi(r_ij), rho_i = sum_j density(r_ij), for one element.
 
     The EAM energy of jax-md is correct only for a neighbor list in which no atom is its own neighbor. The
-    lists of jax-md contain such entries, which add the density at r = 0. The splines of jax-md round the
-    table to float32 and return 0 outside its range.
+    neighbor lists of jax-md contain each atom as its own neighbor, which adds the density at r = 0. The
+    splines of jax-md round the table to float32 and return 0 outside its range.
 
     Error: if a density is outside the embedding table, energy and forces are NaN. The deviation of the spline
     from the tabulated function is not considered an error.
 
-    Source: Daw and Baskes, Phys. Rev. B 29, 6443 (1984); checked against ase.calculators.eam and a plain
-    evaluation in extended precision (tests/support/oracles_manybody.py).
+    The implementation was checked against ase.calculators.eam and a plain evaluation in extended precision
+    (tests/support/oracles_manybody.py). Source: Daw and Baskes, Phys. Rev. B 29, 6443 (1984).
     """
 
     # pair, density, embedding: phi, density and F as splines

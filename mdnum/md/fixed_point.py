@@ -7,7 +7,7 @@ this integer.
 
 A pair force is computed in float64 from the exact integer distance, by operations that every compiler rounds
 in the same way, and is then rounded to the unit of force. The forces on both atoms are exactly opposite, so
-that momentum is conserved to the last bit. The result does not depend on atom labels or on the neighbor list.
+that momentum is conserved to the last bit. Forces do not depend on atom labels or on the neighbor list.
 """
 
 from __future__ import annotations
@@ -378,7 +378,7 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
 
 
 def _period(kept: int) -> int:
-    """Return the number of steps before an integer that grows by 2^24/kept per step may overflow."""
+    """Return the number of steps before an integer that grows by a factor 2^24/kept per step may overflow."""
     if not 0 < kept < 2**_SHIFT:
         return 0
     growth = 2**_SHIFT / kept

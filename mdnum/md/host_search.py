@@ -119,7 +119,7 @@ def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
     only once for a whole column of bins.
 
     Returns:
-        True if the capacity sufficed. begin: start of each layer, and the end; home: start of its middle bin.
+        whether the capacity sufficed. begin: start of each layer, and the end; home: start of its middle bin.
     """
     (x, own, start), (runs, middle), (bins, reach, periodic, matrix) = layered, found, box
     count, apart, wide = 0, x.shape[1], near.shape[1]

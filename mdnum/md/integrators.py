@@ -75,9 +75,9 @@ def converted(field: Field[Any], value: Any, units: Units, *, back: bool = False
 def quantity(
     unit: Literal["time", "rate", "temperature", "pressure", "compressibility", "seed"], **options: Any
 ) -> Any:
-    """Declare an integrator field that a system file gives in units of this kind, or as a random seed.
+    """Declare a field of an integrator that has a unit in system files, such as a time or a temperature.
 
-    The units "temperature" (an energy inside mdnum) and "seed" (a random key) are also keys in the file.
+    A temperature (an energy inside mdnum) has the key `temperature`; a random key has the key `seed`.
     """
     return eqx.field(metadata={"unit": unit}, **options)
 
@@ -127,7 +127,7 @@ class Integrator(eqx.Module):
 
     @classmethod
     def numbers(cls) -> list[str]:
-        """Keys of the numerical parameters by which an integrator can be differentiated."""
+        """Keys of the parameters with respect to which an integrator can be differentiated."""
         return [key for key, one in cls.keys().items() if key != "seed" and not one.metadata.get("static")]
 
     @classmethod
@@ -195,7 +195,7 @@ class Integrator(eqx.Module):
     def deform(self, v: Vector, extra: Any, at: AtStep) -> tuple[Float[Array, "3 3"], Vector, Any]:
         """Return the deformation of the box before the next force evaluation; the default is no deformation.
 
-        The method is called after `begin`. Lattice vectors and positions, as rows, are multiplied by the
+        This method is called after `begin`. Lattice vectors and positions, as rows, are multiplied by the
         deformation; `begin` must make only the motion relative to the box.
 
         Args:
@@ -333,7 +333,7 @@ class KickDrift(Integrator):
     def drift(
         self, x: Vector, v: Vector, masses: Masses, step: Step, order: Order
     ) -> tuple[Vector, Vector, Number]:
-        """Advance positions and velocities as in `begin`, after the kick; linear in x and v."""
+        """Advance positions and velocities as in `begin`, after the kick, by a function linear in x and v."""
 
 
 def without_kick(integrator: Integrator) -> str | None:

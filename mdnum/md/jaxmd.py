@@ -119,7 +119,7 @@ def _quiet_scatter() -> Iterator[None]:
 
 
 def upstream() -> ModuleType:
-    """Return the package jax_md, which is imported, in seconds, at the first call."""
+    """Return the package jax_md; the first call imports the package, which takes seconds."""
     with standard_promotion():
         import jax_md
         import jax_md.custom_partition
@@ -231,9 +231,9 @@ class PairSearch:
     """Neighbor search of jax-md for one cell, for repeated calls with new positions.
 
     Positions are passed to jax-md as fractional coordinates wrapped into [0, 1), with the perpendicular
-    widths as the box. Otherwise, jax-md loses pairs of positions outside the box without an error, and
-    rejects some valid triclinic boxes. The overflow flag is read after every search, outside jit; after an
-    overflow, the list is enlarged.
+    widths as the box. For positions outside the box, jax-md loses pairs without an error; it also rejects
+    some valid triclinic boxes. The overflow flag is read after every search, outside jit; after an overflow,
+    the list is enlarged.
 
     Args:
         cell: lattice vectors as rows, length.

@@ -2,9 +2,9 @@
 
 A function of one pair is traced by jax, and its operations are written as LLVM text for vectors of eight
 atoms. The data of an atom are contiguous, so that loading a neighbor takes one or two instructions, and the
-terms of eight slots are summed in registers. In contrast, XLA's own loop gathers and computes in separate
-passes. No operation is contracted or reordered, so that equal input gives equal bits on every processor. XLA
-calls the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
+terms of eight slots are summed in registers. XLA's own loop gathers and computes in separate passes. No
+operation is contracted or reordered, so that equal input gives equal bits on every processor. XLA calls the
+loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ _Pair = Callable[..., Sequence[Any]]
 
 
 class Shortcut(NamedTuple):
-    """A cheaper function of a pair, used for a vector of pairs if all pairs in the vector are near."""
+    """A cheaper function of a pair, used for vectors of pairs that are all near (see `far`)."""
 
     # whether a pair is far, from the arguments of a function of a pair
     far: Callable[..., Any]

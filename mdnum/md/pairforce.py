@@ -255,7 +255,7 @@ class PairForce(eqx.Module):
 class ChannelForce(PairForce):
     """Forces of several terms with different cutoff radii, evaluated one after the other over one list.
 
-    Decisions of different terms are concatenated along the axis of words of decisions.
+    The decisions of all terms are concatenated along the first axis.
     """
 
     model: Channels  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -377,7 +377,7 @@ def _in_one_loop_jvp(primals, tangents, *, decisions: bool, tensor: bool):
 def imposed(
     inside: Bool[Array, "4 atoms"], given: UInt8[Array, "atoms"], where: UInt8[Array, "atoms"] | None
 ) -> Bool[Array, "4 atoms"]:
-    """Return the decisions used in a group of slots: the imposed decisions where given, or else its own.
+    """Return the decisions used in a group of slots: imposed decisions if given, otherwise `inside`.
 
     A simple mask makes the compiler compute distances twice: a step of 864 atoms takes 2.2 times as long as a
     normal step, 1.3 times with a mask per slot (`unpacked`), and 1.2 times in this way.

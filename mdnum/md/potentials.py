@@ -122,7 +122,7 @@ class LennardJones(PairPotential):
 
 
 class Morse(PairPotential):
-    """depth (exp(-2 alpha (r - r0)) - 2 exp(-alpha (r - r0))); energy, one over length, length.
+    """depth (exp(-2 alpha (r - r0)) - 2 exp(-alpha (r - r0))); depth: energy, alpha: 1/length, r0: length.
 
     Example:
         >>> Morse(depth=0.3429, alpha=1.3588, r0=2.866)
@@ -142,7 +142,7 @@ class Morse(PairPotential):
 
 
 class SoftSphere(PairPotential):
-    """epsilon/alpha (1 - r/sigma)^alpha inside sigma, zero outside; length, energy, exponent above 1.
+    """epsilon/alpha (1 - r/sigma)^alpha for r < sigma, else 0; sigma: length, epsilon: energy, alpha > 1.
 
     Example:
         >>> SoftSphere(sigma=1.0, epsilon=1.0, alpha=2.0)
@@ -434,7 +434,7 @@ class CutPotential(eqx.Module):
 class Channels(eqx.Module):
     """Sum of cut potentials with different radii, where a pair has one decision for each radius.
 
-    The kind of a decision is its pair type index plus the number of pair types in all previous channels.
+    Decisions are numbered by pair type, plus the number of pair types in all previous channels.
     """
 
     parts: tuple[CutPotential, ...]
@@ -478,11 +478,11 @@ class Channels(eqx.Module):
 
     @property
     def r_cut(self) -> Float[Array, "kinds"]:
-        """Cutoff radius of each kind of decision, length."""
+        """Cutoff radius for each channel and pair type, length."""
         return jnp.concatenate([part.r_cut for part in self.parts])
 
     def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
-        """Return energy jump and radial force jump as a pair enters, per term and kind of decision."""
+        """Return energy jump and radial force jump as a pair enters, by term and channel's pair type."""
         sides = zip(*(part.jumps() for part in self.parts), strict=True)
         return np.stack([np.asarray(block_diag(*one)) for one in sides])
 

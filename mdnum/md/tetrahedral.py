@@ -26,8 +26,8 @@ class StillingerWeber(ManyBody):
 
     All derivatives are continuous at the cutoff, so that flips change neither the energy nor the forces.
 
-    Source: Stillinger and Weber, Phys. Rev. B 31, 5262 (1985), eqs. 2.3 to 2.7; checked against a plain
-    numpy evaluation of those equations (tests/support/oracles_manybody.py).
+    The implementation was checked against a plain numpy evaluation (tests/support/oracles_manybody.py).
+    Source: Stillinger and Weber, Phys. Rev. B 31, 5262 (1985), eqs. 2.3 to 2.7.
     """
 
     epsilon: float = eqx.field(static=True, default=2.1683)  # energy scale, energy
@@ -77,12 +77,13 @@ _LARGEST_EXPONENT = 69.0776
 class Tersoff(ManyBody):
     """Bond-order potential for one element; the default constants are those of silicon, set Si(C), "T3".
 
-    Energy and force go to zero at r_cut = R + D, where the derivative of the force jumps. If no other atom
-    affects the order of a bond, the bond order varies as (r_cut - r)^(2n). For n < 1, the force is then
-    continuous with an infinite derivative (in dilute silicon, not in the crystal).
+    Energy and force go to zero at r_cut = R + D, where the derivative of the force jumps. If only the
+    crossing atom affects the order of a bond, the bond order varies as (r_cut - r)^(2n). For n < 1, the force
+    is then continuous with an infinite derivative (in dilute silicon, not in the crystal).
 
-    Source: Tersoff, Phys. Rev. B 38, 9902 (1988), eqs. 1 to 3 and table I, in LAMMPS's notation; checked
-    against ase.calculators.tersoff and a plain numpy evaluation (tests/support/oracles_manybody.py).
+    The implementation was checked against ase.calculators.tersoff and a plain numpy evaluation
+    (tests/support/oracles_manybody.py). Source: Tersoff, Phys. Rev. B 38, 9902 (1988), eqs. 1 to 3 and table
+    I, in LAMMPS's notation.
     """
 
     # A, B: repulsion and attraction, energy

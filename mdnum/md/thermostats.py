@@ -75,9 +75,9 @@ class Chain(NamedTuple):
 class NoseHooverChain(Integrator):
     """Canonical ensemble by a Nosé-Hoover chain: velocity Verlet between two half-steps of the chain.
 
-    Deterministic and time-reversible dynamics. Source: Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635
-    (1992), integrated as in Tuckerman et al., J. Phys. A 39, 5629 (2006). A stiff system at low temperature
-    may not be ergodic.
+    The dynamics is deterministic and time-reversible. Source: Martyna, Klein, Tuckerman, J. Chem. Phys. 97,
+    2635 (1992), integrated as in Tuckerman et al., J. Phys. A 39, 5629 (2006). A stiff system at low
+    temperature may not be ergodic.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="nose-hoover",
