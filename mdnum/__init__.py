@@ -1,13 +1,13 @@
 """mdnum: neighbor-set flips, forks and gradients of cutoff-based molecular dynamics.
 
-A simulation is made from objects, or from a system file:
+A simulation is created from Python objects or from a system file:
 
     >>> argon = mdnum.LennardJones(sigma=3.405, epsilon=0.0103235)
     >>> sim = mdnum.simulation(atoms, argon, mdnum.Cut("switched", 8.5), timestep=0.002)
     >>> sim = mdnum.build("argon/liquid-864")
     >>> sim = mdnum.changed(sim, {"cutoff.radius": 8.0})
 
-Verbs take a simulation, or the name or path of a system file, and write a folder:
+Functions take a simulation, or the name or path of a system file, and write a folder:
 
     run                 simulate, record every flip, compare with ASE
     fork, fork_...      compare two runs that differ in one choice; maps, certificates, forecasts
@@ -24,8 +24,8 @@ Nouns: `Simulation` and its `parameters` by path, pair potentials (`LennardJones
 several that add, integrators (`VelocityVerlet`, `Langevin`; `KickDrift` and `Integrator` to write one),
 `PrecisionPolicy`, `Problem` with `value_and_grad` and `method` for gradients, and `MdnumCalculator` for ASE.
 
-The names below are imported on first use (PEP 562), because jax takes half a second to import and
-jax_md takes six, and `mdnum --help` needs neither.
+The names below are imported on first use (PEP 562), because importing jax takes half a second and importing
+jax_md takes six seconds, and `mdnum --help` does not need these packages.
 """
 
 from __future__ import annotations

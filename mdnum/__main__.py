@@ -1,4 +1,4 @@
-"""The command line as `python -m mdnum`, the same as `mdnum`."""
+"""Entry point of `python -m mdnum`, which is equivalent to the command `mdnum`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ if __name__ == "__main__" and not sys.flags.safe_path and sys.path[:1] == [os.ge
 def main() -> None:
     """Run the command line and exit.
 
-    Until there are results to be saved, and again at the end, control-C ends the process at once, because a
-    package whose import is interrupted fails in an unpredictable way.
+    Before there are results to be saved, and again at the end, control-C ends the process at once, because an
+    interrupted import of a package fails in unpredictable ways.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:

@@ -1,6 +1,6 @@
-"""Operations on bits: packed decisions, and sorting of integers.
+"""Operations on packed bits (one bit per cutoff decision), and sorting of integers.
 
-This module is outside `mdnum.numerics` because trajectories use it too, and `mdnum.numerics` imports jax.
+This module is not in `mdnum.numerics`, because trajectories use it without jax.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mdnum.vectors import lowest_bit
 
 @njit
 def _scan(before, rows, columns, row, slot, column, values):
-    """Record the bits that change from row to row until the buffer is full; return the number of changes."""
+    """Record the bits that change between consecutive rows, until the buffer is full; return their number."""
     at, room = 0, row.shape[0]
     for r in range(rows.shape[0]):
         # the eight slots that the scan is in, and the places of their bytes
@@ -43,14 +43,15 @@ def changes_in_time(
 ) -> tuple[
     Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]
 ]:
-    """Return the decisions that differ from the previous row, for consecutive rows of one list.
+    """Find all decisions that change between consecutive rows of packed decisions for one neighbor list.
 
     Args:
         before: decisions before the first row.
         rows: decisions of each row.
 
     Returns:
-        row, slot, column and the new decision (1 yes, 0 no) of every change, by row, slot word, column, bit.
+        row, slot, column and new decision (1 yes, 0 no) of every change, sorted by row, slot word, column,
+        bit.
     """
     count, words, columns = rows.shape
     size = words * columns
@@ -74,13 +75,13 @@ def changes_in_time(
 def set_bits(
     packed: UInt8[np.ndarray, "words columns"],
 ) -> tuple[Int[np.ndarray, "set"], Int[np.ndarray, "set"]]:
-    """Return slot and column of every decision that is yes."""
+    """Return slot and column of every bit that is set (decision "yes")."""
     _, slots, columns, _ = changes_in_time(np.zeros_like(packed), packed[None])
     return slots, columns
 
 
 def count_set(packed: UInt8[np.ndarray, "..."]) -> int:
-    """Count the decisions that are yes in packed bytes (any number of columns)."""
+    """Count the bits that are set (decision "yes") in packed bytes."""
     flat = np.ascontiguousarray(packed).reshape(-1)
     whole = len(flat) // 8 * 8
     return int(np.bitwise_count(flat[:whole].view(np.uint64)).sum(dtype=np.int64)) + int(
@@ -90,9 +91,9 @@ def count_set(packed: UInt8[np.ndarray, "..."]) -> int:
 
 @njit
 def digit_order(room, count, most):
-    """Sort integer keys from 0 to below `most` stably, by radix sort from the last digit; return the order.
+    """Sort integer keys (0 <= key < `most`) by a stable radix sort, and return the sorting order.
 
-    Keys are in the first row of `room`, whose content is overwritten: int64, (4, count or more).
+    The keys are in the first row of `room`, int64, shape (4, count or more); `room` is overwritten.
     """
     keys, numbers, other_keys, other_numbers = room[0], room[1], room[2], room[3]
     bits = 1

@@ -1,4 +1,4 @@
-"""numba's decorators as mdnum uses them: compiled functions are cached on disk where possible."""
+"""Decorators of numba with caching: compiled functions are stored on disk if possible."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ _missed: list[Any] = []  # what could not be kept
 
 
 def njit(function: Any = None, /, **options: Any) -> Any:
-    """`numba.njit` without the GIL; cached in a file, or compiled by each process if no folder allows it."""
+    """`numba.njit` without the global lock; compiled functions are cached on disk if a folder is writable."""
     if function is None:
         return lambda function: njit(function, **options)
     return _kept(lambda keep: numba.njit(cache=keep, nogil=True, **options)(function))
 
 
 def cfunc(signature: Any, function: Callable[..., Any]) -> Any:
-    """`numba.cfunc`, cached as by `njit`."""
+    """`numba.cfunc` with compiled functions cached on disk if a folder is writable."""
     return _kept(lambda keep: numba.cfunc(signature, cache=keep)(function))
 
 
 def all_kept() -> bool:
-    """True if every function that this process has compiled so far is cached."""
+    """Return True if every function that this process has compiled so far is cached on disk."""
     # a function that was not called has not been compiled
     return not any(getattr(one, "signatures", True) for one in _missed)
 
@@ -58,7 +58,7 @@ def _kept(compiled: Callable[[bool], Any]) -> Any:
 
 
 def _attempt(use: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a use of the cache so that errors from unreadable files or lack of disk space are recorded."""
+    """Wrap a method of the cache to record errors from unreadable files or lack of disk space."""
 
     def attempt(*given: Any) -> Any:
         try:

@@ -1,4 +1,4 @@
-"""Time limit of a verb: results that are missing at the deadline are reported as missing, not estimated."""
+"""Time limit of a command: results that are missing at the deadline are reported as missing."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ GRACE = 10.0
 
 
 class TimeUp(Exception):
-    """The deadline passed during a calculation, which therefore has no result."""
+    """Raised if the deadline passes during a calculation, which therefore has no result."""
 
     why = "the time was up"
 
 
 class Deadline:
-    """Time after which no more work is started.
+    """A deadline, after which a command does not start further work.
 
-    The evidence for a verdict is measured in calls, never in seconds; a deadline only limits the number of
-    calls, and a verb states when this happened.
+    The evidence for a verdict is the number of calls, which does not depend on the speed of the machine. A
+    deadline can only reduce this number; the command then reports this.
 
     Args:
-        minutes: time from now; None for no limit.
+        minutes: time from now in minutes; None for no limit.
 
     Raises:
         InputError: minutes is not a positive number.
@@ -46,11 +46,11 @@ class Deadline:
 
     @property
     def left(self) -> float:
-        """Remaining seconds; infinite without a limit, never negative."""
+        """Remaining time in seconds; infinite without a limit, and 0 after the deadline."""
         return max(0.0, self._end - time.monotonic())
 
     def part(self, share: float) -> Deadline:
-        """Return the deadline after this fraction of the remaining time."""
+        """Return an earlier deadline, after a fraction of the remaining time."""
         sooner = Deadline()
         sooner._end = time.monotonic() + share * self.left
         return sooner
@@ -63,9 +63,9 @@ class Deadline:
 
 @contextmanager
 def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
-    """In the main thread, raise `TimeUp` if a call is still running `grace` s after the deadline.
+    """Raise `TimeUp` in the main thread if the block is still running `grace` seconds after the deadline.
 
-    The interruption is repeated, because the called code may catch it; compiled code is not interrupted.
+    The interruption is repeated, because the block may catch it. Compiled code is not interrupted.
     """
     if math.isinf(deadline.left) or threading.current_thread() is not threading.main_thread():
         yield
@@ -84,7 +84,7 @@ def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
 def fewest(
     items: Sequence[T], enough: Callable[[list[T]], bool], spent: Callable[[], bool] = lambda: False
 ) -> list[T]:
-    """Return a sufficient subset of items, minimal unless the search was cut short.
+    """Return a sufficient subset of items, which is minimal unless the search was stopped early.
 
     Args:
         items: items that are sufficient together.

@@ -1,11 +1,11 @@
-"""`mdnum doctor`: tests of whether the numbers that this installation computes can be trusted.
+"""`mdnum doctor`: tests of whether this installation computes correct numbers.
 
-All results come from computations on the current machine. A version known to be faulty is also reported, but
-a version is no evidence of correctness.
+All tests are computations on the current machine. Versions that are known to be faulty are also reported, but
+no version is assumed to be correct.
 
-Bounds and margins require that +, -, *, / and sqrt are correctly rounded, one by one, and that no sum is
-reordered. XLA satisfies this on CPUs, but also contracts a*b+c and rewrites divisions by constants: these
-legitimately change last bits, so two builds may make different decisions if a margin is within its bound.
+Error bounds require that +, -, *, / and sqrt are each correctly rounded, and that sums are not reordered. XLA
+satisfies these conditions on CPUs, but contracts a*b+c and rewrites divisions by constants. This changes last
+bits, so the cutoff decisions of two builds may differ if a margin is below its error bound.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Diagnosis:
 
 
 def diagnose(budget: float = 18.0) -> Diagnosis:
-    """Test this installation.
+    """Run all tests of this installation.
 
     Example:
         >>> mdnum.diagnose().ok
@@ -96,7 +96,7 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
 
 
 def _row(test: str, status: Status | bool, **values: Any) -> DoctorRow:
-    """Return a test's row with the fields of its text filled in; status True is "ok", False "unsafe"."""
+    """Return the result row of a test with its text filled in; status True means "ok", False "unsafe"."""
     if not isinstance(status, str):
         status = "ok" if status else "unsafe"
     words = _WORDS[test]
@@ -136,13 +136,13 @@ def flags() -> DoctorRow:
 
 
 def devices() -> DoctorRow:
-    """Report the devices that jax computes on."""
+    """Report the devices on which jax computes."""
     names = ", ".join(f"{device.platform} ({device.device_kind})" for device in jax.devices())
     return _row("devices", "info", names=names, cores=os.cpu_count())
 
 
 def packages() -> DoctorRow:
-    """Report every package that mdnum needs, and the installed optional packages."""
+    """Report the versions of all required packages and of installed optional packages."""
     found = {package: version(package) for package in (*PACKAGES, *PEERS)}
     missing = [package for package in PACKAGES if found[package] is None]
     installed = ", ".join(f"{package} {at}" for package, at in found.items() if at)
@@ -150,7 +150,7 @@ def packages() -> DoctorRow:
 
 
 def numba_works() -> DoctorRow:
-    """Test that numba compiles, keeps float64 and does not reorder a sum."""
+    """Test that numba can compile, computes in float64, and does not reorder sums."""
     start = time.perf_counter()
     try:
         import numba
@@ -185,7 +185,7 @@ def _differing(a: Any, b: Any) -> int:
 
 
 def float64() -> DoctorRow:
-    """Test that double precision is on, and that doubles are unchanged by transfer to the device and jit."""
+    """Test that jax uses float64, and that transfer to the device and jit do not change float64 numbers."""
     values = np.array([np.float64(1) / 3, np.pi, 1 + 2**-52, 8.5125, 1e300, -(2.0**-1000)])
     after = np.asarray(jax.jit(lambda x: x)(jnp.asarray(values)))
     kept = after.dtype == np.float64 and after.tobytes() == values.tobytes()
@@ -197,10 +197,10 @@ def float64() -> DoctorRow:
 
 
 def elementwise() -> DoctorRow:
-    """Compare basic operations, jitted and eager, with numpy, bit for bit, in both precisions.
+    """Compare basic operations of jax (jitted and eager) with numpy, bit for bit, in float64 and float32.
 
-    On an accelerator, quotients and square roots in float32 may be approximate; decisions do not depend on
-    them (`numerics.exact.root`).
+    On an accelerator, quotients and square roots in float32 may be approximate; cutoff decisions do not use
+    these operations (`numerics.exact.root`).
     """
     # by name, which numpy and jax share, with the number of arguments
     operations = {
@@ -221,7 +221,7 @@ def elementwise() -> DoctorRow:
 
 
 def functions() -> DoctorRow:
-    """Compare exp, log, cos and power with numpy, in units in the last place."""
+    """Measure differences between jax and numpy for exp, log, cos and power, in units in the last place."""
     a, b = _numbers(3), _numbers(4) / 10
     ulps = {}
     for name, given in {"exp": [-a], "log": [a], "cos": [a], "power": [a, b]}.items():
@@ -235,7 +235,7 @@ def functions() -> DoctorRow:
 
 
 def reassociation() -> DoctorRow:
-    """Test that sums keep their order: (x + c) - c is not folded, error-free transformations stay exact."""
+    """Test that sums are not reordered: (x + c) - c is not simplified, and error-free sums remain exact."""
     x, c = _numbers(5) * 1e-3, np.full(_COUNT, 1e3)
 
     def two_sum(a: Any, b: Any) -> tuple[Any, Any]:
@@ -254,14 +254,14 @@ def reassociation() -> DoctorRow:
 
 
 def contraction() -> DoctorRow:
-    """Test whether a*b + c is contracted to one rounding under jit."""
+    """Test whether jit contracts a*b + c to a fused multiply-add with a single rounding."""
     a, b, c = _numbers(6), _numbers(7), -_numbers(8)
     count = _differing(jax.jit(lambda a, b, c: a * b + c)(*map(jnp.asarray, (a, b, c))), a * b + c)
     return _row("contraction", "info" if count else "ok", count=count, of=_COUNT)
 
 
 def constant_division() -> DoctorRow:
-    """Test whether x / constant becomes x * (1 / constant), and (x*c)*d becomes x*(c*d)."""
+    """Test whether jit replaces x / c by x * (1 / c), and (x*c)*d by x*(c*d), for constants c and d."""
     x = _numbers(9)
     divided = _differing(jax.jit(lambda x: x / 3.0)(jnp.asarray(x)), x / 3.0)
     folded = _differing(jax.jit(lambda x: (x * 0.1) * 0.7)(jnp.asarray(x)), (x * 0.1) * 0.7)
@@ -272,9 +272,9 @@ def constant_division() -> DoctorRow:
 def subnormals() -> DoctorRow:
     """Test whether numpy and jax keep numbers below 2.2e-308, or flush them to zero.
 
-    XLA flushes them on CPUs, and a loaded library can make the processor flush all of them. The test computes
-    with subnormals, also in arrays large enough for XLA's own threads, and compares integers, because a
-    processor that treats subnormals as zero considers them equal to zero.
+    XLA flushes subnormal numbers to zero on CPUs, and a loaded library can make the processor flush all of
+    them. The test also uses arrays that are large enough for XLA's own threads. Results are compared as
+    integers, because a processor that treats subnormals as zero considers these numbers equal to zero.
     """
 
     def power(exponent: int, count: int) -> np.ndarray:
@@ -300,12 +300,12 @@ def subnormals() -> DoctorRow:
 
 
 def _fcc(cells: int) -> np.ndarray:
-    """Return the atoms of an fcc crystal in units of its lattice constant, (4 cells³, 3)."""
+    """Return the positions of an fcc crystal in units of its lattice constant, shape (4 cells³, 3)."""
     return np.array([place for place in np.ndindex((2 * cells,) * 3) if sum(place) % 2 == 0]) / 2
 
 
 def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return 500 argon atoms of an fcc crystal, perturbed, in a tilted box, with a padded pair list.
+    """Return a perturbed fcc crystal of 500 argon atoms in a tilted box, with a padded list of pairs.
 
     Returns:
         cell: columns are box vectors (3, 3), Å.
@@ -325,7 +325,7 @@ def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) -> jax.Array:
-    """Compute r² of every slot as jax-md does, one matrix-vector product per pair; 0 in unused slots."""
+    """Compute r² of every listed pair by one matrix-vector product, like jax-md; 0 in unused slots."""
     used = slots[:, 0] < fractional.shape[0]
     index = jnp.where(used[:, None], slots, 0)
     separation = fractional[index[:, 0]] - fractional[index[:, 1]]
@@ -335,7 +335,7 @@ def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) 
 
 
 def pair_energy(r2: jax.Array) -> jax.Array:
-    """Return the Lennard-Jones energy of the slots inside a hard cutoff, eV."""
+    """Return the Lennard-Jones energy of the listed pairs inside a hard cutoff, eV."""
     inside = (r2 > 0) & (r2 < _R_CUT**2)
     inverse = (_SIGMA**2) / jnp.where(inside, r2, jnp.ones_like(r2))
     sixth = inverse * inverse * inverse
@@ -343,11 +343,11 @@ def pair_energy(r2: jax.Array) -> jax.Array:
 
 
 def crystal() -> DoctorRow:
-    """Compare distances and energy of the tilted crystal, jitted and eager, with numpy and exact sums.
+    """Compare distances and energy of a tilted crystal in jax (jitted and eager) with exact sums in numpy.
 
-    On CPUs, jax 0.10.2 jits a vmapped matrix-vector product followed by a reduction incorrectly
+    On CPUs, jax 0.10.2 compiles a vmapped matrix-vector product that is followed by a reduction incorrectly
     (jax-ml/jax#39103), without a warning: one coordinate of every displacement in a tilted box is wrong. The
-    bug requires more than 16,384 rows, so small tests pass.
+    bug affects only arrays with more than 16,384 rows, so small tests pass.
     """
     cell, fractional, slots = tilted_crystal()
     used = slots[:, 0] < len(fractional)
@@ -373,7 +373,7 @@ def crystal() -> DoctorRow:
 
 
 def digest(steps: int = 50) -> str:
-    """Return the SHA-256 of a short jitted rollout, to be compared between processes.
+    """Return the SHA-256 digest of a short jitted simulation, which must be the same in all processes.
 
     Args:
         steps: number of velocity Verlet steps of 32 argon atoms.
@@ -408,7 +408,7 @@ def digest(steps: int = 50) -> str:
 
 
 def own_forces() -> DoctorRow:
-    """Compare mdnum's energy and forces of argon/tilted-500, including neighbor search, with plain numpy."""
+    """Compare mdnum's energy and forces of the system argon/tilted-500 with a direct sum in numpy."""
     try:
         energy, force = worst_errors()
     except Exception as error:  # whatever keeps mdnum from computing forces here is what was asked for
@@ -418,7 +418,7 @@ def own_forces() -> DoctorRow:
 
 
 def worst_errors() -> tuple[float, float]:
-    """Return the relative energy difference, and the largest force difference over the largest force."""
+    """Return the relative energy error, and the largest force error divided by the largest force."""
     from mdnum.systems import build
 
     simulation = build("argon/tilted-500")
@@ -434,7 +434,7 @@ def worst_errors() -> tuple[float, float]:
 def _lennard_jones(
     positions: np.ndarray, cell: np.ndarray, sigma: float, epsilon: float, r_cut: float
 ) -> tuple[float, np.ndarray]:
-    """Compute energy and forces from all pairs in all neighboring images, one image after another."""
+    """Compute Lennard-Jones energy and forces by a direct sum over all pairs and neighboring images."""
     terms: list[np.ndarray] = []
     forces = np.zeros_like(positions)
     fractional = positions @ np.linalg.inv(cell)
@@ -455,7 +455,7 @@ def _lennard_jones(
 
 
 class Child:
-    """A Python process that runs code and prints one line, started early to avoid waiting."""
+    """A Python process that runs code and prints one line; it is started early to avoid waiting."""
 
     def __init__(self, code: str):
         pipe: Any = subprocess.PIPE
@@ -464,7 +464,7 @@ class Child:
         )
 
     def answer(self, seconds: float) -> tuple[str | None, str]:
-        """Wait at most the given seconds; return (output, "") or (None, reason for the missing output)."""
+        """Wait for at most `seconds`; return (output, "") or (None, reason for the missing output)."""
         try:
             out, err = self.process.communicate(timeout=max(seconds, 0.1))
         except subprocess.TimeoutExpired:
@@ -487,7 +487,7 @@ def imports(child: Child, seconds: float) -> DoctorRow:
 
 
 def second_process(child: Child, here: str, seconds: float) -> DoctorRow:
-    """Test that a jitted rollout has the same bits in another process, as required for resuming runs."""
+    """Test that a jitted simulation has the same bits in another process, which resuming a run requires."""
     answer, why = child.answer(seconds)
     status = "info" if why == _LATE else answer == here
     return _row("second_process", status, here=here[:12], there=answer[:12] if answer else why)

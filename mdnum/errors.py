@@ -1,4 +1,4 @@
-"""Exceptions whose messages contain the observation, the expectation and a remedy."""
+"""Exceptions with messages that state what was found, what was expected, and a remedy."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def json_escape(character: str) -> str:
 
 
 def printable(text: str, escape: Callable[[str], str] = python_escape) -> str:
-    """Escape everything in untrusted text that a terminal would interpret.
+    """Escape all characters of untrusted text that a terminal would interpret.
 
     Escape sequences, other control characters (except line ends and tabs) and characters that reorder or hide
-    text are written as in Python, such as ``\\x1b``.
+    text are written in Python notation, such as ``\\x1b``.
     """
     return _CONTROL.sub(lambda found: escape(found[0]), text)
 
 
 def shortened(text: str) -> str:
-    """Shorten a message: long words and long texts lose their middle."""
+    """Shorten a message: the middle of long words and long texts is removed."""
     text = _LONG_WORD.sub(lambda found: _without_middle(found[0], 100), text)
     return _without_middle(text, _LONGEST)
 
@@ -51,9 +51,9 @@ def _without_middle(text: str, kept: int) -> str:
 
 
 class MdnumError(Exception):
-    """Base class of every error that mdnum raises on purpose.
+    """Base class of all errors that mdnum raises intentionally.
 
-    Control characters in quoted text are escaped, and long quotes are shortened.
+    Control characters in the message are escaped, and long quoted texts are shortened.
 
     Example:
         >>> try:
@@ -90,7 +90,7 @@ def _restored(kind: type[MdnumError], args: tuple[Any, ...], held: dict[str, Any
 
 
 class InputError(MdnumError):
-    """Raised if user input cannot be used: a system file, an option, a structure."""
+    """Raised if user input (a system file, an option, a structure) cannot be used."""
 
 
 class FolderError(InputError):
@@ -114,7 +114,7 @@ class NumericalError(MdnumError):
 
 
 def in_a_line(error: BaseException) -> str:
-    """Return the type and message of another package's exception in one line."""
+    """Return the type and the message of an exception from another package in one line."""
     words = " ".join(str(error).split())[:300]
     return f"{type(error).__name__}: {words}" if words else type(error).__name__
 
@@ -123,7 +123,7 @@ def expect_at_least(least: int, **numbers: int) -> None:
     """Raise an error if a number is below its minimum.
 
     Raises:
-        InputError: with the name of the first such number.
+        InputError: a number is below its minimum; the message contains the name of the first such number.
     """
     for name, number in numbers.items():
         if number < least:
@@ -131,10 +131,10 @@ def expect_at_least(least: int, **numbers: int) -> None:
 
 
 def expect_path(given: object, remedy: str) -> None:
-    """Raise an error if an array or another object is given instead of a path, without quoting its content.
+    """Raise an error if an object that is not a path is given instead of a path.
 
     Raises:
-        InputError: with the object's type and, if it has one, its shape.
+        InputError: the object is not a path; the message contains its type and shape, but not its contents.
     """
     if not isinstance(given, str | os.PathLike):
         shape = getattr(given, "shape", None)

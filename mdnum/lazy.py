@@ -1,4 +1,4 @@
-"""Import of a package's names on first use (PEP 562)."""
+"""Import of the names of a package when they are first used (PEP 562)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any
 def on_first_use(
     package: str, **others: str
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package that imports nothing itself.
+    """Return `__getattr__`, `__dir__` and `__all__` for a package that imports its names on first use.
 
-    The names of the package are those imported in its source under `if TYPE_CHECKING`, from modules by their
-    full names; they are thus written only once, for type checkers and for Python.
+    The names are taken from the imports under `if TYPE_CHECKING` in the source of the package, which must use
+    full module names. Type checkers and Python thus use the same list of names.
 
     Args:
         package: `__name__` of the package.

@@ -1,4 +1,4 @@
-"""Conversion of results to plain values for JSON, TOML and terminals, and access to shipped files."""
+"""Conversion of results to plain values for JSON, TOML and terminals, and access to packaged files."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ T = TypeVar("T")
 
 @functools.cache
 def beside(module: str) -> dict[str, Any]:
-    """Return the tables of the TOML file next to a module (given by `__file__`); do not change them."""
+    """Return the tables of the TOML file next to a module (`__file__`); do not change the tables."""
     return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def shipped_folder(kind: Literal["systems", "demos"] = "systems") -> Path:
-    """Return the folder of shipped files: the packaged copy, or the repository's for editable installs."""
+    """Return the folder of shipped files: the packaged copy, or the repository for editable installs."""
     package = Path(__file__).parent
     packaged = package / f"_{kind}"
     return packaged if packaged.is_dir() else package.parent / kind
@@ -37,7 +37,7 @@ HEAD = ("status", "seconds", "headline", "verdict", "findings")
 
 
 def headed(kind: str, document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document with a header that names its schema in mdnum/schemas, its kind and its version."""
+    """Return a JSON document with a header that contains its schema (in mdnum/schemas), kind and version."""
     head = {"schema": f"mdnum/{kind}/1", "kind": kind}
     return {**head, **document, **head}
 
@@ -46,7 +46,7 @@ def plain(value: Any) -> Any:
     """Convert a value for JSON: dataclasses to dictionaries, arrays to lists, non-finite numbers to None.
 
     Raises:
-        TypeError: the value has no plain form.
+        TypeError: the value cannot be converted.
     """
     if value is None or isinstance(value, bool | str | int):
         return value
@@ -68,7 +68,7 @@ def plain(value: Any) -> Any:
 
 @dataclass_transform(frozen_default=True)
 def result(kind: type[T]) -> type[T]:
-    """Make a frozen dataclass whose repr shows numbers and short texts, and the types of other fields."""
+    """Class decorator: frozen dataclass with a short repr (numbers, short texts, types of other fields)."""
 
     def __repr__(self: Any) -> str:
         values = ((one.name, getattr(self, one.name)) for one in dataclasses.fields(self))

@@ -1,10 +1,10 @@
-"""The interface between a world and the analyses that run its systems, and the results of such runs.
+"""Interface of simulations to analyses such as forks and parameter maps, and results of comparisons.
 
-A world (molecular dynamics, the bouncing ball, or another package's) implements `Program`: everything that
-determines the bits of a run, including its start. Forks, parameter maps, screening and certificates are
-written once for this interface, independent of atoms and balls. A program acts on decisions that it is given,
-so a ledger contains the decisions that were used, and the decisions of one program can be imposed on another.
-The implementation for molecular dynamics is `mdnum.rollout.program.MdProgram`, that for the ball
+Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. A
+program determines all bits of a run, including the initial state. Forks, parameter maps, screening and
+certificates use only this interface. Decisions (such as whether a pair is inside the cutoff) are an input of
+a time step. Records therefore contain the decisions that were used, and decisions of one program can be
+imposed on another program. The implementations are `mdnum.rollout.program.MdProgram` and
 `mdnum.ball.program.BallProgram`.
 """
 
@@ -22,17 +22,17 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 
 
 class Program(Protocol):
-    """One way to run one system.
+    """Protocol of a simulation that can be run, compared with another simulation, and varied.
 
     Attributes:
         size: number of atoms or balls.
-        steps: number of steps of the system's own run.
-        timestep: time step in the units of the system's file.
-        scale: length relative to which tolerances are given: the longest cutoff, the largest start height.
-        ulp: unit in the last place of the largest start coordinate, length: no smaller displacement is
-            representable.
+        steps: number of steps that the system specifies.
+        timestep: time step in the unit of the system file.
+        scale: reference length of tolerances: the longest cutoff, or the largest initial height.
+        ulp: unit in the last place of the largest initial coordinate, length; the smallest possible
+            displacement.
         streams: whether runs may continue beyond the requested steps; False for runs that are stored whole.
-        imposable: why decisions cannot be imposed on the program; None if they can.
+        imposable: reason why decisions cannot be imposed on the program; None if imposing is possible.
     """
 
     @property
@@ -51,72 +51,72 @@ class Program(Protocol):
     def imposable(self) -> str | None: ...
 
     def check(self, other: Any) -> None:
-        """Check that another program makes the same kinds of decisions on the same subjects.
+        """Raise an error if another program has other kinds of decisions or other numbers of atoms or balls.
 
         Raises:
-            InputError: the programs are not comparable.
+            InputError: the programs cannot be compared.
         """
         ...
 
     def lockstep(
         self, other: Any, last: int, *, forward: bool, back: bool, guard: float | None
     ) -> Iterator[PairRows]:
-        """Run this program (A) and another (B) in lockstep.
+        """Run this program (A) and another program (B) together, and compare them step by step.
 
         Args:
-            forward: whether to run B under A's decisions too, "B|A".
-            back: whether to run A under B's decisions too, "A|B".
-            guard: length; a run ends when an imposed decision is further than this from its threshold,
-                because rounding could no longer have changed that decision.
+            forward: whether to run also B with A's decisions imposed, "B|A".
+            back: whether to run also A with B's decisions imposed, "A|B".
+            guard: largest distance of an imposed different decision from its threshold, length; the run ends
+                at larger distances, because rounding could not have changed such a decision.
         """
         ...
 
     def repeats(
         self, others: Sequence[Any], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Return separations of other programs from this one, free and under this one's decisions.
+        """Return separations of other runs from this run, without and with this run's decisions imposed.
 
         Args:
             others: the same program with perturbed starts.
-            last: last step; runs may end earlier if all of them have split.
+            last: last step; runs may end earlier if all runs have split.
             tolerance: separation that counts as a split, length.
             guard: as for `lockstep`.
         """
         ...
 
     def nudged(self, size: float, count: int, seed: int) -> list[Any]:
-        """Programs with random displacements of the start, the largest about `size`, at least an ulp."""
+        """Return programs with random displacements of the start, at most about `size`, at least an ulp."""
         ...
 
     def decision(self, other: Any, flips: Sequence[Any], separation: float) -> Decision:
-        """Return the decision at a fork.
+        """Return the decision that differs between two runs at their fork.
 
         Args:
             flips: cross-run flips of the segment of steps.
-            separation: separation of the runs at the step before, length.
+            separation: separation of the runs at the previous step, length.
         """
         ...
 
     def number(self, key: str) -> Number:
-        """Return a number of the system by its key, to be varied.
+        """Return a numerical parameter of the system, which can be varied, by its key.
 
         Raises:
-            InputError: there is no such number, or several; the message lists the known ones.
+            InputError: no parameter or several parameters match; the message lists the known parameters.
         """
         ...
 
     def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
-        """Return the decisions of a run of the given number of steps, and its final state."""
+        """Return the decisions of a run with a given number of steps, and the final state."""
         ...
 
     def differing(self, other: Any, steps: int, step: int, key: str) -> Differing:
-        """Return the decisions at a step that differ from those of a program with an adjacent value."""
+        """Return the decision that differs at a step from a program with an adjacent parameter value."""
         ...
 
 
 @dataclass(frozen=True)
 class Twin:
-    """Two programs that differ in one numerical choice."""
+    """Two simulations (programs) that differ in one numerical setting."""
 
     # a, b: the programs
     a: Any
@@ -128,7 +128,7 @@ class Twin:
 
 @dataclass(frozen=True)
 class PairRows:
-    """Consecutive steps of two runs in lockstep."""
+    """Consecutive time steps of two runs that are compared step by step."""
 
     first: int  # step of the first row
     # largest distance between the runs, length, of "B" and "B|A" from A, of "A|B" from B, and the other way
@@ -159,11 +159,11 @@ class PairRows:
 
     @property
     def rows(self) -> int:
-        """Number of steps."""
+        """Number of recorded time steps."""
         return len(self.cross)
 
     def until(self, last: int) -> PairRows:
-        """Return the rows up to a step, and the events in them."""
+        """Return the rows up to a time step, and the events in these rows."""
         rows = last - self.first + 1
         if rows >= self.rows:
             return self
@@ -195,7 +195,7 @@ class PairRows:
 
 @dataclass(frozen=True)
 class Decision:
-    """Decision at a fork."""
+    """The decision that differs between two runs at a fork."""
 
     channel: str  # "pair", "contact" or "stop"
     step: int  # of the fork
@@ -216,7 +216,7 @@ class Decision:
 
     @property
     def margin(self) -> float:
-        """Margin in the run that made the decision, or in A at the start."""
+        """Margin (threshold minus quantity) in the run that made the decision, or in run A at the start."""
         return self.margins["A" if self.run == "start" else self.run]
 
     @property
@@ -226,18 +226,18 @@ class Decision:
 
     @property
     def ambiguous_in(self) -> list[str]:
-        """Runs in which rounding alone could have reversed the decision."""
+        """Names of the runs in which rounding alone could have reversed the decision."""
         return [name for name, bound in self.bounds.items() if bound > 0 and abs(self.margins[name]) <= bound]
 
     @property
     def ambiguous(self) -> bool:
-        """True if rounding could have reversed the decision in the run that made it."""
+        """True if rounding could have reversed the decision in the run that made the decision."""
         return abs(self.margin) <= self.bound
 
 
 @dataclass(frozen=True)
 class Number:
-    """One number of a system that can be varied."""
+    """A numerical parameter of a system that can be varied."""
 
     key: str  # as system files have it where they do
     value: float | None  # what the system says, in the units of its file; None where a batch has several
@@ -250,7 +250,7 @@ class Number:
 
 @dataclass(frozen=True)
 class DecisionHistory:
-    """Decisions of a run, step by step, and its final state."""
+    """Decisions of a run at each time step, and the final state of the run."""
 
     # of each step, a number that any other decisions of that step have different (up to collisions of 64
     # bits); shorter where the run failed, shape (rows,)
@@ -274,7 +274,7 @@ class DecisionHistory:
 
 @dataclass(frozen=True)
 class Differing:
-    """Decisions that differ at one step between programs with adjacent values of a number, nearest first."""
+    """Decision that differs at a step between two simulations with adjacent values of a parameter."""
 
     # the one whose margin is closest to 0 on both sides; a, b, margins and bounds are those of the two
     # programs

@@ -1,8 +1,8 @@
-"""Record of the program and machine of a run, sufficient to explain why two runs of one input differ.
+"""Record of software and machine of a run, which can explain why two runs of the same input differ.
 
-Two runs of the same system file on the same structure should agree bit for bit if their fingerprints agree.
-The fingerprint includes everything that XLA's code generation and mdnum's arithmetic depend on: the versions,
-the processor's instruction set, the devices, XLA's flags, jax's settings and the dtypes.
+Two runs of the same system file and structure should agree bit for bit if their fingerprints agree. The
+fingerprint includes everything on which code generation and arithmetic depend: versions, instruction set of
+the processor, devices, XLA's flags, jax's settings and dtypes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _RECORDED: dict[str, list[str]] = beside(__file__)  # names of what is recorded
 
 
 class _System(Protocol):
-    """Required attributes of a system: a structural type, because systems are in a higher layer."""
+    """Protocol with the required attributes of a system, because systems are defined in a higher layer."""
 
     @property
     def name(self) -> str: ...
@@ -37,7 +37,7 @@ class _System(Protocol):
 
 
 def collect(system: _System) -> dict[str, Any]:
-    """Return everything outside the system file that a run depends on, and hashes of the content.
+    """Return everything outside the system file on which a run depends, and hashes of its input.
 
     Returns:
         a mapping of plain values, ready for JSON.
@@ -79,7 +79,7 @@ def collect(system: _System) -> dict[str, Any]:
 
 
 def surroundings() -> dict[str, Any]:
-    """Return time, place and versions of a computation that ran no system and needs no jax."""
+    """Return time, machine and software versions of a computation without a simulation and without jax."""
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": shlex.join(sys.argv),
@@ -93,7 +93,7 @@ def surroundings() -> dict[str, Any]:
 
 
 def fingerprint(parts: Mapping[str, Any]) -> str:
-    """Return a short hash of the arithmetic; equal parts give equal hashes.
+    """Return a short hash of values that determine the arithmetic; equal values give equal hashes.
 
     Args:
         parts: plain values; the order of keys does not matter.
@@ -103,12 +103,12 @@ def fingerprint(parts: Mapping[str, Any]) -> str:
 
 
 def package_versions() -> dict[str, str | None]:
-    """Return the versions of packages that a result can depend on, None for packages not installed."""
+    """Return the versions of packages on which results can depend; None for packages not installed."""
     return {package: version(package) for package in _RECORDED["packages"]}
 
 
 def version(package: str) -> str | None:
-    """Return the installed version of a package, None if it is not installed."""
+    """Return the installed version of a package; None if the package is not installed."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -121,10 +121,10 @@ def cores() -> int:
 
 
 def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
-    """Return the processor's name, its cores, and the instruction sets that affect bits.
+    """Return the processor's name, number of cores, and the instruction sets that affect rounding.
 
     Args:
-        cpuinfo: Linux's description of the processor; on other systems Python's `platform` is used.
+        cpuinfo: Linux's description of the processor; other systems use Python's `platform`.
 
     Returns:
         model, cores, flags; flags is None if unknown.
@@ -144,12 +144,12 @@ def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
 
 
 def hashes(system: _System) -> dict[str, str | None]:
-    """Return SHA-256 of the system file as written, of the program that it defines, and of the structure.
+    """Return SHA-256 digests of the system file, of the settings that it defines, and of the structure.
 
-    The program includes all numbers and choices except the structure, with defaults and overrides: any change
-    of a value changes its hash, a change of the system's name does not. The structure is hashed as numbers
-    (species, masses, positions, velocities, cell, periodicity), so that a file in another format with the
-    same atoms has the same hash.
+    The settings are all parameters except the structure, with defaults and overrides. A change of any value
+    changes their hash; a change of the system's name does not. The structure is hashed as numbers (species,
+    masses, positions, velocities, cell, periodicity), so the same atoms in another file format have the same
+    hash.
 
     Returns:
         file (None for a system that did not come from a file), program, and structure (None without atoms).
@@ -176,9 +176,9 @@ def hashes(system: _System) -> dict[str, str | None]:
 
 
 def commit(package: Path) -> str | None:
-    """Return the git commit that a package runs from, with "+" if its files were changed since.
+    """Return the git commit of a package's source, with "+" if source files were changed since the commit.
 
-    No program that a repository can configure (monitors, hooks, filters, transports) is run.
+    Programs that a repository can configure (monitors, hooks, filters, transports) are not run.
 
     Returns:
         None for an installed wheel, without git, or if the folder belongs to another repository.

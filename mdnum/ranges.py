@@ -1,4 +1,4 @@
-"""Ranges of numbers, and the effect of narrower formats on them. No jax is imported."""
+"""Ranges of numbers, and floating-point formats that are too narrow for these ranges (without jax)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ DTYPES = {name: np.dtype(name) for name in ("float16", "bfloat16", "float32", "f
 
 
 def smallest(name: str) -> float:
-    """Return the smallest positive number that arithmetic in a format preserves."""
+    """Return the smallest positive number of a format that arithmetic does not flush to zero."""
     limits = ml_dtypes.finfo(DTYPES[name])
     # XLA on a CPU flushes subnormals to zero in every format but float16, whose arithmetic it does in float32
     return float(limits.smallest_subnormal if name == "float16" else limits.smallest_normal)
 
 
 def columns(quantities: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return table columns for the named quantities, each of shape (rows, values).
+    """Return table columns with the largest and smallest magnitudes of quantities, shape (rows, values).
 
-    `largest_NAME` is the largest magnitude of a row, `smallest_NAME` the smallest nonzero one (NaN for none).
+    `largest_NAME` is the largest magnitude in a row, `smallest_NAME` the smallest nonzero magnitude (or NaN).
     """
     made = {}
     for name, values in quantities.items():
@@ -33,11 +33,11 @@ def columns(quantities: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def first_outside(most: Any, least: Any, name: str) -> dict[str, tuple[int, float]]:
-    """Find the first rows whose numbers a format cannot represent, from the extreme magnitudes of each row.
+    """Find the first rows with numbers that a format cannot represent, given each row's extreme magnitudes.
 
     Returns:
         row and number that would first be infinite ("overflows"), lose digits ("subnormal") or be 0 ("lost");
-        only those that exist.
+        cases that do not occur are omitted.
     """
     with np.errstate(over="ignore", under="ignore"):
         high, low = (np.asarray(one).astype(DTYPES[name]).astype(np.float64) for one in (most, least))

@@ -1,7 +1,7 @@
-"""Common access to files for the readers of other packages.
+"""Reading of files by other packages, with one-line error messages.
 
-The readers of ASE and MDAnalysis raise whatever exception occurs in parsing: any Python exception, with
-messages of many lines, or none. `reading` converts each to one line with the file and the frame.
+The readers of ASE and MDAnalysis can raise any Python exception, with a message of many lines or without a
+message. `reading` converts each exception to one line with the file and the frame.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _PATIENCE = 10_000
 
 
 class FrameError(InputError):
-    """Raised if a frame contains impossible data; `frame` is its number in the file, from 0."""
+    """Raised if a frame contains impossible data; `frame` is the number of the frame in the file, from 0."""
 
     def __init__(self, message: str, *, frame: int, remedy: str | None, where: str | None = None):
         super().__init__(message, remedy=remedy, where=where)
@@ -82,11 +82,11 @@ class FrameError(InputError):
 
 
 class EarlierFramesError(FrameError):
-    """Raised if a frame shows that all earlier frames are wrong, so that nothing can be kept."""
+    """Raised if a frame shows that all earlier frames are wrong, so that no result can be kept."""
 
 
 class UnreadableFrame(FrameError):
-    """Raised if a frame in the middle of a file cannot be read; earlier frames were read."""
+    """Raised if a frame cannot be read after earlier frames of the file were read."""
 
     def __init__(self, message: str, *, frame: int, where: str, remedy: str | None = None):
         before = f"The frames before it were read; to stop there add @:{frame} to the path"
@@ -97,7 +97,7 @@ class UnreadableFrame(FrameError):
 def reading(
     file: str | Path, frame: int | None = None, *, by: str = "MDAnalysis", remedy: str = CHECK
 ) -> Iterator[None]:
-    """Context manager that converts a reader's exceptions to one line, and suppresses its warnings.
+    """Context manager that converts exceptions of a reader to one-line errors, and suppresses warnings.
 
     Args:
         file: the file that is read.
@@ -144,11 +144,12 @@ def reading(
 
 
 def check_claim(path: str | Path, atoms: int | None = None) -> None:
-    """Reject an impossible number of atoms in a file, for which readers would allocate memory or loop.
+    """Raise an error if a file claims an impossible number of atoms, before a reader allocates memory.
 
     Args:
         path: the file.
-        atoms: number of atoms in the file's header; None to search for it in formats whose readers trust it.
+        atoms: number of atoms in the file's header; None to search the header in formats whose readers trust
+            it.
 
     Raises:
         InputError: there would be at least a thousand atoms per byte, which no compression achieves.
@@ -168,7 +169,7 @@ def check_claim(path: str | Path, atoms: int | None = None) -> None:
 
 
 def whole_text(file: str | Path | BinaryIO, where: str | Path) -> str:
-    """Return the text of a UTF-8 file that is read into memory as a whole.
+    """Return the whole text of a UTF-8 file; raise an error if the file is too large for memory.
 
     Raises:
         InputError: the file is too large. OSError, UnicodeDecodeError: as from `open` and `read`.
@@ -206,7 +207,7 @@ def first_line(error: BaseException) -> str:
 
 
 class _Lines(io.TextIOWrapper):
-    """A text file that raises an error if a reader, misled by a count in the header, reads beyond the end."""
+    """A text file that raises an error if a reader repeatedly reads beyond the end of the file."""
 
     _at_end = 0
 
@@ -223,7 +224,7 @@ class _Lines(io.TextIOWrapper):
 def ase_images(
     path: str | Path, index: int | slice | str = slice(None), format: str | None = None
 ) -> Iterator[Atoms]:
-    """Yield structures that ASE reads from a file; to be used inside `reading`.
+    """Yield the structures that ASE reads from a file; for use inside `reading`.
 
     Args:
         path: always the path of a file, even if it contains an @ or begins like the address of a database.
@@ -254,10 +255,10 @@ def ase_images(
 
 
 def with_elements(atoms: Any) -> Atoms:
-    """Return the atoms if each is of a known element or of none (0).
+    """Return the atoms; raise an error if an atom has an invalid atomic number (0 is allowed).
 
     Raises:
-        ValueError: an atom has another atomic number, for which ASE has no symbol or, below 0, a wrong one.
+        ValueError: an atomic number is negative, or too large for ASE's table of elements.
     """
     from ase.data import chemical_symbols
 
@@ -270,9 +271,9 @@ def with_elements(atoms: Any) -> Atoms:
 
 
 def ignored_velocities(arrays: Mapping[str, np.ndarray]) -> list[str]:
-    """Return the names of columns that appear to be velocities or momenta, but that no reader uses as such.
+    """Return the names of columns that look like velocities or momenta, but are not read as such.
 
-    Extended XYZ defines only momenta, in ASE's units; a file does not state the units of other columns.
+    Extended XYZ defines only momenta, in ASE's units; the units of other columns are unknown.
     """
     shapes = {name: array.shape[1:] for name, array in arrays.items() if _VELOCITY.fullmatch(name)}
     return sorted(name for name, shape in shapes.items() if shape in ((3,), ()) and name != "momenta")

@@ -1,12 +1,12 @@
-"""Registries of named objects: cutoffs, choices, methods and checks, of mdnum and of other packages.
+"""Registries of named objects (cutoffs, integrators, methods) from mdnum and from other packages.
 
-A registry maps a name to a *value*: an object that is used as it is, or a class or function that makes one.
-Another package adds a value by an entry point of the registry's group, such as
+A registry maps a name to a *value*: an object, or a class or function that creates an object. Another package
+adds a value by an entry point of the registry's group, such as
 
     [project.entry-points."mdnum.cutoffs"]
     "smooth-cubic" = "my_package.cutoffs:SmoothCubic"
 
-The package is imported only when the name is used or described.
+The other package is imported only when the name is used or described.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _LONGEST_WORD = 100
 
 
 def meant(word: str, known: Iterable[str]) -> str:
-    """Return "Did you mean ...? " with the most similar known word; empty if no word is similar."""
+    """Return "Did you mean ...? " with the most similar known name; empty if no name is similar."""
     folded = {option.lower(): option for option in known if len(word) <= _LONGEST_WORD}
     close = difflib.get_close_matches(word.lower(), folded, n=1)
     return f"Did you mean {folded[close[0]]}? " if close else ""
 
 
 def unknown(noun: str, word: str, known: Iterable[str], *, where: str | None = None) -> InputError:
-    """Return the error for an unknown name, with the most similar name and the list of known names."""
+    """Return the error for an unknown name, with the most similar known name and a list of known names."""
     known = list(known)
     remedy = f"{meant(word, known)}Choose from {', '.join(known)}"
     return InputError(f"unknown {noun} {word!r}", remedy=remedy, where=where)
@@ -46,7 +46,7 @@ def expect_known(noun: str, words: Iterable[str], known: Iterable[str], *, where
     """Raise an error if a name is unknown.
 
     Raises:
-        InputError: see `unknown`, with the first such name.
+        InputError: a name is unknown (see `unknown`); the message refers to the first such name.
     """
     known = list(known)
     for word in words:
@@ -62,7 +62,7 @@ def _plugins(group: str, path: tuple[str, ...]) -> tuple[metadata.EntryPoint, ..
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Values by name, in the order in which they were added, followed by those of other packages."""
+    """Mapping from names to values in the order of registration; values of other packages come last."""
 
     noun: str  # what one of them is called, for messages
     group: str  # entry points by which other packages add theirs
@@ -75,7 +75,7 @@ class Registry(Generic[T]):
     _descriptions: dict[str, str] = field(default_factory=dict, repr=False)
 
     def add(self, name: str, value: Any = None, *, description: str | None = None) -> Any:
-        """Add one of mdnum's own values, or decorate a class or function to add it.
+        """Add a value of mdnum to the registry, or decorate a class or function to add it.
 
         Args:
             name: name that users write.
@@ -93,7 +93,7 @@ class Registry(Generic[T]):
 
     @property
     def shipped(self) -> tuple[str, ...]:
-        """Names of mdnum's own values."""
+        """Names of the values that mdnum itself provides."""
         return tuple(self._own)
 
     def _added(self) -> dict[str, metadata.EntryPoint]:
@@ -134,8 +134,8 @@ class Registry(Generic[T]):
         """Return the value registered under a name.
 
         Raises:
-            InputError: there is no such name, or the package that adds it is broken; the message lists the
-                known names.
+            InputError: the name is unknown, or the package that adds this name is broken; the message lists
+                the known names.
         """
         if name in self._own:
             value = self._own[name]
@@ -167,13 +167,13 @@ class Registry(Generic[T]):
         return loaded
 
     def parse(self, text: str) -> T:
-        """Return the value that `text` refers to: a name, or "name=argument".
+        """Return the value to which a text refers; the text is a name or "name=argument".
 
-        A class or function is called, with the text of the argument if there is one (its `parse` method, if
-        it has one). Any other value is returned as it is, and takes no argument.
+        A class or function is called with the text of the argument, if any (or the `parse` method of the
+        class, if it exists). Any other value is returned unchanged and cannot have an argument.
 
         Raises:
-            InputError: no such name, an unexpected argument, or a missing one.
+            InputError: the name is unknown, or an argument is unexpected or missing.
         """
         name, separator, argument = text.strip().partition(self.separator)
         found = self[name]

@@ -1,8 +1,8 @@
-"""Protection against running Python code from the current folder instead of the environment's packages.
+"""Protection against importing Python code from the current folder in place of installed packages.
 
-For `-m` and `-c`, Python puts the current folder first on its path: a `jax.py` or `numpy.py` in an untrusted
-folder would be run instead of the package. Therefore every process that mdnum starts has the option `-P`,
-which processes of Python's multiprocessing inherit.
+With `-m` and `-c`, Python puts the current folder first on its import path: a file `jax.py` or `numpy.py` in
+an untrusted folder would be imported in place of the package. Therefore mdnum starts every Python process
+with the option `-P`, which processes of Python's multiprocessing inherit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from types import ModuleType
 
 
 def python(*words: str) -> list[str]:
-    """Return the command of a Python process that imports nothing from the current folder.
+    """Return the command of a Python process that does not import modules from the current folder.
 
     Args:
         words: arguments of the interpreter: "-m", a module, and its arguments, or "-c" and a program.
@@ -29,7 +29,7 @@ def python(*words: str) -> list[str]:
 
 
 def environment(**changes: str) -> dict[str, str]:
-    """Return the environment of a child process, in which mdnum is found where this process found it."""
+    """Return environment variables for a child process, so that it imports mdnum from the same location."""
     home = Path(__file__).resolve().parents[1]
     if home.name in ("site-packages", "dist-packages"):
         return {**os.environ, **changes}
@@ -39,13 +39,12 @@ def environment(**changes: str) -> dict[str, str]:
 
 
 def guard(parent: int) -> None:
-    """End this process when its parent ends, for whatever reason, and limit it to half of the memory.
+    """End this process when its parent process ends, and limit this process to half of the memory.
 
-    If a foreign function is in a loop and the system is not Linux, the process ends when that function
-    returns.
+    On systems other than Linux, a process inside a foreign function ends only when this function returns.
 
     Args:
-        parent: process number of the parent.
+        parent: process number of the parent process.
     """
 
     def watch() -> None:
@@ -67,10 +66,10 @@ def guard(parent: int) -> None:
 
 
 def executed(file: Path, name: str) -> ModuleType:
-    """Run a Python file and return it as a module with this name, unless another module has the name.
+    """Run a Python file, and return the resulting module with a given name.
 
     Raises:
-        BaseException: any exception that the file raises.
+        BaseException: the code in the file raises an exception.
     """
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None and spec.loader is not None  # of every file that ends in .py
@@ -86,7 +85,7 @@ def executed(file: Path, name: str) -> ModuleType:
 
 
 def search_last(folder: str | Path, module: str | None = None) -> None:
-    """Append a folder to the import path as the last entry, so that nothing in it can hide a package.
+    """Append a folder to the end of the import path, so that files in the folder cannot hide packages.
 
     Args:
         folder: folder of the Python code that the user asked to run.

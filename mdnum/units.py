@@ -1,4 +1,4 @@
-"""Unit systems: conversion between the units of user input and the ASE-consistent internal units."""
+"""Unit systems: conversion between the units of user input and consistent internal units."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _BOLTZMANN_EV_PER_K = 8.617330337217213e-05
 
 @dataclass(frozen=True)
 class Units:
-    """Labels and factors of a unit system.
+    """Unit labels and conversion factors of a unit system.
 
-    Internally, lengths, energies and masses are in the units of the system file and time is in units of
-    length * sqrt(mass / energy), so that acceleration is force / mass without a factor.
+    Internally, lengths, energies and masses are in the units of the system file, and times are in units of
+    length * sqrt(mass / energy), so that acceleration = force / mass without a conversion factor.
 
     Attributes:
         time_factor: user time * time_factor = internal time.
@@ -57,7 +57,7 @@ FORCE = f"{ENERGY}/{LENGTH}"
 
 
 def named(quantity: str, units: Mapping[str, Any]) -> str:
-    """Replace quantities in a unit by the names of a unit system; empty if one of them is missing.
+    """Replace quantities in a unit by the unit names of a unit system; empty if a name is missing.
 
     An explicit unit ("kcal/mol") is unchanged.
 
@@ -70,7 +70,7 @@ def named(quantity: str, units: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Measured:
-    """A number with its unit, its noise floor and a scale."""
+    """A measured number with unit, noise floor (largest value that noise explains) and reference value."""
 
     value: float
     unit: str = ""  # of names ("eV/Å") or, until it is written, of quantities ("energy/length")
@@ -79,18 +79,18 @@ class Measured:
 
     @property
     def found(self) -> bool:
-        """True if the number is larger than noise or rounding can explain, or is nan."""
+        """True if the magnitude exceeds the noise floor, or if the number is NaN."""
         return self.floor is None or not abs(self.value) <= self.floor
 
     @property
     def digits(self) -> str:
-        """The number as text, with the digits that its floor justifies; all digits if there is no floor."""
+        """The number as text with the digits that the noise floor justifies (all digits without a floor)."""
         if self.floor is None or self.floor < 1e-12:
             return repr(float(self.value))
         return f"{self.value:.{min(max(math.ceil(-math.log10(self.floor)), 1), 15)}f}"
 
     def to(self, prefix: str, units: Mapping[str, Any] = MappingProxyType({})) -> Measured:
-        """Convert to a unit with a prefix ("m": meV), with quantities replaced by names of a unit system."""
+        """Convert the number to a unit with a prefix ("m" for meV), with the unit names of a unit system."""
         unit = named(self.unit, units) or self.unit
         size = {"": 1.0, "m": 1e3}[prefix]
         scaled = {name: size * part for name, part in vars(self).items() if isinstance(part, float)}
@@ -98,7 +98,7 @@ class Measured:
 
 
 def revived(value: Any) -> Any:
-    """Restore a `Measured` that was written as JSON; return any other value unchanged."""
+    """Restore a `Measured` from a dictionary read from JSON; return any other value unchanged."""
     names = {each.name for each in fields(Measured)}
     return Measured(**value) if isinstance(value, dict) and value.keys() == names else value
 
@@ -110,7 +110,7 @@ def get(name: str) -> Units:
     """Return the unit system with this name ("metal", "lj" or "ball").
 
     Raises:
-        InputError: no such unit system.
+        InputError: there is no unit system with this name.
     """
     try:
         return _ALL[name]

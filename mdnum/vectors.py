@@ -1,7 +1,7 @@
-"""LLVM instructions on vectors and on bits of words that numba does not generate itself.
+"""LLVM instructions for vectors and for bits of integers that numba does not generate.
 
-numba caches a compiled function by the file that contains it. After a change here, delete the caches of
-callers (`__pycache__`), which otherwise keep the old instructions.
+numba caches a compiled function by its source file. After a change of this file, delete the caches of callers
+(`__pycache__`), which otherwise contain the old instructions.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ intrinsic: Any = numba.extending.intrinsic
 
 @intrinsic
 def lowest_bit(typingctx: Any, word: Any) -> Any:
-    """Return the position of the lowest set bit of 64, unsigned; at least one bit must be set."""
+    """Return the position of the lowest set bit of a nonzero 64-bit unsigned integer."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -37,12 +37,12 @@ def lowest_bit(typingctx: Any, word: Any) -> Any:
 
 @intrinsic
 def bits_set(typingctx: Any, word: Any) -> Any:
-    """Count the set bits of 64, unsigned."""
+    """Count the set bits of a 64-bit unsigned integer."""
     return types.uint64(types.uint64), lambda context, builder, signature, args: builder.ctpop(args[0])
 
 
 class _Vectors:
-    """Generator of instructions on vectors of fixed width, for one of numba's number types."""
+    """Generator of LLVM instructions for vectors of fixed width, with elements of one number type."""
 
     def __init__(self, context: Any, builder: Any, number: Any, width: int):
         self.context, self.builder, self.width = context, builder, width
@@ -56,12 +56,12 @@ class _Vectors:
         )
 
     def at(self, address: Any, place: int) -> Any:
-        """Return the address of a number at an offset from an address that is an integer."""
+        """Return the address of a number at an offset from an integer address."""
         moved = self.builder.add(address, ir.Constant(self.whole, self.size * place))
         return self.builder.inttoptr(moved, self.number.as_pointer())
 
     def load(self, address: Any) -> Any:
-        """Load the vector that begins at an address."""
+        """Load the vector that starts at an address."""
         return self.builder.load(self.builder.bitcast(address, self.kind.as_pointer()), align=self.size)
 
     def store(self, value: Any, address: Any) -> None:
@@ -79,11 +79,11 @@ class _Vectors:
         return self.spread(self.builder.load(address, align=self.size))
 
     def larger(self, a: Any, b: Any) -> Any:
-        """Return the elementwise maximum; b where either is not a number."""
+        """Return the elementwise maximum of two vectors; if either element is NaN, the element of b."""
         return self.builder.select(self.builder.fcmp_ordered(">", a, b), a, b)
 
     def squares(self, parts: list[Any]) -> Any:
-        """Return the sum of squares."""
+        """Return the elementwise sum of squares of several vectors."""
         name = f"llvm.fmuladd.v{self.width}f32"
         fused = self.builder.module.declare_intrinsic(name, (), ir.FunctionType(self.kind, [self.kind] * 3))
         total = self.builder.fmul(parts[0], parts[0])
@@ -92,7 +92,7 @@ class _Vectors:
         return total
 
     def bits(self, decisions: Any) -> Any:
-        """Pack decisions into the bits of a number."""
+        """Pack a vector of decisions into the bits of an integer."""
         return self.builder.zext(self.builder.bitcast(decisions, ir.IntType(self.width)), self.whole)
 
 
@@ -101,7 +101,7 @@ class _Vectors:
 
 @intrinsic
 def moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any) -> Any:
-    """Copy eight numbers, and add a shift to each."""
+    """Copy eight numbers of an array, and add a shift to each number."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         to = _Vectors(context, builder, source.dtype, EIGHT)
@@ -115,7 +115,7 @@ def moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any
 
 @intrinsic
 def kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: Any, at: Any) -> Any:
-    """Write those of eight labels that a mask selects; return the position after the last one."""
+    """Write the labels that a mask selects from eight labels; return the next free position."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits, to = (_Vectors(context, builder, one.dtype, EIGHT) for one in (mask, labels))
@@ -141,7 +141,7 @@ def kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: An
 
 @intrinsic
 def turned(typingctx: Any, rows: Any, place: Any, apart: Any, out: Any, at: Any, across: Any) -> Any:
-    """Transpose eight rows of eight numbers.
+    """Transpose a matrix of eight rows with eight numbers each.
 
     Args:
         place, apart: position of the first row, and distance between rows. at, across: the same for columns.
@@ -172,9 +172,9 @@ def turned(typingctx: Any, rows: Any, place: Any, apart: Any, out: Any, at: Any,
 
 @intrinsic
 def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: Any) -> Any:
-    """Return bits for the atoms of a shifted cluster whose squared distance to a box is within reach.
+    """Return a bit mask of the atoms in a shifted cluster within a squared distance `reach` of a box.
 
-    The shifted coordinates are stored.
+    The shifted coordinates are written to `out`.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -193,7 +193,7 @@ def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: 
 
 @intrinsic
 def near_atom(typingctx: Any, atom: Any, atoms: Any, low: Any, high: Any) -> Any:
-    """Return bits for the atoms of a cluster within two squared distances of an atom, the second above."""
+    """Return bit masks of the atoms in a cluster within the squared distances `low` and `high` of an atom."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         atom, atoms, low, high = args

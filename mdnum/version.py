@@ -1,3 +1,3 @@
-"""Version of this package, for modules in lower layers that write it to files."""
+"""Version of this package, for modules that write the version to files."""
 
 __version__ = "0.1.0"

@@ -1,7 +1,7 @@
-"""Command line of mdnum: parse arguments, call a verb and print the result, without importing jax.
+"""Command line of mdnum: parsing of arguments, calls of commands, and printing, without import of jax.
 
-Every verb is a function that returns its exit code: 0 without findings, 1 with findings, 2 for invalid input,
-3 if time ran out before a verdict.
+The exit code of a command is 0 without findings, 1 with findings, 2 for invalid input, and 3 if the time
+limit ended the command before a verdict.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _UsageError: Any = typer.BadParameter.__base__
 
 
 def programs_folder() -> str:
-    """Return the folder name for compiled programs that only this kind of processor may run."""
+    """Return the name of the cache folder for functions that were compiled for this kind of processor."""
     features = platform.machine()
     with contextlib.suppress(OSError), open("/proc/cpuinfo") as file:
         features = next((line for line in file if line.startswith(("flags", "Features"))), features)
@@ -37,9 +37,9 @@ def programs_folder() -> str:
 
 
 def _keep_programs() -> None:
-    """Set up jax's compilation cache, so that later commands reuse compiled programs.
+    """Set up jax's compilation cache, so that later commands reuse compiled functions.
 
-    Processors of several kinds may share home folders, and also the folder that the environment names.
+    Machines with different processors may share a home folder or a cache folder.
     """
     if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":  # which jax sets where nobody has
         # XLA takes its own hints (prefer-no-gather) for what the processor lacks and prints pages of it
@@ -63,7 +63,7 @@ def _keep_programs() -> None:
 
 
 def _set_up() -> None:
-    """Change process-wide settings that only the command line may change."""
+    """Change settings of the whole process, such as garbage collection and the compilation cache."""
     # imports and compilers make half a million objects that stay: walking them for garbage takes a sixth of a
     # short command's time, and walking them once more as the process ends half a second
     gc.set_threshold(1_000_000, 20, 20)
@@ -82,7 +82,7 @@ def _set_up() -> None:
 
 
 def _no_device(error: BaseException) -> str | None:
-    """Return a message if jax failed because a device named in JAX_PLATFORMS is missing, else None."""
+    """Return a message if jax failed because JAX_PLATFORMS names a missing device, else None."""
     platforms, trace = os.environ.get("JAX_PLATFORMS"), error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and exit.
 
     Args:
-        arguments: command-line arguments after `mdnum`; None for those of the process.
+        arguments: command-line arguments after `mdnum`; None for the arguments of the process.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     as_json = "--json" in arguments
@@ -143,7 +143,7 @@ _EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number"
 
 
 def _said(error: Any) -> str:
-    """Return the message of a usage error, including the invalid text where a number was expected."""
+    """Return the message of a usage error, with the invalid text if a number was expected."""
     details = getattr(error.__cause__, "errors", None)
     if details is None or details()[0]["type"] not in _EXPECTED:
         return error.format_message()

@@ -1,6 +1,6 @@
-"""Commands of the verbs, created from the verbs' text files (their format: `mdnum/verbs/__init__.toml`).
+"""Command-line commands, created from the text files of the commands (format: `mdnum/verbs/__init__.toml`).
 
-A verb's modules are imported only when its command is called.
+The modules of a command are imported only when this command is called.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = beside(verbs.__file__)["shared"]
 
 
 class _Verbs(TyperGroup):
-    """Command group of all verbs, including those of other packages, and of commands registered directly."""
+    """Group of all commands of mdnum, including commands of other packages."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(dict.fromkeys([*(name.split()[0] for name in VERBS), *self.commands]))
@@ -52,7 +52,7 @@ class _Verbs(TyperGroup):
         )
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the verbs of `--help`, grouped by the question that they answer."""
+        """Write the list of commands of `--help`, grouped by topic."""
         below: dict[str, list[tuple[str, str]]] = {}
         for name in (names := self.list_commands(ctx)):
             made = self.get_command(ctx, name)
@@ -94,7 +94,7 @@ def _top(
 
 
 class _Questions(TyperGroup):
-    """Command group of one verb; a first word that is no subcommand goes to the verb's usual subcommand."""
+    """Group of subcommands; if the first argument is not a subcommand, the usual subcommand is called."""
 
     group: Mapping[str, Any]
 
@@ -123,7 +123,7 @@ class _Questions(TyperGroup):
 
 
 def _of_verb(verb: str) -> Any:
-    """Create the command of a verb, or the group of its commands."""
+    """Create a command-line command, or a group of subcommands."""
     texts = {name: declared(name) for name in verbs.VERBS if name.split()[0] == verb}
     shared = {**_SHARED, **texts[verb].get("shared", {})}
     if "group" not in texts[verb]:
@@ -143,7 +143,7 @@ def _of_verb(verb: str) -> Any:
 
 
 def _command(entry: str, name: str, said: Mapping[str, Any], shared: Mapping[str, Any]) -> Any:
-    """Create a command for the parser, from the text file of an entry of `VERBS`."""
+    """Create a command for the argument parser from the text file of an entry of `VERBS`."""
     parts = [shared[one] for one in said.get("shares", ())]
     # a system comes first among arguments, and a command's own options before those of others
     arguments = {key: one for part in (*parts, said) for key, one in part.get("arguments", {}).items()}
@@ -174,7 +174,7 @@ def _made(name: str, said: Mapping[str, Any], function: Callable[..., Any], **se
 
 
 def _parameter(name: str, said: Mapping[str, Any], make: Callable[..., Any]) -> tuple[Any, Any]:
-    """Return the type and the default of an argument or option in the form that typer reads."""
+    """Return the type and the default of an argument or option in the format of typer."""
     types = [_TYPES[word] for word in said.get("type", "text").split()]
     kind: Any = types[0] if len(types) == 1 else tuple[tuple(types)]
     kind = list[kind] if said.get("repeatable") else kind
@@ -200,7 +200,7 @@ def _flags(name: str, said: Mapping[str, Any]) -> list[str]:
 
 
 def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> int:
-    """Call a command's function with values from the command line, print the answer; return the exit code."""
+    """Call the function of a command with command-line values, print the result, and return the exit code."""
     typed = {**said["arguments"], **said["options"]}
     if given.get("resume") == given.get("out"):
         given.pop("out", None)
@@ -215,7 +215,7 @@ def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> in
     stopped = False
 
     def again() -> str | None:
-        """Return how to continue a stopped command: by --resume if it has that option and a folder."""
+        """Return a sentence that tells the user how to continue, for example by --resume."""
         folder = given.get("resume") or progress.folder or given.get("out")
         with suppress(MdnumError):
             if "resume" in typed and folder is not None:
@@ -249,7 +249,7 @@ def _folder(path: Path) -> Any:
 
 
 def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert options to function arguments; code that is named on the command line is allowed to run."""
+    """Convert options to function arguments; allow the execution of a file given on the command line."""
     options = {}
     for name in given.keys() & said["options"].keys():
         off = said["options"][name].get("type") == "flag" and name.startswith("no_")
@@ -266,7 +266,7 @@ def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any
 
 
 def _refuse_new(said: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-    """Raise an error for values that a resumed folder already contains."""
+    """Raise an error for options that cannot be used with --resume, because the folder has their values."""
     from mdnum.verbs.frame import refuse
 
     labels = {name: one["metavar"].strip("[]") for name, one in said["arguments"].items() if "new" in one}

@@ -1,4 +1,4 @@
-"""Output of the verbs: one-line errors, one JSON document, tables for people, and progress."""
+"""Terminal output of commands: one-line errors, a JSON document, tables, and progress bars."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ class Stopped(MdnumError):
 
 
 def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
-    """Parse the `--set key=value` words into a mapping.
+    """Parse the `--set key=value` options into a mapping from keys to values.
 
     Raises:
-        InputError: a word has no "=", or a key is given twice.
+        InputError: an option has no "=", or a key is given twice.
     """
     overrides: dict[str, str] = {}
     for setting in settings or ():
@@ -64,13 +64,13 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
 
 
 def print_json(document: Mapping[str, Any]) -> int:
-    """Print the JSON document of a verb to stdout; return the exit code for success."""
+    """Print the JSON document of a command to stdout; return the exit code for success."""
     say(printable(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False), json_escape))
     return EXIT_FINE
 
 
 def print_reply(reply: Reply, as_json: bool) -> int:
-    """Print an immediate reply, as JSON or as text for people; return the exit code."""
+    """Print the reply of a command without a run folder, as JSON or as text; return the exit code."""
     if as_json:
         print_json(reply.document)
     for one in () if as_json else reply.shown:
@@ -84,13 +84,13 @@ def print_reply(reply: Reply, as_json: bool) -> int:
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Print a line for people, with control characters from files escaped."""
+    """Print a line of text, with control characters escaped."""
     # typer's own echo writes UTF-8 to a stream that is ascii
     print(printable(text), file=sys.stderr if err else sys.stdout, flush=True)
 
 
 def print_error(error: MdnumError, *, as_json: bool) -> None:
-    """Print an error as one line on stderr, and as a JSON document if requested."""
+    """Print an error as one line on stderr, and also as a JSON document if requested."""
     say("mdnum: " + " ".join(str(error).split()), err=True)
     if as_json:
         told = {name: getattr(error, name) for name in ("message", "where", "remedy", "exit_code")}
@@ -98,13 +98,13 @@ def print_error(error: MdnumError, *, as_json: bool) -> None:
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Print lines on stderr, each with the prefix "mdnum:"."""
+    """Print lines on stderr, each line with the prefix "mdnum:"."""
     for line in lines:
         say("mdnum: " + " ".join(line.split()), err=True)
 
 
 def console(width: int = _PIPE_WIDTH) -> Console:
-    """Return rich's console for stdout, with raw characters escaped; rich is imported on first use."""
+    """Return rich's console for stdout, which escapes control characters; rich is imported on first use."""
     from rich.console import Console
     from rich.segment import Segment
 
@@ -119,7 +119,7 @@ def console(width: int = _PIPE_WIDTH) -> Console:
 
 
 def print_prose(text: str, indent: int = 2, style: str = "") -> None:
-    """Print a paragraph wrapped to a readable width; a word longer than a line is not broken."""
+    """Print a paragraph that is wrapped to a readable width; long words are not broken."""
     from textwrap import fill
 
     from rich.text import Text
@@ -133,7 +133,7 @@ def print_prose(text: str, indent: int = 2, style: str = "") -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print a table for people; severities are colored, and the header is omitted if no column has a name."""
+    """Print a table; severities are colored, and the header is omitted if no column has a name."""
     from rich.table import Table
     from rich.text import Text
 
@@ -161,7 +161,7 @@ def print_records(title: str, records: Sequence[Mapping[str, Any]]) -> None:
 
 
 def show(cell: Any) -> str:
-    """Format a table cell: floats in short form, None as a dash, booleans as yes or no."""
+    """Format a value for a table cell: floats in short form, None as a dash, booleans as yes or no."""
     if cell is None:
         return "-"
     if isinstance(cell, bool):
@@ -186,10 +186,10 @@ def print_findings(findings: Iterable[Finding]) -> None:
 
 
 def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
-    """Return the exit code of a verb: 1 if a finding is a warning or an error, for any status.
+    """Return the exit code of a command, which is 1 if a finding is a warning or an error.
 
     Args:
-        findings: findings of the verb; those that are only informative do not count.
+        findings: findings of the command; findings of severity "info" do not count.
         status: status in summary.json; see `frame.UNDECIDED`.
     """
     if any(finding.severity in ("warning", "error") for finding in findings):
@@ -199,7 +199,7 @@ def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
 
 
 def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
-    """Print a command's result as JSON, or as a short form of its report page; return the exit code."""
+    """Print the result of a command, as JSON or as a summary of its report page; return the exit code."""
     code = exit_code(outcome.verdict.findings, outcome.summary.get("status", "complete"))
     if as_json:
         print_json({**outcome.summary, "folder": outcome.folder})
@@ -244,10 +244,10 @@ def _print_part(table: Table) -> None:
 
 
 class CommandBar(ProgressBar):
-    """Progress bar that lets control-C raise KeyboardInterrupt after the first report."""
+    """Progress bar that makes control-C raise KeyboardInterrupt after the first progress report."""
 
     def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
-        """Show the progress that a rollout reports."""
+        """Show the progress that a run reports."""
         if signal.getsignal(signal.SIGINT) == signal.SIG_DFL and threading.current_thread() is _MAIN:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         super().__call__(step, steps, info)
@@ -255,7 +255,7 @@ class CommandBar(ProgressBar):
 
 @contextmanager
 def watched(remedy: Callable[[], str | None]) -> Iterator[ProgressBar]:
-    """Show a progress bar during a run, and convert control-C into the error that ends the command line.
+    """Show a progress bar during a command, and convert control-C into the error `Stopped`.
 
     Args:
         remedy: called after control-C to get the remedy for the error message.
@@ -273,7 +273,7 @@ def watched(remedy: Callable[[], str | None]) -> Iterator[ProgressBar]:
 
 
 def is_interrupt(error: BaseException | None) -> bool:
-    """Return True if an error was caused by control-C, also inside an import or compiled code."""
+    """Return True if control-C caused an error, even inside an import or compiled code."""
     while error is not None and not isinstance(error, KeyboardInterrupt | MdnumError):
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     return isinstance(error, KeyboardInterrupt)

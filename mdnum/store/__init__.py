@@ -1,4 +1,4 @@
-"""Storage of a run in one folder: tables that survive a kill, exact frames, JSON and text, all atomic."""
+"""Storage of a run in a folder: tables, frames, JSON and text files, which remain valid after a kill."""
 
 from __future__ import annotations
 

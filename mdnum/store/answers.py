@@ -1,9 +1,9 @@
-"""answers.json: the answers that a verb has found so far, so that a killed verb continues with the rest.
+"""The file answers.json, which stores intermediate results so that a killed command can be resumed.
 
-A verb with many questions (`audit`, `conform`) keeps its options and its answers as one dataclass of plain
-values. The file is written at once if an answer should not be lost, and otherwise within a second. A resumed
-verb restores all values with their types, and processes the questions without an answer. Tables are made from
-the answers.
+A command with many tests (`audit`, `conform`) keeps its options and results in one dataclass of plain values.
+The file is written at once if a result should not be lost, and otherwise about once per second. A resumed
+command restores all values with their types, and runs the tests that have no result. Tables are created from
+the results.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NAME = "answers.json"
 
 
 class Timed(Protocol):
-    """Dataclass of numbers, text, lists, tuples, dictionaries and further dataclasses."""
+    """Protocol of a state that can be stored: a dataclass of plain values with the elapsed time (s)."""
 
     seconds: float
 
@@ -34,12 +34,11 @@ T = TypeVar("T", bound=Timed)
 
 
 class Answers(Generic[T]):
-    """Writer of a verb's state into its folder.
+    """Writer of the state of a command into its folder.
 
     Args:
         folder: folder open for writing.
-        state: state that is changed in place as answers arrive; its `seconds`, the time spent before, are
-            updated.
+        state: state that is changed in place as results arrive; its `seconds` (total time) are updated.
     """
 
     def __init__(self, folder: RunFolder, state: T):
@@ -47,7 +46,7 @@ class Answers(Generic[T]):
         self._before, self._began, self._due = state.seconds, monotonic(), 0.0
 
     def save(self, urgent: bool = True) -> None:
-        """Save the state from which a killed verb resumes; a save that is not urgent may be skipped."""
+        """Save the state of a command for resuming; if not urgent, the save is skipped after a recent one."""
         now = monotonic()
         self.state.seconds = self._before + now - self._began
         if urgent or now >= self._due:
@@ -58,11 +57,10 @@ class Answers(Generic[T]):
 
 
 def take(path: str | Path, layout: Layout) -> RunFolder:
-    """Open the folder of a verb to be resumed; from here on, only this process writes the folder.
+    """Open the folder of a command that is resumed, and make this process the only writer of the folder.
 
     Raises:
-        FolderError: the folder has nothing of that verb to resume, another process writes it, or it was
-            changed.
+        FolderError: the folder has no state of this command, another process writes it, or it was changed.
     """
     folder = RunFolder.open(path)
     if folder.kind != layout.kind or not (folder.path / NAME).is_file():
@@ -74,10 +72,10 @@ def take(path: str | Path, layout: Layout) -> RunFolder:
 
 
 def restored(folder: RunFolder, kind: type[T]) -> T:
-    """Return the state that is stored in a folder.
+    """Return the state of a command that is stored in a folder.
 
     Raises:
-        FolderError: the file is not readable, or holds another kind of state.
+        FolderError: the file cannot be read, or contains another kind of state.
     """
     path = folder.path / NAME
     text = read_text(path)

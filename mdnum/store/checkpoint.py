@@ -1,4 +1,4 @@
-"""Checkpoint from which a killed run resumes: arrays and plain values in one npz file, bit for bit."""
+"""Checkpoint file from which a killed run is resumed: exact arrays and plain values in an npz file."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _META, _STORE = "mdnum meta", "mdnum store"
 def write(
     path: Path, state: Mapping[str, Any], store: Mapping[str, Any], beside: Mapping[str, list[str]]
 ) -> None:
-    """Replace the checkpoint at path, and list it in the manifest together with the files that it counts.
+    """Write the checkpoint file, and list this file and the files written since then in the manifest.
 
     Args:
-        state: state of the rollout; arrays, and any values that JSON can hold.
+        state: state of the run: arrays, and values that JSON can represent.
         store: lengths of the tables, frames and log.
         beside: digests of the files written since the last checkpoint.
     """
@@ -45,11 +45,10 @@ def write(
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return (state, store) as given to `write`.
+    """Return the state and the file lengths that were given to `write`.
 
     Raises:
-        FolderError: the checkpoint is damaged, or would unpack to more than its own size (mdnum does not
-            compress checkpoints).
+        FolderError: the checkpoint is damaged, or it is compressed (mdnum does not compress checkpoints).
     """
     try:
         with opened(path) as file:
@@ -120,7 +119,7 @@ _HEADER = struct.Struct("<qq")
 
 
 class FrameFile:
-    """Writer of `trajectory.traj`; the file is opened at the first frame."""
+    """Writer of the trajectory file `trajectory.traj`, which is opened when the first frame is written."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -130,7 +129,7 @@ class FrameFile:
         """Append one frame (positions, momenta, cell and results of a single-point calculator).
 
         Raises:
-            FolderError: the disk is full; the file is left with the frames before this one.
+            FolderError: the disk is full; the file still contains all frames before this one.
         """
         from ase.io.trajectory import TrajectoryWriter
 
@@ -147,7 +146,7 @@ class FrameFile:
                 raise
 
     def mark(self) -> tuple[int, int, int]:
-        """Return (frames, position of the offset table, bytes) of the file; zeros before the first frame."""
+        """Return number of frames, position of the offset table, and file size; 0 before the first frame."""
         if not self.path.exists() or self.path.stat().st_size < _FRAMES_AT + _HEADER.size:
             return (0, 0, 0)
         with opened(self.path) as file:
@@ -156,9 +155,9 @@ class FrameFile:
         return (frames, table, self.path.stat().st_size)
 
     def truncate(self, mark: tuple[int, int, int]) -> None:
-        """Restore the file to its state at a mark, removing later frames even if half-written.
+        """Restore the file to an earlier state given by `mark`, and remove later frames, even partial ones.
 
-        ASE moves its offset table as the file grows, so the mark includes the position of the table.
+        ASE moves its offset table as the file grows, so `mark` includes the position of this table.
         """
         self.close()
         frames, table, size = mark
@@ -178,7 +177,7 @@ class FrameFile:
             os.ftruncate(file.fileno(), size)
 
     def close(self) -> None:
-        """Close the file; the next frame opens it again."""
+        """Close the trajectory file; the next frame opens the file again."""
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.close()

@@ -1,4 +1,4 @@
-"""Metadata of parquet files: unit and description of every column, and the folder of its run."""
+"""Metadata of parquet files: the unit and description of every column, and the run that wrote the file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DECLARED: Mapping[str, Mapping[str, Sequence[str]]] = beside(__file__)
 
 
 def meaning(table: str, column: str, own: Mapping[str, Mapping[str, Any]] | None = None) -> Sequence[str]:
-    """Return (unit as quantities, description) of a column, by `Layout.described`; empty if undeclared."""
+    """Return the unit (in terms of quantities) and the description of a column; empty if undeclared."""
     if own is not None:
         said = _found(own.get(table, {}), column)
         return (_found(_DECLARED["columns"], said) if isinstance(said, str) else said) or ("", "")
@@ -33,12 +33,12 @@ def _json(value: Any) -> str:
 
 
 def described(schema: pa.Schema, table: str, about: Mapping[str, Any], own: Any = None) -> pa.Schema:
-    """Return a schema with metadata: keys `mdnum.*` for the folder, `unit` and `description` for columns.
+    """Return a parquet schema with metadata of the run (keys `mdnum.*`) and of columns (unit, description).
 
-    `mdnum.columns` repeats the metadata of columns as JSON, for programs that read no metadata of columns.
+    `mdnum.columns` repeats the metadata of columns as JSON, for programs that cannot read column metadata.
 
     Args:
-        about: version, kind, system, run and units of the folder; empty values are left out.
+        about: version, kind, system, run and units of the folder; empty values are omitted.
         own: as in `meaning`.
     """
     fields, known = [], {}

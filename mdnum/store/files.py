@@ -1,4 +1,4 @@
-"""Access to the files of a folder: atomic replacement, no links, and a one-line error for a full disk."""
+"""Access to files in a run folder: atomic replacement, rejection of links, and one-line error messages."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Convert errors of the operating system for a path into a FolderError with a remedy."""
+    """Convert operating-system errors for a path into a FolderError with a remedy."""
     try:
         yield
     except OSError as error:
@@ -56,13 +56,13 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def opened(path: Path, mode: Literal["rb", "r+b", "ab"] = "rb") -> BinaryIO:
-    """Open a file of a folder; reject links and anything but a regular file.
+    """Open a file in a run folder; raise an error for links and for anything that is not a regular file.
 
     Args:
-        mode: "r+b" and "ab" write in place, so a file with a second name (a hard link) is rejected too.
+        mode: "r+b" and "ab" write in place, so a file with a second name (a hard link) is also rejected.
 
     Raises:
-        FolderError: the path is a link, or not a regular file. OSError: as `open`.
+        FolderError: the path is a link, or not a regular file. OSError: the file cannot be opened.
     """
     refuse_link(path, in_place=mode != "rb")
     try:
@@ -81,10 +81,10 @@ def opened(path: Path, mode: Literal["rb", "r+b", "ab"] = "rb") -> BinaryIO:
 
 
 def refuse_link(path: Path, in_place: bool = False) -> None:
-    """Reject a file of a folder that leads out of the folder; accept a file that does not exist.
+    """Raise an error if a file in a run folder is a link or not a regular file; a missing file is allowed.
 
     Args:
-        in_place: True if the file is to be written in place.
+        in_place: True if the file will be written in place.
 
     Raises:
         FolderError: the file or its subfolder is a link, or the file is not a regular file.
@@ -96,7 +96,7 @@ def refuse_link(path: Path, in_place: bool = False) -> None:
 
 
 def subfolder(root: Path, name: str) -> Path:
-    """Return a folder inside a folder, and create it if it is missing.
+    """Return a subfolder of a run folder; create the subfolder if it does not exist.
 
     Raises:
         FolderError: the subfolder is a link, or cannot be created.
@@ -111,9 +111,9 @@ def subfolder(root: Path, name: str) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a temporary file that is moved to path at the end, so that a kill leaves the old or new file.
+    """Open a temporary file that replaces the file at path when closed; a kill leaves the old or new file.
 
-    A link at path is replaced; the file to which the link led is unchanged.
+    If path is a symbolic link, the link is replaced, and the file to which the link refers is unchanged.
     """
     if path.parent.name in SUBFOLDERS and path.parent.is_symlink():
         raise _linked(path.parent)
@@ -134,7 +134,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
-    """Replace the contents of a file, and update the folder's manifest if it lists the file.
+    """Replace the contents of a file; update the folder's manifest if the manifest lists the file.
 
     Raises:
         FolderError: the disk is full, or the folder cannot be written; no partial file remains.
@@ -146,15 +146,15 @@ def write_bytes(path: Path, data: bytes | memoryview) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace the contents of a file by text in UTF-8, as `write_bytes` does."""
+    """Replace the contents of a file by text in UTF-8; for errors see `write_bytes`."""
     write_bytes(path, text.encode())
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file of a folder; empty if the file does not exist.
+    """Return the text of a file in a run folder; empty if the file does not exist.
 
     Raises:
-        InputError: the file is a link, not UTF-8, or larger than any text of a folder.
+        InputError: the file is a link, is not UTF-8, or is too large.
     """
     try:
         with opened(path) as file:
@@ -197,7 +197,7 @@ _INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
 
 @dataclass
 class Manifest:
-    """Manifest of a folder: its layout, its state, and the digests of its files."""
+    """Manifest of a run folder: its layout, its state, and digests of its files."""
 
     layout: Layout | None  # what the folder holds; None where an earlier mdnum wrote it, which did not say
     finished: bool = False  # whether its writing came to an end
@@ -207,12 +207,12 @@ class Manifest:
 
 
 def digest_of(data: bytes | memoryview) -> str:
-    """Return the digest of the bytes of a file."""
+    """Return the hash digest of bytes."""
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
 def digest(path: Path) -> str:
-    """Return the digest of a file as it is; ABSENT if the file does not exist."""
+    """Return the current digest of a file; ABSENT if the file does not exist."""
     try:
         with opened(path) as file:
             return digest_of_file(file)
@@ -230,7 +230,7 @@ def digest_of_file(file: BinaryIO) -> str:
 
 
 def load(root: Path) -> Manifest | None:
-    """Return the manifest of a folder; None without one (an older mdnum wrote none).
+    """Return the manifest of a run folder; None if there is no manifest (older versions wrote none).
 
     Raises:
         FolderError: the manifest is damaged.
@@ -262,7 +262,7 @@ def load(root: Path) -> Manifest | None:
 
 
 def save(root: Path, made: Manifest) -> None:
-    """Replace the manifest of a folder."""
+    """Write the manifest of a run folder, and replace the old manifest."""
     held = {**asdict(made), "files": dict(sorted(made.files.items()))}
     if made.layout is not None:
         held = {**held.pop("layout"), "tables": made.layout.spelled, **held}
@@ -278,7 +278,7 @@ def update(
     finished: bool | None = None,
     layout: Layout | None = None,
 ) -> None:
-    """Add files to a manifest, drop others, and change its state; do nothing without a manifest."""
+    """Add files to a manifest, remove others, and change the state; do nothing without a manifest."""
     made = load(root)
     if made is None:
         return
@@ -293,14 +293,14 @@ def update(
 
 
 def place(path: Path) -> tuple[Path, str]:
-    """Return (folder, name in the folder) of a file."""
+    """Return the run folder of a file, and the name of the file in this folder."""
     if path.parent.name in SUBFOLDERS and not (path.parent / NAME).exists():
         return path.parent.parent, f"{path.parent.name}/{path.name}"
     return path.parent, path.name
 
 
 def foretell(path: Path, new: str) -> None:
-    """Permit a new digest, in addition to the present digest, for a file that the manifest lists."""
+    """Add a digest to the manifest for a file that will be replaced; the present digest remains valid."""
     root, name = place(path)
     if name == NAME or not (root / NAME).exists():
         return
@@ -324,7 +324,7 @@ def remove(path: Path) -> None:
 
 
 def resumable(root: Path) -> bool:
-    """Return True if a folder holds a state from which its verb can resume."""
+    """Return True if a run folder contains a state from which its command can be resumed."""
     with suppress(FolderError, OSError):
         made = load(root)
         state = "" if made is None or made.layout is None else made.layout.resumes_from
@@ -333,7 +333,7 @@ def resumable(root: Path) -> bool:
 
 
 def listed_files(root: Path, names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the digests of files as they are now, leaving out missing files."""
+    """Return the current digests of files, without missing files."""
     return {name: [digest(root / name)] for name in names if os.path.lexists(root / name)}
 
 
@@ -347,13 +347,13 @@ _RUNS = Path("runs")
 
 
 def default_folder(system: str, runs: Path = _RUNS) -> Path:
-    """Create a new folder runs/NAME-N: NAME is the system's name with dashes, N the first unused number.
+    """Create a new folder runs/NAME-N, with the system's name (with dashes) and the first unused number N.
 
-    Creating the folder claims its name: processes that search at the same time get different folders.
+    The folder is created at once, so that simultaneous processes get different folders.
 
     Args:
         system: name of a system, or the path of its file.
-        runs: the folder of run folders.
+        runs: folder that contains all run folders.
 
     Raises:
         FolderError: the folder cannot be created.

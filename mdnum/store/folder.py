@@ -1,4 +1,4 @@
-"""Run folder: files that a rollout writes, that reports read, and from which a killed run resumes."""
+"""Run folder: the files that a run writes, that reports read, and from which a killed run is resumed."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _EDITED = (SYSTEM_FILE, "log.txt")
 
 
 def system_tables(file: Path) -> dict[str, Any]:
-    """Return the tables of a system file in a run folder, or of the description of a simulation of objects.
+    """Return the tables of system.toml (or of the description of a simulation) in a run folder.
 
     Raises:
         FolderError: the file is not valid TOML or JSON.
@@ -80,12 +80,12 @@ def _parsed(file: Path, text: str) -> Any:
 
 
 class RunFolder:
-    """Folder of one run on disk.
+    """The folder of a run on disk.
 
-    Rows, frames and log lines may be appended at any time; they count once a checkpoint has been written
-    after them. A killed run resumes from its last checkpoint: `resume()` drops later data and returns the
-    state, so that the run continues as if it had never stopped. Use `create` for a new run, and `open` for an
-    existing one (to read it, or to resume it).
+    Rows, frames and log lines can be appended at any time, and become permanent with the next checkpoint. A
+    killed run is resumed from its last checkpoint: `resume()` removes later data and returns the state, so
+    that the result is the same as without the kill. Use `create` for a new run, and `open` to read or resume
+    an existing run.
     """
 
     def __init__(self, path: Path, layout: Layout | None = None):
@@ -127,7 +127,7 @@ class RunFolder:
             layout: kind of the folder, with its tables.
 
         Raises:
-            FolderError: the folder holds a run or other files, is a file, or cannot be written.
+            FolderError: the folder contains a run or other files, is a file, or cannot be written.
         """
         folder = cls(Path(path), layout)
         if folder.path.exists() and not folder.path.is_dir():
@@ -159,10 +159,10 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> RunFolder:
-        """Open an existing run folder, finished or not, for reading (or `resume`).
+        """Open an existing run folder, finished or unfinished, for reading or for `resume`.
 
         Raises:
-            FolderError: the folder does not exist, or holds no run.
+            FolderError: the folder does not exist, or does not contain a run.
         """
         expect_path(path, "Give the folder of a run")
         folder = cls(Path(path))
@@ -177,10 +177,10 @@ class RunFolder:
 
     @property
     def layout(self) -> Layout:
-        """Kind of the folder, with its tables.
+        """Layout of the run folder: its kind and its tables.
 
         Raises:
-            FolderError: the folder has no manifest, or its manifest is from a version that stored no layout.
+            FolderError: the folder has no manifest, or a manifest of a version that did not store the layout.
         """
         if self._layout is None:
             seen = "is missing, although it must list the tables of the folder"
@@ -191,33 +191,33 @@ class RunFolder:
         return self._layout
 
     def read_as(self, layout: Layout) -> None:
-        """Read a folder of an earlier version with the layout that the folder's verb declares today."""
+        """Use the current layout of a command to read a folder that an earlier version wrote."""
         self._layout = layout
 
     @property
     def kind(self) -> str:
-        """Kind of the folder, as declared by the verb that made it."""
+        """Kind of the run folder, as declared by the command that created it."""
         return self.layout.kind
 
     # -- writing ---------------------------------------------------------------------------------
 
     def append(self, table: str, columns: Mapping[str, Any]) -> None:
-        """Append rows to a table of the layout; rows stay in memory until a checkpoint.
+        """Append rows to a table of the run folder; rows stay in memory until the next checkpoint.
 
         Args:
             columns: equally long arrays by column name, at least the declared ones.
 
         Raises:
-            ValueError: the table is not declared, or a column is missing, not expected or of another length.
+            ValueError: the table is not declared, or a column is missing, undeclared or of another length.
         """
         self._stream(table).append(columns)
 
     def look_up(self, table: str, of: str, columns: Mapping[str, Any]) -> None:
-        """Add columns that follow from a column of indices (see `TableStream.look_up`)."""
+        """Add columns with values that are looked up by a column of indices (see `TableStream.look_up`)."""
         self._stream(table).look_up(of, columns)
 
     def append_frame(self, atoms: Atoms) -> None:
-        """Append a frame to trajectory.traj; its float64 values are exact to the last bit."""
+        """Append a frame to trajectory.traj, with float64 values that are stored exactly."""
         self._frames.append(atoms)
 
     def log(self, line: str) -> None:
@@ -231,11 +231,11 @@ class RunFolder:
         _LOGGER.debug("%s: %s", self.path.name, printable(line))
 
     def checkpoint_due(self) -> bool:
-        """Return True if `checkpoint` would write now.
+        """Return True if the last checkpoint is so old that a new one is due.
 
-        The interval is 2 s at first, and later 1 % of the time that the run has taken: a kill costs at most
-        that much, and a run of days has a thousand part files, not a hundred thousand. The interval is never
-        less than fifty times the duration of the last checkpoint.
+        The interval between checkpoints is at least 2 s, 1 % of the run's duration, and fifty times the
+        duration of the last checkpoint. A kill therefore loses about 1 % of a run, and a run of days has a
+        thousand part files, not a hundred thousand.
         """
         now = time.monotonic()
         due = now - self._written >= max(2.0, 0.01 * (now - self._began), 50 * self._cost)
@@ -243,7 +243,7 @@ class RunFolder:
         return due
 
     def checkpoint(self, state: Mapping[str, Any], force: bool = False) -> bool:
-        """Save the state and all data appended so far, as the point from which a killed run resumes.
+        """Save the state and all appended data as a checkpoint from which a killed run can be resumed.
 
         Args:
             state: arrays (numpy, jax) and plain values (numbers, text, lists, dicts), which `load_checkpoint`
@@ -264,9 +264,9 @@ class RunFolder:
         return True
 
     def checkpoint_beside(self, state: Callable[[], Mapping[str, Any]]) -> None:
-        """Write a forced `checkpoint` in a background thread; the thread also makes the state.
+        """Write a checkpoint in a background thread, which also calls the function that returns the state.
 
-        An error in the thread is raised by the next checkpoint, or by `finalize`.
+        An error in the thread is raised at the next checkpoint or in `finalize`.
         """
         self._settle()
         began = time.monotonic() if self._asked is None else self._asked
@@ -294,7 +294,7 @@ class RunFolder:
         self._writing = self._beside.submit(write)
 
     def finalize(self) -> None:
-        """Finish writing: one parquet file per table, no part files; the folder can still be resumed."""
+        """Finish the folder: merge part files into one parquet file per table; resuming remains possible."""
         if self._pending is not None and self._pending[1] == self._rows():
             self.checkpoint(self._pending[0], force=True)
         for name in self.layout.always:
@@ -308,18 +308,18 @@ class RunFolder:
         self.close()
 
     def flush(self, *last: str) -> None:
-        """Write all appended rows, tables in `last` after the others: a kill leaves no excess rows there."""
+        """Write all appended rows; tables in `last` are written last, so that a kill leaves no extra rows."""
         for name in sorted(self._streams, key=last.count):
             self._streams[name].flush()
 
     def merge(self) -> None:
-        """Merge each table that has rows into one file, which can be read before the folder is finished."""
+        """Merge each table into one file, which can be read before the run folder is finished."""
         self._settle()
         for stream in self._streams.values():
             stream.merge()
 
     def close(self) -> None:
-        """Close all files and release the lock; rows after the last checkpoint are dropped."""
+        """Close all files and release the lock; rows after the last checkpoint are lost."""
         # also for one that began as the run was interrupted
         self._beside.shutdown()
         self._frames.close()
@@ -331,7 +331,7 @@ class RunFolder:
         self._log = self._lock = None
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Write summary.json (NaN and infinity, which JSON does not have, become null)."""
+        """Write summary.json; NaN and infinity are written as null, because JSON cannot represent these."""
         self._write_json("summary.json", summary)
         made = manifest.load(self.path) if self._owner else None
         if made is not None and made.finished:
@@ -339,7 +339,7 @@ class RunFolder:
             self._list_files()
 
     def write_provenance(self, provenance: Mapping[str, Any]) -> None:
-        """Write provenance.json, once all files from which a run starts are in the folder."""
+        """Write provenance.json; called when the folder contains all input files of the run."""
         self._write_json("provenance.json", provenance)
         if self._owner:
             names = {entry.name for entry in self.path.iterdir() if not entry.name.startswith(".")}
@@ -349,22 +349,22 @@ class RunFolder:
     # -- resuming --------------------------------------------------------------------------------
 
     def has_checkpoint(self) -> bool:
-        """Return True if the folder has a checkpoint from which to resume."""
+        """Return True if the folder has a checkpoint from which the run can be resumed."""
         return (self.path / "checkpoint.npz").exists()
 
     def load_checkpoint(self) -> dict[str, Any]:
-        """Return the state given to the last `checkpoint` that was written.
+        """Return the state that was saved by the last checkpoint.
 
         Raises:
-            FolderError: there is no checkpoint, or it cannot be read.
+            FolderError: there is no checkpoint, or the checkpoint cannot be read.
         """
         return self._read_checkpoint()[0]
 
     def resume(self, layout: Layout | None = None) -> dict[str, Any]:
-        """Drop all rows, frames and log lines after the last checkpoint, and return its state.
+        """Remove rows, frames and log lines after the last checkpoint; return the state of the checkpoint.
 
         Args:
-            layout: the layout from now on, if the verb has added columns since the run began.
+            layout: new layout of the folder, if the command has added columns since the run began.
 
         Raises:
             FolderError: there is no checkpoint, another process writes the folder, or files are missing.
@@ -393,10 +393,11 @@ class RunFolder:
         return state
 
     def take(self, layout: Layout) -> None:
-        """Make this process the only writer of a folder that is resumed from answers.json.
+        """Make this process the only writer of a run folder that is resumed from answers.json.
 
         Raises:
-            FolderError: another process writes the folder, or the files from which it resumes have changed.
+            FolderError: another process writes the folder, or the files that are needed to resume have
+                changed.
         """
         self._layout = layout
         self._take_lock()
@@ -405,9 +406,9 @@ class RunFolder:
             self.check(name)
 
     def restart(self) -> None:
-        """Mark a taken folder as unfinished, and remove its tables, which are written at its end.
+        """Mark a resumed folder as unfinished, and remove its tables, which are written again at the end.
 
-        Part files, which a kill during `finalize` leaves behind, are removed too.
+        Part files that remain after a kill during `finalize` are also removed.
         """
         with disk_errors(self.path):
             refuse_link(self.path / "log.txt", in_place=True)
@@ -423,7 +424,7 @@ class RunFolder:
     # -- reading ---------------------------------------------------------------------------------
 
     def table(self, name: str, columns: Sequence[str] | None = None, rows: int | None = None) -> pa.Table:
-        """Return a table as it is on disk; for a killed run, the rows that its checkpoint counts.
+        """Return a table from disk; for a killed run, only the rows before the last checkpoint.
 
         Args:
             columns: names of the columns to read; None for all.
@@ -432,7 +433,7 @@ class RunFolder:
         return self._reader(name).read(columns, min(self.rows(name), rows or sys.maxsize))
 
     def batches(self, name: str, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Yield the rows of `table` in batches, for a table that is larger than memory."""
+        """Yield the rows of a table in batches, for tables that are larger than memory."""
         left = self.rows(name)
         for batch in self._reader(name).batches(columns):
             if left <= 0:
@@ -443,7 +444,7 @@ class RunFolder:
     def read(
         self, name: str, columns: Sequence[str] | None = None, rows: int | None = None
     ) -> dict[str, np.ndarray]:
-        """Return a table as numpy arrays by column name, without columns unknown to this folder."""
+        """Return a table as numpy arrays by column name, without columns that this folder does not have."""
         table = self.table(name, columns, rows)
         declared = {} if self._layout is None else self._layout.columns(name)
         gaps = {key: table[key].null_count for key in table.column_names if table[key].null_count}
@@ -454,7 +455,7 @@ class RunFolder:
         return {key: as_numpy(table[key]) for key in table.column_names if key not in unknown}
 
     def rows(self, name: str) -> int:
-        """Return the number of rows of a table, as returned by `table`."""
+        """Return the number of rows that `table` returns for a table."""
         stream = self._reader(name)
         if stream.parts() and self.has_checkpoint():
             # series and flips of an unfinished run agree with one another only at a checkpoint
@@ -463,12 +464,12 @@ class RunFolder:
 
     @property
     def system_file(self) -> Path | None:
-        """File that describes what was run: a system file, or a description of objects; None if missing."""
+        """File that describes the simulation: a system file, or a description of objects; None if missing."""
         return next((self.path / name for name in _SYSTEM if (self.path / name).exists()), None)
 
     @property
     def system(self) -> dict[str, Any]:
-        """Tables of the system that was run; empty if there is none.
+        """Tables of the system file of the run; empty if there is no system file.
 
         Raises:
             FolderError: the system file is not valid TOML or JSON.
@@ -478,10 +479,10 @@ class RunFolder:
 
     @cached_property
     def about(self) -> dict[str, Any]:
-        """Metadata of the tables: version, kind, system, run (a digest) and units by quantity.
+        """Metadata of the tables: version, kind, system, digest of the run, and units by quantity.
 
-        The metadata do not depend on the time of writing, so a run has the same bytes however it was
-        interrupted.
+        The metadata do not depend on the time of writing, so that a resumed run has the same bytes as an
+        uninterrupted run.
         """
         made, system = self._read_json("provenance.json"), self.system
         named = system.get("units") or system.get("world")
@@ -503,21 +504,21 @@ class RunFolder:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Contents of summary.json; empty if the run has not yet written it."""
+        """Contents of summary.json; empty if this file was not written yet."""
         return self._read_json("summary.json")
 
     @property
     def again(self) -> str:
-        """Remedy for an unfinished folder, as an imperative sentence."""
+        """Imperative sentence that tells the user how to continue an unfinished folder."""
         return _again(self.path)
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """Contents of provenance.json; empty if it was not written."""
+        """Contents of provenance.json; empty if this file was not written."""
         return self._read_json("provenance.json")
 
     def damaged(self) -> dict[str, str]:
-        """Return the files that differ from what was written, with the problem of each, by name.
+        """Return the names of files that changed or are missing, with a description of each problem.
 
         Raises:
             FolderError: the manifest itself is damaged.
@@ -525,10 +526,10 @@ class RunFolder:
         return {name: wrong for name in self._listed() if (wrong := self._wrong(name))}
 
     def check(self, name: str) -> None:
-        """Compare a file with the manifest; a file that the manifest does not list is not compared.
+        """Raise an error if the digest of a file differs from the manifest; unlisted files are not checked.
 
         Raises:
-            FolderError: the file changed since it was written, or is missing.
+            FolderError: the file is missing, or has changed since it was written.
         """
         if wrong := self._wrong(name):
             others = self.damaged()
@@ -543,10 +544,10 @@ class RunFolder:
         """Convert exceptions caused by invalid contents of the folder into one-line errors.
 
         Raises:
-            FolderError: the folder is damaged or unfinished, or has no manifest; or its digests match, but
-                mdnum would not write such files, and the message names the place in mdnum's code. An
-                exception with an intact folder that this object wrote is a bug in mdnum, and is raised
-                unchanged.
+            FolderError: the folder is damaged or unfinished, or has no manifest; or its digests match, but it
+                has contents that mdnum does not write. The message then names a line of mdnum's code. If this
+                object wrote the folder and the folder is intact, the exception is a bug of mdnum and is
+                raised unchanged.
         """
         try:
             yield
@@ -568,10 +569,10 @@ class RunFolder:
             raise FolderError(message, remedy=_RESTORE, where=str(self.path)) from error
 
     def check_start(self) -> None:
-        """Compare the input of a run (the system and the files that belong to it) with the manifest.
+        """Raise an error if the input files of a run (system and structure) differ from the manifest.
 
         Raises:
-            FolderError: the input was changed, so that a new run would differ from the recorded one.
+            FolderError: the input was changed, so that a new run would differ from the recorded run.
         """
         for name in self._listed():
             written = name in _FILES or name.endswith(".parquet")
@@ -580,7 +581,7 @@ class RunFolder:
                 self.check(name)
 
     def noted(self) -> list[str]:
-        """Return one line for each file that has changed, and for a folder that cannot be checked."""
+        """Return a one-line message for each changed file, or for a folder that cannot be checked."""
         if not (self.path / manifest.NAME).exists():
             return [
                 f"{self.path}: has no {manifest.NAME}, so that nothing in it could be checked for damage."
@@ -590,7 +591,7 @@ class RunFolder:
     # -- inside ----------------------------------------------------------------------------------
 
     def _usable(self) -> list[str]:
-        """Return the names in a folder in which a run may begin; none if the folder does not exist."""
+        """Return the file names in a folder in which a run can begin; raise an error for any other folder."""
         there = self.path.iterdir() if self.path.is_dir() else ()
         present = sorted(entry.name for entry in there if entry.name != _LOCK)
         if present and not _came_to_nothing(self.path, present):
@@ -614,7 +615,7 @@ class RunFolder:
         return TableStream(self.path, name, self._layout, lambda path: self.check(manifest.place(path)[1]))
 
     def _sweep(self, *patterns: str) -> None:
-        """Remove temporary files that a kill left behind, and files that match the patterns."""
+        """Remove temporary files that remain after a kill, and files that match the patterns."""
         for pattern in (*patterns, ".*.part", *(f"{name}/.*.part" for name in SUBFOLDERS)):
             for file in self.path.glob(pattern):
                 if not (file.parent.is_symlink() and file.parent != self.path):
@@ -634,7 +635,7 @@ class RunFolder:
         return self._manifest[1]
 
     def _wrong(self, name: str) -> str:
-        """Return the problem of a file that the manifest lists; empty if it is intact or not listed."""
+        """Return how a file differs from the manifest; empty if the file is intact or is not listed."""
         allowed = self._listed().get(name)
         if allowed is None:
             return ""
@@ -656,7 +657,7 @@ class RunFolder:
         return self._checked[name][1]
 
     def _list_files(self, finished: bool | None = None) -> None:
-        """List this folder's unlisted files in the manifest, and update the entries of files that grew."""
+        """Add unlisted files of this folder to the manifest, and update the entries of files that grew."""
         listed = self._listed()
         there = [f"structures/{entry.name}" for entry in (self.path / "structures").glob("*.extxyz")]
         there += [entry.name for entry in self.path.iterdir() if entry.name not in self._foreign]
@@ -673,7 +674,7 @@ class RunFolder:
         return {name: stream.rows for name, stream in self._streams.items()}
 
     def _settle(self) -> None:
-        """Wait for the checkpoint that is being written, and raise the error that prevented it, if any."""
+        """Wait until the current checkpoint is written; raise the error of the writing thread, if any."""
         if self._writing is not None:
             written, self._writing = self._writing, None
             written.result()
@@ -733,10 +734,10 @@ class RunFolder:
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """Convert exceptions caused by contents that mdnum would not write into a file into one-line errors.
+    """Convert exceptions that are caused by invalid contents of a file into one-line errors.
 
     Raises:
-        FolderError: the file has such contents.
+        FolderError: the file has contents that mdnum does not write.
     """
     try:
         yield
@@ -750,7 +751,7 @@ def restoring(path: Path) -> Iterator[None]:
 
 
 def expect(right: object, seen: str) -> None:
-    """Reject a restored value unless a condition is true; for use inside `restoring`.
+    """Raise an error if a condition for a restored value is false; for use inside `restoring`.
 
     Raises:
         ValueError: the condition is false.
@@ -760,7 +761,7 @@ def expect(right: object, seen: str) -> None:
 
 
 def _came_to_nothing(path: Path, present: Sequence[str]) -> bool:
-    """Return True if a folder holds only the remains of a run that stopped before it computed anything."""
+    """Return True if a folder contains only files of a run that was stopped before the first result."""
     made = manifest.load(path)
     if made is None or made.finished or (path / "parts").is_symlink():
         return False
@@ -772,7 +773,7 @@ def _came_to_nothing(path: Path, present: Sequence[str]) -> bool:
 
 
 def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
-    """Raise the error for a folder that is not empty, with its remedy."""
+    """Raise the error for a run folder that is not empty, with a remedy."""
     if not any(name in (*_FILES, "parts", manifest.NAME) for name in present):
         seen = f"is not empty (it holds {present[0]!r})"
         raise FolderError(seen, remedy="Choose an empty or a new folder", where=str(path))
@@ -786,7 +787,7 @@ def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
 
 
 def _again(path: Path) -> str:
-    """Return the remedy for an unfinished folder."""
+    """Return a sentence that tells the user how to continue an unfinished run folder."""
     made = manifest.load(path)
     if made is None or made.layout is None:
         return "Run again in a new folder"

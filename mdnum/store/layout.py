@@ -1,4 +1,4 @@
-"""Layout of a folder, as declared by the verb that makes the folder, and as stored in its manifest."""
+"""Layout of a run folder, which is declared by the command that creates it and stored in the manifest."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOST_TABLES, _MOST_COLUMNS = 100, 1000
 
 @dataclass(frozen=True)
 class Layout:
-    """Kind of a folder: the command that makes it, the file from which it resumes, and its tables.
+    """Layout of a kind of run folder: its command, the file from which it is resumed, and its tables.
 
     Args:
         kind: name of the kind.
@@ -77,16 +77,16 @@ class Layout:
 
     @cached_property
     def always(self) -> tuple[str, ...]:
-        """Tables that every folder of the kind has."""
+        """Names of the tables that every folder of this kind has."""
         return tuple(name for name in self.tables if not name.endswith("?"))
 
     def keeps(self, name: str) -> bool:
-        """Return True if a file other than a table belongs to the kind, so that its digest is checked."""
+        """Return True if a file that is not a table belongs to the folder, so that its digest is checked."""
         fixed = ("summary.json", self.resumes_from)
         return name in fixed or any(fnmatchcase(name, pattern) for pattern in self.further.split())
 
     def columns(self, table: str) -> Mapping[str, tuple[str, bool]]:
-        """Return (type, whether it may be unknown) of each column of a table; empty if undeclared."""
+        """Return the type of each column of a table, and whether values can be null; empty if undeclared."""
         return self._columns.get(table, {})
 
     @cached_property
@@ -104,7 +104,7 @@ class Layout:
 
     @property
     def spelled(self) -> dict[str, str]:
-        """Declared tables with the type of every column, as the manifest stores them."""
+        """Declared tables with the types of all columns, in the format of the manifest."""
         spelled = {}
         for table in self.tables:
             columns = self.columns(table.rstrip("?")).items()

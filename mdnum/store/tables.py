@@ -1,6 +1,6 @@
-"""Tables that grow by part files named after their first row, and are merged into one file at the end.
+"""Tables that are written in part files while a run continues, and merged into one file at the end.
 
-A table of a folder that is never resumed needs no parts: a thread writes its file as rows arrive.
+In a folder that cannot be resumed, a thread writes each table directly into its final file.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ _DISTINCT = frozenset({"i", "j", "distance", "before", "margin", "margin_before"
 
 
 class TableStream:
-    """Rows 0, 1, 2, ... of one table, spread over `<name>.parquet` and `parts/<name>-<first row>.parquet`.
+    """A growing table, stored in the files `<name>.parquet` and `parts/<name>-<first row>.parquet`.
 
-    The name of a file determines which rows it holds, so that a kill at any step of writing, merging or
-    truncating leaves a folder whose rows can be identified.
+    The name of a file determines the rows in this file. Rows can therefore be identified after a kill at any
+    stage of writing, merging or truncating.
     """
 
     def __init__(
@@ -82,17 +82,17 @@ class TableStream:
 
     @property
     def rows(self) -> int:
-        """Number of rows appended so far, including those still in memory."""
+        """Number of rows appended so far, including rows in memory."""
         return self.flushed + self._buffered
 
     def parts(self) -> list[tuple[int, Path]]:
-        """Return (first row, path) of the part files, in order."""
+        """Return the first row and the path of each part file, in the order of rows."""
         found = self.parts_folder.glob(f"{self.name}-*.parquet")
         named = re.compile(re.escape(self.name) + r"-(\d{12,})\.parquet")
         return sorted((int(match[1]), path) for path in found if (match := named.fullmatch(path.name)))
 
     def files(self) -> list[tuple[Path, int]]:
-        """Return (path, rows) of the files that form the table, without gaps or parts already merged."""
+        """Return path and number of rows of each file of the table, without part files that were merged."""
         files: list[tuple[Path, int]] = []
         rows = 0
         if self.merged_path.exists():
@@ -113,7 +113,7 @@ class TableStream:
         return files
 
     def append(self, columns: Mapping[str, Any]) -> None:
-        """Append rows, which stay in memory until the next flush.
+        """Append rows to the table; rows stay in memory until the next flush.
 
         Args:
             columns: equally long arrays by column name, or a text for all rows; at least the table's own
@@ -148,7 +148,7 @@ class TableStream:
             self.flush()
 
     def look_up(self, of: str, columns: Mapping[str, Any]) -> None:
-        """Declare columns, before the first row, that are looked up from a column of indices on writing.
+        """Declare columns with values that are looked up by a column of indices when rows are written.
 
         Args:
             of: name of the column of indices.
@@ -182,7 +182,7 @@ class TableStream:
         self._buffer, self._buffered = [], 0
 
     def truncate(self, rows: int) -> None:
-        """Keep only the first rows of the table, in memory and on disk."""
+        """Keep only the given number of first rows of the table, in memory and on disk."""
         self._buffer, self._buffered = [], 0
         files = self.files()
         have = sum(count for _, count in files)
@@ -210,7 +210,7 @@ class TableStream:
         self.flushed = rows
 
     def merge(self) -> None:
-        """Write all rows into one file and remove the parts; a table without rows gets an empty file."""
+        """Write all rows into one file, and remove part files; a table without rows becomes an empty file."""
         self.flush()
         if self._writing is not None:
             self._writing.end()
@@ -230,13 +230,13 @@ class TableStream:
                 path.unlink()
 
     def close(self) -> None:
-        """Discard the unfinished file of a table."""
+        """Stop the writing thread, and discard the unfinished file of the table."""
         if self._writing is not None:
             self._writing.end(whole=False)
             self._writing = None
 
     def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Return an iterator over the rows on disk, a file or row group at a time."""
+        """Return an iterator over the rows on disk, one file or row group at a time."""
         return (self._whole(table, columns) for table in self._on_disk(columns))
 
     def _on_disk(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
@@ -275,7 +275,7 @@ class TableStream:
         self._replace(self.merged_path, groups, self._describe(cast(pa.Schema, self._schema)))
 
     def _whole(self, table: pa.Table, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return rows with the columns that they omit added, in order; all columns if none are named."""
+        """Return rows with the requested (default: all) columns; omitted columns are filled in."""
         there = table.column_names
         known = [name for name in self._known if name in there or name in self._usual]
         names = columns or [*known, *(name for name in there if name not in self._known)]
@@ -294,9 +294,9 @@ class TableStream:
             return file.metadata.num_rows
 
     def _replace(self, path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
-        """Write rows into a file of this table, whose new digest is listed in the manifest before it exists.
+        """Write rows into a file of this table; its digest is listed in the manifest before the file exists.
 
-        Every page carries a checksum, which readers of the file can verify.
+        Every page of the file has a checksum that readers can verify.
         """
         # a part is read once more and removed: packing it takes longer than all the rest
         packed = "zstd" if path == self.merged_path else "none"
@@ -319,7 +319,7 @@ class TableStream:
         self.written[name] = [found]
 
     def _refuse_columns(self, path: Path, schema: pa.Schema, wanted: Sequence[str] | None) -> None:
-        """Reject columns of another type than in this table, and a file without the requested columns."""
+        """Raise an error if a file has columns of the wrong type, or does not have the requested columns."""
         found = {field.name: field.type for field in schema}
         other = [name for name, kind in self._known.items() if found.get(name, kind) != kind]
         missing = [name for name in wanted or () if name not in found and name not in self._usual]
@@ -333,7 +333,7 @@ class TableStream:
 
 
 class _Writing:
-    """File that a thread writes from the tables it receives, mostly outside of Python's global lock."""
+    """A file that a background thread writes from a queue of tables, mostly without Python's global lock."""
 
     def __init__(self, write: Callable[[Iterator[pa.Table]], None]):
         # with a limit: where the disk is slower than what makes the rows, that waits
@@ -350,7 +350,7 @@ class _Writing:
             raise RuntimeError("rows of the table are missing")
 
     def put(self, table: pa.Table | None) -> None:
-        """Add a table, waiting for space in the queue; raise the error that has ended the writing, if any."""
+        """Add a table to the queue when there is space; raise the error of the writing thread, if any."""
         while not self._done.ready():
             with suppress(Full):
                 self._tables.put(table, timeout=1.0)
@@ -358,7 +358,7 @@ class _Writing:
         self._done.get()
 
     def end(self, whole: bool = True) -> None:
-        """Wait until all tables are written; with whole=False, discard the file and ignore errors."""
+        """Wait until all tables are written; if `whole` is False, discard the file and ignore errors."""
         self._whole = whole
         with nullcontext() if whole else suppress(Exception):
             self.put(None)
@@ -367,23 +367,23 @@ class _Writing:
 
 
 def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Concatenate the rows of tables with the same columns; a text stands for all rows."""
+    """Concatenate tables with the same columns; a text is the value of a column in all rows."""
     columns = {name: [part[name] for part in parts] for name in parts[0]}
     return {name: one[0] if isinstance(one[0], str) else np.concatenate(one) for name, one in columns.items()}
 
 
 def _repeats(values: Any, value: Any) -> bool:
-    """Return True if a column is known to have this value in all rows: a text, or a broadcast array."""
+    """Return True if a column given by one text or by a broadcast array has a value in all rows."""
     if isinstance(values, np.ndarray) and values.strides == (0,):
         values = values[0]
     return value is not None and np.ndim(values) == 0 and bool(values == value)
 
 
 def as_arrow(values: Any, kind: pa.DataType, rows: int = 0) -> pa.Array:
-    """Build a column of a type from its buffers, since `pa.array` imports pandas, which takes half a second.
+    """Create an arrow column from buffers, without `pa.array`, which imports pandas (half a second).
 
     Args:
-        values: one value per row; one value for all rows; or None for a column that is not known.
+        values: one value per row; one value for all rows; or None for a column of unknown values.
         rows: number of rows; required unless there is one value per row.
     """
     if values is None:
@@ -406,7 +406,7 @@ def as_arrow(values: Any, kind: pa.DataType, rows: int = 0) -> pa.Array:
 
 
 def as_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
-    """Return a column without gaps as a numpy array, from its buffers, since `to_numpy` imports pandas."""
+    """Return an arrow column without nulls as a numpy array, without `to_numpy`, which imports pandas."""
     parts = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
     if pa.types.is_string(column.type):
         return np.array([text for part in parts for text in part.to_pylist()], object)
@@ -427,7 +427,7 @@ def as_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
 
 @contextmanager
 def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a parquet file whose pages are verified by their checksums as they are read."""
+    """Open a parquet file; the checksum of each page is verified when the page is read."""
     try:
         with opened(path) as raw, pq.ParquetFile(raw, page_checksum_verification=True) as file:
             head, size = file.metadata, os.fstat(raw.fileno()).st_size

@@ -349,9 +349,8 @@ def _threes(trial: Trial) -> tuple[Any, Any, np.ndarray]:
     """Arrange the atoms in isolated groups of three.
 
     Returns:
-        a function that returns the neighbor list of chosen groups; a function that returns positions in which
-        the third atom of each group is at a given distance from the first, and the second atom at 0.6 of the
-        cutoff; the indices of the third atoms.
+        a function that returns the neighbor list of chosen groups; a function that places the third atom of
+        each group at a given distance from the first atom (the second at 0.6 of the cutoff); third atoms.
     """
     n, x = trial.n, trial.x
     first, second, third = np.arange(n - n % 3).reshape(3, -1)
