@@ -30,7 +30,7 @@ def idle(done: int, total: int, info: dict[str, Any]) -> None:
 
 
 class CallsUp(TimeUp):
-    """Raised when a check or a search has used up its allowed calculator calls; the check is abandoned."""
+    """Raised when a check has made all calculator calls allowed to it; the check then ends unfinished."""
 
     why = "the calls of this check were used up"
 
@@ -55,10 +55,10 @@ class CalculatorError(MdnumError):
 
 @dataclass
 class Meter:
-    """Counts the calls to all instances of a calculator, and limits the number of further calls and the time.
+    """Counts the calls to a calculator, and enforces limits on the number of calls and on the elapsed time.
 
-    A check is limited by its number of calls, so that its results do not depend on the load of the machine;
-    only a deadline ends a check earlier.
+    Checks are limited by a number of calculator calls, so that results do not depend on the load of the
+    machine; only a deadline ends a check earlier.
     """
 
     calls: int = 0
@@ -79,12 +79,12 @@ class Meter:
 
     @property
     def up(self) -> type[TimeUp] | None:
-        """The exception class for an exceeded limit on calls or time; None if neither limit is exceeded."""
+        """The exception class for an exceeded limit on calls or time; None if no limit is exceeded."""
         return TimeUp if self.deadline.passed else CallsUp if self.calls >= self.most else None
 
     @contextmanager
     def apart(self, calls: int) -> Iterator[None]:
-        """Allow further calls, beyond the limit of the check, for a result that several checks share."""
+        """Allow calculator calls beyond the limit of a check, for a result that several checks share."""
         most = self.most
         self.most = self.calls + calls
         try:
@@ -94,7 +94,7 @@ class Meter:
 
     @contextmanager
     def limited(self) -> Iterator[None]:
-        """Limit calls and time inside this block: the first call beyond a limit raises `TimeUp`."""
+        """Limit calculator calls and time in a `with` block; a call beyond a limit raises `TimeUp`."""
         if up := self.up:
             raise up
         self._limited += 1
@@ -106,7 +106,7 @@ class Meter:
 
 @dataclass(frozen=True)
 class Observed:
-    """One finding of a check: its code, and the values inserted into its text in mdnum/verbs/audit.toml."""
+    """One finding of a check: a code, and the values inserted into the text for this code in audit.toml."""
 
     code: str  # short stable name
     severity: Severity  # info (nothing to do), warning (look at it), error (the numbers are wrong)
@@ -169,9 +169,9 @@ class CheckResult:
 
 
 class AuditCheck:
-    """Base class of calculator checks; subclasses are in `mdnum.audit.checks` or in plugins of a package.
+    """Base class of calculator checks; each subclass is one check, in `mdnum.audit.checks` or in a plugin.
 
-    A subclass defines a name, a title, a one-line docstring and `ask`. The texts of its findings are in
+    A subclass defines a name, a title, a one-line docstring and `ask`. The texts of a check's findings are in
     mdnum/verbs/audit.toml, under the codes of the findings. To add a check, add the file `checks/NAME.py`
     with the class `NameCheck`.
 

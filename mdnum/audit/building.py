@@ -1,4 +1,4 @@
-"""Build a test structure, in a few calls, from elements that a calculator without own structure supports."""
+"""Build a structure for auditing a calculator without own structure, from elements that it supports."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
     """Return a test structure for a calculator: the calculator's own structure, a crystal, or rigid water.
 
     The crystal consists of an element for which the calculator is intended; if the calculator distinguishes a
-    second element, half of the atoms are of that element. The lattice constant is at the energy minimum of
-    the calculator. The crystal is repeated until the cell is two cutoffs wide (at most 500 atoms, fewer for a
-    slow calculator), and its atoms are displaced slightly. `info["origin"]` describes the structure. If the
-    calculator fails on atoms without neighbors, a denser crystal is built; this failure is reported later and
-    does not stop the audit.
+    second element, half of the atoms are of that element. The lattice constant is the one at which the
+    calculator's energy is lowest. The crystal is repeated until the cell is two cutoffs wide (at most 500
+    atoms, fewer for a slow calculator), and its atoms are displaced slightly. `info["origin"]` describes the
+    structure. If the calculator fails on atoms without neighbors, a denser crystal is built; this failure is
+    reported later and does not stop the audit.
 
     Args:
         deadline: time limit for building; at the deadline, or after `BUILDING_CALLS` calls, the best
@@ -131,7 +131,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return the crystal of the first supported element; `paired` first tests two atoms of an element."""
+        """Return the crystal of the first supported element; `paired` tests a pair of its atoms first."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():
@@ -141,7 +141,7 @@ class _Builder:
         return None
 
     def _mixed(self, made: Atoms) -> Atoms:
-        """Return the crystal with a second element if the calculator distinguishes it, else unchanged."""
+        """Return a crystal with a second element if the calculator distinguishes two, else unchanged."""
         from ase.data import atomic_numbers
 
         self.best, symbol = made, str(made.symbols[0])
@@ -185,7 +185,7 @@ class _Builder:
 
 
 def meant_for(calculator: Any, words: str) -> list[str]:
-    """Return the elements named in a calculator, its arguments, file or documentation, most likely first."""
+    """Return the elements named in a calculator's arguments, file or documentation, most likely first."""
     from ase.data import atomic_names, atomic_numbers, chemical_symbols
 
     module = sys.modules.get(type(calculator).__module__)
@@ -207,7 +207,7 @@ def meant_for(calculator: Any, words: str) -> list[str]:
 
 
 def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]:
-    """Yield element symbols in a value or its attributes; dictionary keys count only if all are symbols."""
+    """Yield element symbols in a value or its attributes; of dictionary keys, only if all are symbols."""
     from ase.data import chemical_symbols
 
     value = value.tolist() if hasattr(value, "tolist") else value
@@ -264,9 +264,9 @@ def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """Estimate the cutoff of a pair interaction, and the distance of minimum energy; None for a missing one.
+    """Estimate the cutoff of a pair interaction and the distance of lowest energy; None if not found.
 
-    If the calculator fails on atoms without neighbors, the cutoff is the distance from which it fails.
+    If the calculator fails on atoms without neighbors, the cutoff is the distance at which it begins to fail.
     """
     curve, distances = pair.curve(subject), _DISTANCES.tolist()
     known: dict[float, tuple[float, float]] = {}
@@ -350,9 +350,9 @@ def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, r
 
 
 def _unit_cell(symbol: str, *others: str) -> tuple[Atoms, str]:
-    """Return a rectangular fcc, bcc or diamond unit cell of the element (fcc if its crystal is another).
+    """Return a rectangular fcc, bcc or diamond unit cell of an element; fcc for other crystal structures.
 
-    If a second element is given, every second atom is of that element.
+    If a second element is given, half of the atoms are of this element.
     """
     from ase.build import bulk
     from ase.data import atomic_numbers, covalent_radii, reference_states

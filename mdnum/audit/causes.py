@@ -1,4 +1,4 @@
-"""Table of the causes that explain findings, read from causes.toml next to this file."""
+"""Table of the causes of findings, read from the file causes.toml in this folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mdnum.plain import beside
 
 @dataclass(frozen=True)
 class Cause:
-    """Known consequences, alternative causes and tests of the cause that a finding code reports."""
+    """Consequences of the cause behind a finding code, alternative causes, and tests to tell them apart."""
 
     brings: tuple[str, ...] = ()  # codes of findings that it explains
     rivals: tuple[str, ...] = ()  # codes of other causes that show the same
@@ -42,16 +42,16 @@ _SEVERITIES = ("info", "warning", "error")
 
 
 def cause(code: str) -> Cause:
-    """Return the table row for a finding code; an empty row for codes defined by another package."""
+    """Return the row of the cause table for a finding code; empty for codes of other packages."""
     return CAUSES.get(code, Cause())
 
 
 def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
-    """Return, for each finding, the index of the finding under which it is listed; its own index if separate.
+    """Return, for each finding, the index of the finding that explains it; its own index if there is none.
 
-    A finding is listed under the reported cause that explains it and is at least as severe (the deepest such
-    cause), or under the first finding with the same code. A common cause is likely but not proven: correct
-    the upper finding, and repeat the audit.
+    A finding is listed under the deepest reported cause that explains this finding and is at least as severe,
+    or under the first finding with the same code. A common cause of several findings is likely but not
+    proven: correct the finding listed first, and repeat the audit.
 
     Args:
         findings: code and severity of each finding, in the order in which the findings were made.

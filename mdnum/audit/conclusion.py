@@ -16,7 +16,7 @@ _QUESTIONS = ("run", "differentiate")
 
 
 def in_order(names: Sequence[str]) -> list[str]:
-    """Return the names of checks in the order in which they run."""
+    """Return the names of checks in the order in which the checks run."""
     return sorted(names, key=lambda name: (CHECKS[name].order, name))
 
 
@@ -26,7 +26,7 @@ def needed_to(question: str) -> set[str]:
 
 
 def answers(results: Sequence[CheckResult], wanted: Sequence[str]) -> Mapping[str, Answer]:
-    """Answer each question ("run", "differentiate") from the results of the requested checks."""
+    """Answer the questions "run" and "differentiate" from the results of the requested checks."""
     return {question: _answer(question, results, wanted) for question in _QUESTIONS}
 
 
@@ -65,10 +65,10 @@ def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
 
 
 def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
-    """Return the text variants, by finding code, that depend on the results of more than one check.
+    """Return the text variants of findings that depend on the results of more than one check.
 
-    If incorrect forces do no work around closed loops, they are the derivative of another energy; if they do
-    work, they are the derivative of no energy.
+    Incorrect forces that do no work around closed loops are the gradient of another energy; forces that do
+    work around loops are not the gradient of any energy.
     """
     numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
     curl, forces = numbers.get("curl"), numbers.get("forces")

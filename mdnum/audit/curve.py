@@ -1,10 +1,10 @@
 """Locate jumps and kinks of a curve to adjacent floating-point numbers by scanning and zooming; measure them.
 
-A curve consists of an energy and the force along one coordinate. Each value is predicted from the points to
-its left and, independently, from the points to its right. Where the curve is smooth, the difference between
-the two predictions falls with the fourth power of the spacing. At a kink this difference falls only linearly,
-and at a jump it does not fall. The rate at which the difference falls on zooming in therefore identifies the
-kind of singularity, whatever the curve is like elsewhere.
+A curve consists of an energy and the force along one coordinate. Each energy and force is predicted from the
+points to the left and, independently, from the points to the right. Where the curve is smooth, the difference
+between the two predictions falls with the fourth power of the point spacing. At a kink, this difference falls
+only linearly with the spacing, and at a jump it does not fall. The decrease of the difference with smaller
+spacing therefore identifies the kind of singularity, whatever the curve is like elsewhere.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SMOOTH = 3  # order of a threshold at which neither energy, force nor curvature 
 
 
 class Curve:
-    """Energy and force along one coordinate; each point is evaluated only once.
+    """Energy and force along one coordinate; results are stored, so each point is evaluated only once.
 
     Args:
         at: function that returns (energy, force = -dE/dx) at a coordinate.
@@ -63,7 +63,7 @@ class Curve:
 
 
 def bisect(question: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
-    """Find adjacent doubles between which a condition changes; its values at low and high must differ."""
+    """Find adjacent doubles between which a condition changes from true to false or from false to true."""
     before = question(low)
     while True:
         middle = low + 0.5 * (high - low)
@@ -76,14 +76,14 @@ def bisect(question: Callable[[float], bool], low: float, high: float) -> tuple[
 
 
 def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
-    """Return the coordinates that `find_jumps` scans, at most `step` apart."""
+    """Return evenly spaced coordinates, at most `step` apart, that `find_jumps` scans."""
     return np.linspace(low, high, max(int(np.ceil((high - low) / step)), 12) + 1)
 
 
 def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
     """Estimate the rounding noise of energy and force (columns) just below low and just above high (rows).
 
-    The largest estimate over several spacings is used: float32 values are constant over small spacings.
+    The largest estimate over several spacings is used, since float32 values are constant over small ones.
     """
     sides = []
     for start, sign in ((low, -1.0), (high, 1.0)):
@@ -99,7 +99,7 @@ def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndar
 
 
 def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> tuple[float, float]:
-    """Return the one-sided derivative dF/dx at `start` and its error, for the spacing of smallest error."""
+    """Return the one-sided derivative dF/dx of the force at `start` and its error, for the best spacing."""
     best = (0.0, np.inf)
     for relative in _WIDTHS:
         width = max(abs(start), 1.0) * relative
@@ -146,7 +146,7 @@ class Jump:
 
     @property
     def at(self) -> float:
-        """Coordinate at which the curve or its derivative jumps."""
+        """Coordinate at which the curve or one of its derivatives jumps."""
         return self.low if self.exact else 0.5 * (self.low + self.high)
 
 
@@ -159,12 +159,12 @@ def find_jumps(
     expected: Sequence[float] = (),
     calls: float = np.inf,
 ) -> tuple[list[Jump], int]:
-    """Find every jump of energy, force, curvature or third derivative that exceeds the scatter of a scan.
+    """Find jumps of the energy or of its first three derivatives that exceed the scatter of a scan.
 
-    The smallest detectable jump depends on the curvature of the curve; `smallest_steps` returns it for the
-    force. At a spacing of 0.025 Å, 199 of 200 force steps of 1e-6 eV/Å at random distances in five potentials
-    are found, and all larger steps. Energy steps are found down to 3e-6 eV on a repulsive wall of ε = 1 eV,
-    and down to 1e-8 eV on a soft one.
+    The smallest detectable jump depends on the curvature of the curve; for jumps of the force,
+    `smallest_steps` returns it. At a spacing of 0.025 Å, 199 of 200 force jumps of 1e-6 eV/Å at random
+    distances in five potentials are found, and all larger jumps. Energy jumps are found down to 3e-6 eV on a
+    repulsive wall of ε = 1 eV, and down to 1e-8 eV on a soft one.
 
     Args:
         curve: energy and force, which must be defined slightly beyond both ends.
@@ -200,10 +200,10 @@ def find_jumps(
 
 
 def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
-    """Measure the jumps between low and high, with bounds on the apparent jumps of a smooth curve.
+    """Measure the jumps between low and high, with bounds on the jumps that a smooth curve would show.
 
-    Energy and force are medians of four values at the last representable coordinates on either side, which
-    excludes single rounding errors. The curvature is computed from one-sided differences of the force.
+    Energy and force on either side are medians of values at the four nearest coordinates, which excludes
+    single rounding errors. The curvature is computed from one-sided differences of the force.
 
     Args:
         room: length, on either side, within which the curve may be evaluated.
@@ -231,7 +231,7 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
-    """Return the power with which the force vanishes at the end of its range; None if no power is clear.
+    """Return the power law with which the force vanishes at the end of its range; None if it is not clear.
 
     Args:
         edge: end of the interaction, approached from smaller distances; no other threshold is within `room`.
@@ -270,7 +270,7 @@ def smallest_steps(
 def _outliers(
     curve: Curve, places: Float[np.ndarray, "points"]
 ) -> tuple[list[tuple[float, float, float]], Float[np.ndarray, "intervals"]]:
-    """Return the intervals with unusually different predictions from both sides, and the detection limits.
+    """Return the intervals with unusually different predictions from left and right, and detection limits.
 
     Returns:
         (relative difference, left, right) of each outlier, the largest first; and the smallest detectable
@@ -305,9 +305,9 @@ def _outliers(
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
     """Mismatch across each interval: in energy, in force, and in energy change plus work of the force.
 
-    The first two values are |prediction from the left minus prediction from the right| at the midpoint. The
-    third value falls with the fifth power of the spacing if the curve is smooth, and is much more sensitive
-    to a jump of the energy alone.
+    The first two mismatches are |prediction from the left minus prediction from the right| at the midpoint.
+    The third mismatch falls with the fifth power of the spacing if the curve is smooth, and is much more
+    sensitive to a jump of the energy alone.
     """
     values = curve.many(places)
     windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
@@ -383,7 +383,7 @@ def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float
 
 
 def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
-    """Locate a kink of the force: the intersection of its extrapolations from both sides."""
+    """Locate a kink of the force as the point where the extrapolations from both sides intersect."""
     width = min(room / 8, 1e-3)
     middle, reach = 0.5 * (left + right), max(0.5 * (right - left), width / 8)
     roots = np.roots(-_pieces(curve, middle, reach, width, 3))
@@ -405,7 +405,7 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """Locate a jump of the energy's third derivative, using the force's second derivative on both sides.
 
-    Of several fit widths, the width whose result agrees best with that of half the width is used.
+    Several fit widths are tried; the one whose result agrees best with that of half the width is used.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

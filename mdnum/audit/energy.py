@@ -1,9 +1,9 @@
 """Energy balance of a run: jumps of the energy at thresholds and elsewhere, work of the forces, drift.
 
-If the force is the derivative of the energy, ΔU plus the work of the forces along the straight line between
-two steps is zero for every integrator. A remainder at a threshold is the energy jump of a flip. A remainder
-at another single point is due to a limit on the number of neighbors or a selection of nearest neighbors. A
-distributed one means that the force is not the derivative of the energy.
+If the force is minus the gradient of the energy, a step's energy change plus the work of the forces along the
+straight line is zero for every integrator. An energy change that remains at a distance threshold is the
+energy jump of a flip. One at another single point is due to a limit on the number of neighbors or a selection
+of nearest neighbors. A distributed one means that the force is not minus this gradient.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class NveRun:
         return self.timestep * np.arange(len(self.potential))
 
     def at(self, positions: Float[np.ndarray, "atoms 3"]) -> Atoms:
-        """Return the structure with the given positions and without constraints."""
+        """Return the atoms of the run at given positions, without constraints."""
         there = self.start.copy()
         there.set_constraint()
         there.positions = positions
@@ -139,7 +139,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy and force along the straight line between two steps; `ends` uses stored values at both ends."""
+    """Energy and force along the straight line between two steps; `ends` takes both ends from the run."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:
@@ -155,7 +155,7 @@ def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = 
 def account(
     subject: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], smooth: int = 2
 ) -> tuple[list[float], float]:
-    """Compute the work of the forces along the straight line of a step, piecewise between its crossings.
+    """Compute the work of the forces along the straight line of a step, piecewise between crossings.
 
     Args:
         subject: a calculator object separate from the run's; called three times per crossing, plus once.
@@ -189,7 +189,7 @@ def account(
 
 
 def _unexplained(curve: Curve, low: float, high: float) -> float:
-    """Energy change plus work of the force (Simpson's rule); 0 if the force is the energy's derivative."""
+    """Energy change plus work of the force (Simpson's rule); 0 if the force is -dE/dx of this energy."""
     if high <= low:
         return 0.0
     (before, first), (after, last) = curve(low), curve(high)
@@ -209,7 +209,7 @@ class HiddenJump:
 
 @dataclass(frozen=True)
 class HiddenJumps:
-    """Energy jumps found in the time steps of a run that have an unexplained energy change."""
+    """Energy jumps found in time steps in which the energy change was not explained otherwise."""
 
     jumps: tuple[HiddenJump, ...] = ()  # found in the steps that were searched
     steps: Mapping[int, float] = field(default_factory=dict)  # those, with what they left unexplained, eV
@@ -217,7 +217,7 @@ class HiddenJumps:
 
     @property
     def share(self) -> float:
-        """Fraction of the unexplained energy change of the searched steps that is due to jumps."""
+        """Fraction of the unexplained energy change, in the searched time steps, that is due to jumps."""
         whole = sum(abs(rest) for rest in self.steps.values())
         left = sum(abs(rest - self.brought(step)) for step, rest in self.steps.items())
         return max(1.0 - left / whole, 0.0) if whole else 0.0
@@ -240,7 +240,7 @@ class HiddenJumps:
 
     @property
     def radius(self) -> tuple[float, int]:
-        """Pair threshold most frequently crossed at a jump, and the number of such jumps."""
+        """Distance threshold that pairs cross most often at a jump, and the number of such jumps."""
         return _most_frequent(jump.radius for jump in self.jumps if jump.radius is not None)
 
 
@@ -255,7 +255,7 @@ def hidden_jumps(
     crossed: Mapping[int, Sequence[RunCrossing]],
     noise: float,
 ) -> HiddenJumps:
-    """Search the steps with the largest unexplained energy change for jumps of the energy at single points.
+    """Search the time steps with the largest unexplained energy change for jumps at single points.
 
     Args:
         rest: unexplained energy change of each step, eV; nan where unknown.
@@ -314,25 +314,25 @@ class EnergyBalance:
 
     @property
     def elsewhere(self) -> Steps:
-        """Energy change at each step due to jumps away from pair thresholds, eV."""
+        """Energy change at each step due to jumps other than those at pair thresholds, eV."""
         return self.hidden.energies(self.rest)
 
     @property
     def filled(self) -> Steps:
-        """Unexplained energy change at each step without hidden jumps, eV; the mean at steps not measured."""
+        """Energy change at each step that is not explained by jumps, eV; the mean for steps not measured."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 
     @property
     def means(self) -> dict[PairThreshold, float]:
-        """Mean energy jump when a pair comes closer than a threshold distance, for each threshold, eV."""
+        """Mean energy jump when the distance of a pair falls below a threshold, for each threshold, eV."""
         found: dict[PairThreshold, list[float]] = {}
         for place, jump in self.measured.items():
             found.setdefault(self.crossed[place].threshold, []).append(self.crossed[place].sign * jump)
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
 
     def by_means(self, crossed: Sequence[RunCrossing], steps: int) -> Steps:
-        """Estimate the energy change at each step due to the flips of another run from the mean jumps, eV."""
+        """Estimate the energy change by another run's flips at each step, from this run's mean jumps, eV."""
         jumps, means = np.zeros(steps), self.means
         for one in crossed:
             jumps[one.step] += one.sign * means.get(one.threshold, 0.0)
@@ -346,7 +346,7 @@ def balance(
     rng: np.random.Generator,
     noise: float = 0.0,
 ) -> EnergyBalance:
-    """Compute the energy balance of a run.
+    """Compute the energy balance of a run at every time step.
 
     Args:
         probe: a calculator object separate from that of the run.
@@ -411,10 +411,10 @@ class Drift:
 
 
 def drift(time: Steps, values: Steps) -> Drift:
-    """Return the slope of a straight line fitted to block means, with its standard error.
+    """Return the slope of a straight line fitted to block averages, with its standard error.
 
-    Values at neighboring steps are correlated. Blocks are longer than the correlation time, so the block
-    means are independent if the run is long enough. At least 16 values are required.
+    Values at neighboring time steps are correlated. Blocks are longer than the correlation time, so block
+    averages are independent if the run is long enough. At least 16 values are required.
     """
     blocks = np.array_split(np.arange(len(values)), _BLOCKS)
     x, y = ([float(row[block].mean()) for block in blocks] for row in (time, values))
@@ -438,7 +438,7 @@ def wandering(time: Steps, increments: Steps) -> Drift:
 
 
 def ratio(time: Steps, total: Steps, kinetic: Steps) -> float:
-    """Return the energy drift over the whole run, divided by the standard deviation of the kinetic energy.
+    """Return the total energy drift of a run divided by the standard deviation of the kinetic energy.
 
     Source:
         the energy conservation score of the mlipaudit suite; lambench reports meV/atom/ps instead.

@@ -1,4 +1,4 @@
-"""Check how smooth a user's pair function is between close contact and cutoff, using only its values.
+"""Check the smoothness of a user's pair function between close contact and cutoff from computed values.
 
 A run records the flips at its cutoff. If the pair function itself has a discontinuity, for example where two
 pieces do not join, a run records no flip there, and no derivative of the run includes the discontinuity.
@@ -97,7 +97,7 @@ def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
 
 
 def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
-    """Return a function that computes the cut energy and its first derivatives just below each distance."""
+    """Return a function for the cut energy and its first derivatives just inside each given distance."""
 
     @jax.jit
     def evaluate(own, r_cut, r_onset, r):
@@ -116,7 +116,7 @@ def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
 
 
 def _order(derivatives: np.ndarray) -> int:
-    """Return the number of derivatives of the energy that are continuous at the last distance."""
+    """Return the number of energy derivatives that are continuous at the last of the given distances."""
     for order, row in enumerate(derivatives):
         usual = float(np.median(np.abs(row[np.isfinite(row)]))) if np.isfinite(row).any() else 0.0
         if not abs(row[-1]) <= _NOTHING[min(order, 1)] * usual:
@@ -125,7 +125,7 @@ def _order(derivatives: np.ndarray) -> int:
 
 
 def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float) -> list[dict[str, Any]]:
-    """Return the discontinuities and other defects of a pair curve between two distances, one per row."""
+    """Return discontinuities and other defects of a pair function between two distances, one per row."""
     step = (r_cut - low) / _INTERVALS
     curve, high = Curve(at), r_cut * (1 + _BEYOND)
     grid = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
@@ -180,7 +180,7 @@ def _share(four: np.ndarray, width: float) -> np.ndarray:
 
 
 def _poles(curve: Curve, grid: np.ndarray, force: np.ndarray) -> list[float]:
-    """Return the distances at which the force diverges: it grows at every zoom."""
+    """Return the distances at which the force diverges: there it grows each time the spacing is reduced."""
     inner = force[1:-1]
     peaks = 1 + np.flatnonzero((inner >= force[:-2]) & (inner >= force[2:]) & (inner > 0))
     found, usual = [], np.median(force[np.isfinite(force)])

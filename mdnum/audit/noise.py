@@ -1,4 +1,4 @@
-"""Measure the numerical noise of a calculator's energies and forces, and the digits these numbers carry."""
+"""Measure the numerical noise of a calculator's energies and forces, and their number of digits."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class NoiseFloor:
     freedom: float = math.inf  # independent values that the standard deviations were estimated from
 
     def louder(self, other: NoiseFloor) -> NoiseFloor:
-        """Return the larger noise of each quantity, and the smaller number of degrees of freedom."""
+        """Return the larger of two noise levels for each quantity, with the smaller degrees of freedom."""
         return NoiseFloor(
             max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical),
             min(self.freedom, other.freedom),
@@ -76,7 +76,7 @@ class NoiseFloor:
 
     @property
     def allowed(self) -> NoiseFloor:
-        """Largest allowed difference of energies and of forces, used in all comparisons limited by noise.
+        """Largest differences of energies and forces that noise can explain, used in all comparisons.
 
         A standard deviation estimated from few values may be far too small by chance, so the limit is
         computed with Student's t distribution.
@@ -130,8 +130,8 @@ class Staircase:
 def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     """Detect discrete steps in energies and forces: values that stay constant to the last bit, then change.
 
-    In single or double precision, every smooth function changes within 1e-4 Å. Points at which the energy and
-    all forces are unchanged are ignored, since a cached result looks the same.
+    In single or double precision, every smooth energy or force changes within a move of 1e-4 Å. Points at
+    which the energy and all forces are unchanged are ignored, since cached results look the same.
     """
     key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
     if key in subject.known:
@@ -173,7 +173,7 @@ def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
 
 
 def _quantum(values: Float[np.ndarray, "points"]) -> float:
-    """Return a divisor common to all second differences that exceed rounding; 0 if there is none."""
+    """Return a common divisor of all second differences of values that exceed rounding errors, or 0."""
     sizes = np.abs(np.diff(values, n=2))
     sizes = sizes[sizes > np.spacing(largest(values)) / _ALIKE]
     for part in (1, 2, 3) if sizes.size else ():
@@ -198,8 +198,8 @@ def order_change(
     """Largest energy change when the atoms are reordered, eV, and the noise level if rounding explains it.
 
     The noise level is 0 if rounding does not explain the energy change, or if no change exceeds the noise
-    along a line. The rounding error of a sum varies randomly along a line; the change varies smoothly if
-    terms are missing for another atom order.
+    measured along a line. While atoms move along a line, the rounding error of a sum varies randomly, but an
+    error due to missing terms varies smoothly.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
@@ -287,11 +287,11 @@ def under_jitter(
 def settled(
     subject: CalculatorSubject, rng: np.random.Generator, at_least: int = FEW, brief: bool = False
 ) -> tuple[Atoms, NoiseFloor]:
-    """Return a slightly displaced structure without pairs at a threshold distance, and its noise level.
+    """Displace atoms slightly, so that no pair is at a threshold; return the structure and its noise.
 
-    In a perfect crystal a whole neighbor shell can lie exactly at a cutoff, which would disturb checks that
-    do not concern thresholds. An energy step along the sampled line would appear as noise, so the
-    displacement with the least noise of several random displacements is used.
+    In a perfect crystal, a whole neighbor shell can lie exactly at a cutoff, which would disturb the checks
+    that do not test thresholds. An energy step along the sampled line appears as noise, so of several random
+    displacements the one with the least noise is used.
 
     Args:
         at_least: minimum number of atoms; a smaller periodic cell is repeated.
@@ -354,28 +354,28 @@ def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
 
 @dataclass(frozen=True)
 class Digits:
-    """Number of decimals and of significand bits used by a set of numbers."""
+    """Number of decimal places and of significand bits used by a set of numbers."""
 
     decimals: int | None  # they are rounded to; None where to none
     bits: int  # of their significands, at most; 53 for a double that is used in full
 
     @property
     def quantum(self) -> float:
-        """Spacing between numbers rounded to a fixed number of decimals; 0 for unrounded numbers."""
+        """Spacing of numbers that are rounded to a fixed number of decimals; 0 for unrounded numbers."""
         return 0.0 if self.decimals is None else 10.0**-self.decimals
 
     def grain(self, values: np.ndarray) -> float:
-        """Return the spacing, at the largest of the given values, between numbers with these digits."""
+        """Return the spacing between numbers with these digits, at the largest of the given values."""
         return max(self.quantum, 2.0**-self.bits * largest(values))
 
     @property
     def format(self) -> str | None:
-        """Name of the narrowest floating-point format that holds the bits; None if there is none."""
+        """Name of the narrowest floating-point format that can hold the numbers; None if there is none."""
         return next((name for most, name in _FORMATS if self.bits <= most), None)
 
 
 def digits(values: np.ndarray) -> Digits:
-    """Return the number of decimals and bits used by values; full precision if few values are distinct."""
+    """Return the decimal places and bits used by values; full precision if few values are distinct."""
     found = np.unique(np.asarray(values, dtype=np.float64))
     found = found[np.isfinite(found) & (found != 0.0)]
     if len(found) < _FEWEST:
@@ -391,8 +391,8 @@ def digits(values: np.ndarray) -> Digits:
 def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
     """Yield a finding, QUANTIZED or LOW_PRECISION, if energies or forces carry fewer digits than a double.
 
-    Discrete steps are measured along a line and not inferred from the digits: forces that were rounded before
-    a unit conversion, or computed from rounded positions, use all digits of a double.
+    Discrete steps are measured along a line of structures, because the digits of forces may not show them:
+    forces rounded before a unit conversion, or computed from rounded positions, use all digits of a double.
     """
     stairs = steps(subject, atoms)
     size, typical = largest(stairs.energies), rms(stairs.forces)

@@ -19,7 +19,7 @@ _PLACES, _CANDIDATES = 48, 4  # places that are tried, and of them for an ordina
 
 @dataclass(frozen=True)
 class WrongPlaces:
-    """Indices in the list of atoms at which energy or forces are wrong, whichever atom has this index."""
+    """Indices in the list of atoms at which energy or forces are wrong, whichever atom is at this index."""
 
     places: tuple[int, ...]
     count: int  # of atoms
@@ -41,14 +41,14 @@ class WrongPlaces:
 
 
 def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) -> WrongPlaces | None:
-    """Find atom indices with wrong results by exchanging each atom with one of its species at a correct one.
+    """Find atom indices with wrong results, by exchanging atoms of equal species between two indices.
 
-    Exchanging two identical atoms between two correct indices changes nothing. An error tied to an index
-    appears at this index for any order of the atoms. An error that depends on the whole order, such as
+    Exchanging two atoms of the same species between two correct indices changes nothing. An error tied to an
+    index appears at this index for any order of the atoms. An error that depends on the whole order, such as
     neglected neighbors, appears at nearly all indices, or at other indices for another order.
 
     Returns:
-        None if the deviation is below the allowed limit at every index, or above it at nearly every index.
+        None if no index deviates by more than is allowed, or if nearly all indices do.
     """
     key = "places", atoms.positions.tobytes(), atoms.numbers.tobytes()
     if key not in subject.known:
@@ -75,7 +75,7 @@ def _wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor)
 def _at_places(
     subject: CalculatorSubject, atoms: Atoms, order: np.ndarray, places: Sequence[int], allowed: NoiseFloor
 ) -> dict[int, tuple[bool, bool]]:
-    """Test whether energy and forces change when an atom is exchanged with one at a correct index.
+    """Test whether energy and forces change when an atom is exchanged with an atom at a correct index.
 
     Returns:
         for each tested index, whether energy and forces change; empty if most indices of a species are wrong.

@@ -31,9 +31,9 @@ STRUCTURES = "structures"  # where structures are kept that show a finding
 
 
 def load_calculator(words: str) -> LoadedCalculator:
-    """Find the named calculator, and construct an instance once so that errors appear immediately.
+    """Find the named calculator, and create a calculator object at once so that errors appear immediately.
 
-    A Python file is executed again for each calculator object, so that no two objects share an array.
+    A Python file is executed again for each calculator object, so that two objects share no arrays.
 
     Args:
         words: `package.module:Class(argument=value)` with literals as arguments; a Python file in which
@@ -111,7 +111,7 @@ def _of_system(text: str) -> LoadedCalculator:
 
 @dataclass
 class AuditState:
-    """State of an audit, finished or unfinished."""
+    """State of an audit, whether finished or not."""
 
     name: str  # of the calculator
     named: bool  # whether it was named in words, and is found again by them
@@ -134,13 +134,13 @@ class AuditState:
 
     @property
     def left(self) -> list[str]:
-        """Names of the checks that have not finished."""
+        """Names of the checks that are not yet finished."""
         done = {result.name for result in self.results}
         return [name for name in self.checks if name not in done]
 
     @property
     def shown(self) -> list[CheckResult]:
-        """All results so far: of finished checks, of brief forms, and of interrupted checks."""
+        """All results so far: of finished checks, of short forms of checks, and of interrupted checks."""
         return [*self.results, *(self.cut[name] for name in self.left if name in self.cut)]
 
     @property
@@ -172,7 +172,7 @@ def kept(folder: RunFolder) -> AuditState:
 
 
 def encoded(atoms: Atoms) -> str:
-    """Encode a structure as JSON without rounding; in `info`, only text and numbers are kept."""
+    """Encode a structure as JSON without rounding; of its `info`, only text and numbers are kept."""
     copy = atoms.copy()
     copy.info = {key: value for key, value in atoms.info.items() if isinstance(value, str | int | float)}
     copy.set_constraint()
@@ -180,7 +180,7 @@ def encoded(atoms: Atoms) -> str:
 
 
 def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
-    """Return a script that uses ASE alone to show that equivalent structures differ in energy or forces.
+    """Return a script that shows, with ASE alone, that energy or forces of equivalent structures differ.
 
     Args:
         words: the calculator as the user named it.
@@ -193,7 +193,7 @@ def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
 
 
 def _making(words: str) -> list[str]:
-    """Return the source lines that define the function make(), which creates the calculator."""
+    """Return the lines of a script that define make(), a function that creates the calculator."""
     spot = place(words)
     head = ["", "", "def make():"]
     if spot is None:

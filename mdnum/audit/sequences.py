@@ -1,4 +1,4 @@
-"""Sequences of structures for one calculator object, to reveal errors of the neighbor list it keeps."""
+"""Sequences of structures for one calculator object, to reveal errors in its neighbor list."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class SequenceStep(NamedTuple):
 
 
 def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[SequenceStep]]:
-    """Return all nonempty sequences that can be made from a structure, by name."""
+    """Return, by name, all sequences of structures that can be made from a structure."""
     sequences = {
         "sizes": _sizes(atoms, rng), "a slow drift": _slow_drift(atoms, rng),
         "two atoms head on": _head_on(atoms), "strain": _strain(atoms), "wrapping": _wrapping(atoms, rng),
@@ -39,7 +39,7 @@ def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[Sequ
 
 
 def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures with more or fewer atoms or neighbors, and with other species and periodicity."""
+    """Yield structures with other numbers of atoms, other densities, other species and other periodicity."""
     yield "the structure", atoms
     if len(atoms) <= 64 and atoms.pbc.any():
         yield "the structure grew to its supercell", atoms.repeat(np.where(atoms.pbc, 2, 1))
@@ -67,7 +67,7 @@ def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]
 
 
 def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures in which all atoms move slightly in different directions, until they exceed a skin."""
+    """Yield structures in which all atoms drift in different directions, by more than a skin in total."""
     heading = rng.standard_normal((len(atoms), 3))
     heading /= np.linalg.norm(heading, axis=1)[:, None]
     yield "the structure", atoms
@@ -131,7 +131,7 @@ def _scaled(atoms: Atoms, factor: float) -> Atoms:
 
 
 def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
-    """Yield named sequences in which two particles come within the cutoff, each for a new calculator object.
+    """Yield sequences in which two particles come within the cutoff; each requires a new calculator object.
 
     Args:
         radius: cutoff distance, beyond which the particles do not interact, Å.

@@ -24,7 +24,7 @@ _NEAREST = 0.3  # distances are walked from the first
 
 
 def read_structure(words: str | Path) -> Atoms:
-    """Read a structure from any file that ASE reads; `file@5` is the sixth structure, the default the last.
+    """Read a structure with ASE; `file@5` is the sixth structure of a file, `file` is the last.
 
     The text after @ is passed to ASE and must select exactly one structure: an index (negative indices count
     from the end) or a database selection (`file.db@id=3`).
@@ -84,7 +84,7 @@ class Pair:
     moves: Literal["atom", "molecule"] = "atom"
 
     def at(self, distance: float) -> Atoms:
-        """Return the pair with its reference atoms at exactly the given distance, without rounding."""
+        """Return the pair with its two reference atoms at exactly the given distance, without rounding."""
         both = self._together.copy()
         both.positions[len(self.first) :, 0] += distance
         return both
@@ -94,7 +94,7 @@ class Pair:
         return self.surrounded(self.first + self.second)
 
     def surrounded(self, atoms: Atoms, middle: bool = False) -> Atoms:
-        """Put atoms into the cell of the pair; `middle` centers them."""
+        """Put atoms into the cell of the pair; `middle` moves the atoms to its center."""
         if self.box:
             atoms.set_cell([self.box] * 3)
             if middle:
@@ -103,7 +103,7 @@ class Pair:
         return atoms
 
     def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
-        """Return all distances between atoms of the two particles except that of the reference atoms."""
+        """Return the distances between atoms of the two particles, except that of the reference atoms."""
         moved = self.second.positions[None] + [distance, 0.0, 0.0]
         return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
 
@@ -120,9 +120,9 @@ class Pair:
 def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[Skipped]]:
     """Return a pair of particles for every two species that the calculator supports, most frequent first.
 
-    A pair consists of single atoms if the calculator supports them at the smallest distance of the structure.
-    Otherwise each atom has two companion atoms, since a bond order may divide by the number of neighbors. If
-    this is not supported either (rigid water), the pair consists of molecules of the structure.
+    A pair consists of single atoms if the calculator supports single atoms at the smallest distance in the
+    structure. Otherwise each atom has two companion atoms, since a bond-order potential may divide by the
+    number of neighbors. If this fails too (rigid water), the pair consists of molecules of the structure.
 
     Returns:
         (pairs, omitted pairs with the reason).
@@ -150,7 +150,7 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
 
 
 def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
-    """Return a copy of a structure with new attribute values; `scaled` scales positions with a new cell."""
+    """Return a modified copy of a structure; if `scaled`, a new cell also scales the positions."""
     there = atoms.copy()
     if "cell" in values:
         there.set_cell(values.pop("cell"), scale_atoms=scaled)
@@ -183,13 +183,13 @@ def nearest_distance(atoms: Atoms) -> float:
 
 
 def trio(symbol: str, side: float, way: float) -> Atoms:
-    """Return an atom at the origin with two companion atoms beside each other behind it."""
+    """Return an atom at the origin and two companion atoms behind it, at equal distances."""
     depth = way * side * np.sqrt(0.75)
     return Atoms([symbol] * 3, [(0, 0, 0), (depth, side / 2, 0), (depth, -side / 2, 0)])
 
 
 def molecules(atoms: Atoms) -> list[np.ndarray]:
-    """Return the atom indices of each molecule; atoms are bonded if their covalent radii nearly touch."""
+    """Return the atom indices of each molecule; two atoms are bonded if their covalent radii nearly touch."""
     from ase.neighborlist import natural_cutoffs, neighbor_list
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -231,7 +231,7 @@ def _molecules(subject: CalculatorSubject) -> list[Pair]:
 def _answered(
     subject: CalculatorSubject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
 ) -> tuple[Pair | None, str]:
-    """Return the pair in the simplest cell that the calculator supports, or None with the reason."""
+    """Return the pair in the simplest cell that the calculator supports; otherwise None and the reason."""
     why = ""
     for cell, periodic in _SURROUNDINGS:
         name = "-".join(part.get_chemical_formula() for part in (first, second))
@@ -246,7 +246,7 @@ def _answered(
 
 
 def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
-    """Return the scan distances at which the calculator does not fail, and the largest scan distance."""
+    """Return the distances of a scan at which the calculator does not fail, and the largest distance."""
     places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
     first = len(places)
     for k in range(len(places) - 1, -1, -1):
@@ -264,8 +264,8 @@ def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndar
 def group(atoms: Atoms) -> int | None:
     """Return the number of atoms per molecule if a structure consists of identical molecules, else None.
 
-    A repeating sequence of species does not imply molecules, since the atoms of a salt crystal repeat too.
-    The atoms of a molecule must be bonded to one another (by covalent radii) and to no other atoms.
+    A repeating sequence of species does not imply molecules: a salt crystal can have one too. The atoms of a
+    molecule must be bonded to one another (by covalent radii) and to no other atoms.
     """
     numbers = atoms.numbers
     if len(set(numbers)) < 2:

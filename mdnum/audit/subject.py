@@ -1,4 +1,4 @@
-"""Wrapper of an ASE calculator for the checks: returns numbers or a clear error, never outdated results."""
+"""Wrapper of an ASE calculator for audits: returns numbers or a clear error, never outdated results."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Repeats:
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
-        """Record the first energy or force computed by the calculator object with number `which`."""
+        """Record the first energy or force of a new calculator object, the object number `which`."""
         before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
@@ -70,7 +70,7 @@ class Repeats:
             setattr(self.new, what, max(abs(value - before), getattr(self.new, what)))
 
     def findings(self, kT: float) -> list[Observed]:
-        """Return a finding if two evaluations of one structure differ by more than rounding."""
+        """Return a finding if repeated evaluations of one structure differ by more than rounding."""
         for seen, who in ((self.chance, "same"), (self.new, "new")):
             if seen.differ:
                 told = not_repeatable(
@@ -125,13 +125,13 @@ class LoadedCalculator:
 
 
 class CalculatorSubject:
-    """An ASE calculator and the structure on which it is audited.
+    """An ASE calculator and the structure for which it is audited.
 
     ASE returns its cached energy if no coordinate moved by more than 1e-15 Å, although such a move changes
-    bits near the origin; so any differing bit clears the cache. If no bit differs, the cache is used, so that
-    energy and forces need only one calculation; `forget` forces a new calculation. The calculator is attached
-    to the atoms, as in a run, since some calculators require this. An evaluation may raise a
-    `CalculatorError`: the calculator raised an exception or returned nan. The structure is then saved.
+    bits near the origin; so the cache is cleared if any bit differs. If no bit differs, the cache is used, so
+    energy and forces cost one calculation; `forget` forces another. The calculator is attached to the atoms,
+    as in a run, since some calculators require this. An evaluation may raise a `CalculatorError`: the
+    calculator raised an exception or returned nan. The structure is then saved.
 
     Args:
         name: the calculator as the user named it.
@@ -182,14 +182,14 @@ class CalculatorSubject:
         return self._calculator
 
     def fresh(self) -> CalculatorSubject:
-        """Return a copy of the subject with a new calculator object, which has no memory."""
+        """Return a copy of the subject with a new calculator object that has evaluated no structure yet."""
         other = copy.copy(self)
         other.forgets = other.renews = other.copies = True
         other._calculator = other._last = None
         return other
 
     def used(self) -> CalculatorSubject:
-        """Return a copy with a new calculator object, to test its change detection and error recovery."""
+        """Return a copy of the subject, with its safeguards off, to test how a calculator detects changes."""
         other = self.fresh()
         other.forgets = other.renews = False
         return other
@@ -211,7 +211,7 @@ class CalculatorSubject:
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:
         """Return (the energy consistent with the forces, the energy that a run writes to its log), eV.
 
-        ASE calls the first energy `free_energy` and the second `energy`; the second is None if the calculator
+        In ASE the first energy is `free_energy` and the second `energy`; the second is None if a calculator
         has only one.
         """
         asked = self._ask(atoms)
@@ -245,7 +245,7 @@ class CalculatorSubject:
         return self.energy(atoms), self.forces(atoms)
 
     def try_both(self, atoms: Atoms) -> Answered:
-        """Return energy and forces, or the calculator's error; a failing structure is not saved."""
+        """Return energy and forces, or the error of the calculator; no structure is saved."""
         try:
             with self.trying():
                 return self.both(atoms)
@@ -258,7 +258,7 @@ class CalculatorSubject:
 
     @contextmanager
     def trying(self) -> Iterator[None]:
-        """Save no failing structures within this block, in which the calculator is expected to fail."""
+        """Save no structures on which the calculator fails within this block, where failures are expected."""
         before, self.saving = self.saving, False
         try:
             yield
@@ -266,10 +266,10 @@ class CalculatorSubject:
             self.saving = before
 
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
-        """Evaluate a structure again with the same object, and record the comparison in `repeats`.
+        """Evaluate a structure again with the same calculator object, and count any difference in `repeats`.
 
-        A deviation counts as random only if the second result agrees with that of a new object; otherwise the
-        earlier calls to this object may be the reason.
+        A difference counts as random only if the second result agrees with that of a new object; otherwise
+        earlier evaluations by this object may be the reason.
 
         Args:
             energy: the earlier energy, eV; the energy or the forces are required.
@@ -313,7 +313,7 @@ class CalculatorSubject:
         return asked
 
     def _nearly(self, atoms: Atoms) -> bool:
-        """Return whether ASE would treat a structure as unchanged although some bits differ."""
+        """Return whether ASE would treat a structure as unchanged although some of its bits differ."""
         check = getattr(self.calculator, "check_state", None)
         if not callable(check):
             return False

@@ -1,10 +1,10 @@
-"""Search many-atom environments for discontinuities: moves of atoms in a structure, and crowded atoms.
+"""Search for discontinuities of the energy among many atoms, by moving atoms and by crowding them.
 
-A pair of atoms may interact differently among many atoms (embedding energies, angles): a jump may have
-another size, and a threshold that is smooth for two atoms may jump. Therefore atoms and triples of atoms are
-moved through the known pair thresholds and beyond. To detect a limit on the number of neighbors, one more
-atom is moved past all neighbors of a crowded central atom. A calculator that keeps k neighbors exchanges the
-k-th neighbor for this atom when both are equally far away, and the energy or a force jumps. If the calculator
+A pair of atoms may interact differently among many atoms (embedding energies, angles): an energy jump may
+have another size, and a threshold that is smooth for two atoms may jump. Therefore atoms and triples of atoms
+are moved through the pair thresholds and beyond. To detect a limit on the number of neighbors, one more atom
+is moved past all neighbors of a crowded central atom. A calculator that keeps only k neighbors exchanges the
+k-th neighbor for this atom when both are equally far away; then the energy or a force jumps. If a calculator
 keeps the first k neighbors in the order of the list, reordering the atoms reveals the limit.
 """
 
@@ -49,7 +49,7 @@ _HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 
 
 
 class RouteCrossing(NamedTuple):
-    """A point of a route at which the distance of the lead atom from another atom crosses a threshold."""
+    """A point on a route at which the distance from the moving atom to another atom crosses a threshold."""
 
     at: float
     threshold: PairThreshold
@@ -66,13 +66,13 @@ class Route:
     direction: Float[np.ndarray, "3"]  # unit vector
 
     def at(self, along: float) -> Atoms:
-        """Return the structure with the moving atoms displaced along the line by a given length."""
+        """Return the structure with its moving atoms displaced by a given length along the line."""
         atoms = self.atoms.copy()
         atoms.positions[self.moving] += along * self.direction
         return atoms
 
     def curve(self, subject: CalculatorSubject) -> Curve:
-        """Energy along the route, and the component along the line of the force on the moving atoms."""
+        """Energy along the route, and the force on the moving atoms in the direction of the route."""
 
         def at(along: float) -> tuple[float, float]:
             energy, forces = subject.both(self.at(along))
@@ -81,9 +81,9 @@ class Route:
         return Curve(at)
 
     def crossings(self, thresholds: Sequence[PairThreshold], low: float, high: float) -> list[RouteCrossing]:
-        """Return the points between low and high at which a distance of the lead atom crosses a threshold.
+        """Return the points between low and high at which the moving atom crosses a threshold distance.
 
-        The squared distance along a line is quadratic, so the points are roots of a quadratic equation.
+        The squared distance is quadratic along the line, so these points are roots of quadratic equations.
         """
         found: list[RouteCrossing] = []
         symbols = np.array(self.atoms.get_chemical_symbols())
@@ -119,7 +119,7 @@ class Event:
 
 @dataclass(frozen=True)
 class EnvironmentWalks:
-    """Jumps found when atoms were moved through many-atom environments."""
+    """Energy and force jumps found by moving atoms through many-atom environments."""
 
     events: tuple[Event, ...]  # places at which something jumps
     measured: int  # crossings of known thresholds that were measured
@@ -127,7 +127,7 @@ class EnvironmentWalks:
 
     @property
     def unexplained(self) -> list[Event]:
-        """Significant jumps that are not explained by any pair threshold."""
+        """Jumps that exceed noise and that no pair threshold explains."""
         return [one for one in self.events if one.threshold is None and one.jump.order < SMOOTH]
 
     @property
@@ -143,7 +143,7 @@ def walk_surroundings(
     crossings: int = _CROSSINGS,
     routes: int = _ROUTES,
 ) -> EnvironmentWalks:
-    """Move atoms and triples of atoms through the known pair thresholds, and search for unknown thresholds.
+    """Move atoms and triples of atoms through known pair thresholds, and search for unknown thresholds.
 
     Args:
         crossings: number of crossings of known thresholds that are measured in the structure.
@@ -190,7 +190,7 @@ def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
 
 
 def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
-    """Return a cluster of the groups nearest to the first group, in their original order, in a pair's box."""
+    """Return a cluster of the groups of atoms nearest to the first group, in the box of a pair."""
     center = _lead(atoms, groups[0])
     offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
@@ -210,7 +210,7 @@ def _lead(atoms: Atoms, group: np.ndarray) -> int:
 def _targeted(
     atoms: Atoms, thresholds: Sequence[PairThreshold], groups: Sequence[np.ndarray]
 ) -> list[tuple[Route, RouteCrossing]]:
-    """Return, for each threshold, a few routes on which a nearby pair of atoms crosses the threshold."""
+    """Return a few routes for each threshold; on each, a nearby pair of atoms crosses the threshold."""
     of_lead = {_lead(atoms, group): group for group in groups}
     symbols = np.array(atoms.get_chemical_symbols())
     ranked: list[tuple[int, Route, RouteCrossing]] = []
@@ -263,7 +263,7 @@ def _event(
 def _scanned(
     subject: CalculatorSubject, thresholds: Sequence[PairThreshold], route: Route, low: float, high: float
 ) -> list[Event]:
-    """Search a route for unknown thresholds."""
+    """Search a route for thresholds that are not known from pairs."""
     curve = route.curve(subject)
     crossings = route.crossings(thresholds, low - 1.0, high + 1.0)
     inside = sum(low <= one.at <= high for one in crossings)
@@ -313,7 +313,7 @@ def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tupl
 
 
 def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
-    """Return whether a jump is no larger than a few rounding steps of the energies and forces."""
+    """Return whether a jump is within rounding, for energies and forces with few decimals."""
     if not any(quantum):
         return False
     small = abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]
@@ -382,8 +382,8 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
     """Return a central atom at the origin with `count` neighbors at different distances, and these distances.
 
     The neighbors fill the shell evenly (golden spiral in angle, equal volumes in distance); random positions
-    would put some neighbors too close together. The central atom comes first, then the neighbors in order of
-    distance.
+    would put some neighbors too close together. The central atom is the first atom, followed by the neighbors
+    in order of distance.
     """
     k = np.arange(count)
     share = (k + 0.5) / count
@@ -399,7 +399,7 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
 
 
 def gap(atoms: Atoms) -> Float[np.ndarray, "3"]:
-    """Return the direction from the central atom that has the largest angle to the nearest neighbor."""
+    """Return the direction from the central atom that is farthest, in angle, from all neighbors."""
     tried = np.random.default_rng(1).normal(size=(2000, 3))
     tried /= np.linalg.norm(tried, axis=1)[:, None]
     offsets = atoms.positions[1:] - atoms.positions[0]
@@ -468,7 +468,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
 
 
 def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int) -> CrowdOrder:
-    """Find the number of neighbors above which the order of atoms has an effect, and the effect's size."""
+    """Find the number of neighbors above which the order of atoms matters, and the size of the effect."""
     low, high, changed = 1, None, (0.0, 0.0)
     larger = iter([*(count for count in (4, 16, 64) if count < most), most])
     while count := next(larger, None) if high is None else (low + high) // 2 * (high - low > 1):
@@ -491,7 +491,7 @@ def _permuted(
 ) -> tuple[float, float] | None:
     """Return the changes of energy and force when atoms are reordered; None if rounding explains them.
 
-    If `aside`, the last neighbor is first moved beyond the cutoff from all other atoms.
+    If `aside`, the last neighbor is moved out of the range of all other atoms.
     """
     atoms, _ = cluster(walk.pair, radius, count)
     if aside:

@@ -1,7 +1,7 @@
 """Locate the distance thresholds of a calculator's pair interactions, using only energies and forces.
 
-The two atoms of each pair are moved from a large distance to an energy of 1000 kT. Thresholds that appear
-only among many atoms (cutoffs of angles, limits on neighbors) are searched in surroundings.py.
+Two atoms are moved from a large distance to the distance at which their energy is 1000 kT. Thresholds that
+appear only among many atoms (cutoffs of angles, limits on neighbors) are found by surroundings.py.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Beyond:
 
 @dataclass(frozen=True)
 class PairWalk:
-    """Result of moving two particles from far apart to close contact."""
+    """Result of moving two particles from a large distance to close contact."""
 
     pair: Pair
     thresholds: tuple[PairThreshold, ...]  # by distance
@@ -110,7 +110,7 @@ class PairWalk:
 
 @dataclass(frozen=True)
 class PairWalks:
-    """Results of scanning all pairs of species over their distances."""
+    """Results of moving every pair of species from large distances to close contact."""
 
     walks: tuple[PairWalk, ...]  # one for each pair that was walked
     ways: Ways  # all pairs that there are to walk, and what was left out
@@ -120,14 +120,14 @@ class PairWalks:
 
 
 def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
-    """Return all distance thresholds of the calculator's pair interactions, computed once per subject."""
+    """Return all distance thresholds of the calculator's pair interactions; they are computed only once."""
     if "thresholds" not in subject.known:  # a resumed audit knows them without a walk
         subject.known["thresholds"] = [one for walk in walk_pairs(subject).walks for one in walk.thresholds]
     return subject.known["thresholds"]
 
 
 def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWalks:
-    """Scan every pair of species over a range of distances; the result is computed once per subject."""
+    """Scan every pair of species over a range of distances; the scan is made only once."""
     if "walks" not in subject.known:
         with subject.meter.apart(WALKING_CALLS):
             subject.known["walks"] = _walked(subject, progress)
@@ -247,7 +247,7 @@ def _seen(
     rounding: float,
     known: Sequence[float],
 ) -> tuple[float, float, float, float] | None:
-    """Return (from, to, force step detectable at half of the distances, and at all distances).
+    """Return (from, to, force step detectable at half of the distances, force step detectable at all).
 
     Distances close to a known threshold (which would hide another threshold) and distances beyond the end of
     the interaction are not counted.
@@ -264,7 +264,7 @@ def _seen(
 
 
 def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThreshold | None:
-    """Return a threshold whose jump exceeds rounding; the end of an interaction is kept without a jump."""
+    """Return a threshold if its jump exceeds rounding; the end of an interaction is always kept."""
     large = any(abs(jump) > STEPS * size for jump, size in zip(threshold.jumps[:2], quantum, strict=True))
     if threshold.order <= 1 and large:
         return threshold
@@ -272,7 +272,7 @@ def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThresh
 
 
 def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairThreshold]) -> bool:
-    """Return whether the distance of companion atoms crosses another threshold at this pair distance."""
+    """Return whether companion atoms of the pair cross another threshold at this pair distance."""
     others = pair.others(threshold.radius)
     radii = [one.radius for one in thresholds if one is not threshold]
     return len(others) > 0 and any(np.abs(others - radius).min() < 1e-5 for radius in radii)
@@ -284,10 +284,10 @@ def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairTh
 def _end_of(
     coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]
 ) -> tuple[float, float] | None:
-    """Return the last distance with an interaction and the next double; None if the particles never interact.
+    """Return the last distance with a nonzero interaction and the next double; None without interaction.
 
     A smooth switching function may round to zero at some distances before its end, so the search continues
-    outward from any interaction found at a larger distance.
+    outward from any nonzero interaction found at a larger distance.
     """
     last = next((k for k in range(len(coarse) - 2, -1, -1) if alive(float(coarse[k]))), None)
     if last is None:
@@ -307,7 +307,7 @@ def _end_of(
 def _with_end(
     pair: Pair, curve: Curve, edge: tuple[float, float], found: list[PairThreshold], near: float
 ) -> list[PairThreshold]:
-    """Return the thresholds, including the measured end of the interaction."""
+    """Return the thresholds of a pair, including the measured end of the interaction."""
     inner = [one.radius for one in found if one.radius < edge[0] - 1e-3]
     room = min(edge[0] - max([near, *inner]), 0.5)
     jump = measure(curve, *edge, room, exact=True)
@@ -340,11 +340,11 @@ def _with_end(
 
 
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
-    """Extrapolate the distance at which an interaction ends; the force falls to zero there with this power.
+    """Extrapolate the distance at which an interaction ends, from a power law of the force.
 
-    If the last distance with a nonzero force is within the error of the extrapolation, it is returned
-    instead: the power law holds only in the limit, while this distance is exact unless the force was lost in
-    rounding.
+    If the last distance with a nonzero force is within the error of the extrapolation, that distance is
+    returned instead: the power law holds only in the limit, while the distance is exact unless the force was
+    lost in rounding.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])
     far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
@@ -364,7 +364,7 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
 def _beyond(
     subject: CalculatorSubject, pair: Pair, start: float, noise: Float[np.ndarray, "2"], calls: float
 ) -> Beyond | None:
-    """Search larger distances as long as a cutoff there could still remove a relevant energy.
+    """Search beyond the scan for a cutoff, as long as one could still remove a relevant energy.
 
     None is returned if no distance could be evaluated: in a periodic cell, where images of the particles come
     too near, or if the calculator fails.
@@ -424,7 +424,7 @@ def _at(low: float, high: float) -> Float[np.ndarray, "nodes"]:
 def _rough(
     curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 ) -> Iterator[tuple[float, float]]:
-    """Yield narrow intervals where the force is not smooth or the energy change is not minus its work."""
+    """Yield narrow intervals where the force is not smooth or does not agree with the energy change."""
     if high <= low or _smooth(curve, low, high, noise):
         return
     if high - low < _NARROW:

@@ -1,4 +1,4 @@
-"""Registry of all calculator checks: those in the modules of this package, and those of other packages."""
+"""Registry of all calculator checks, from the modules of this package and from plugins."""
 
 from __future__ import annotations
 

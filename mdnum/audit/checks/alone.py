@@ -36,7 +36,7 @@ class AloneCheck(AuditCheck):
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Evaluate single atoms, and an atom far away from a cluster."""
+        """Evaluate energy and force of single atoms, and of an atom far away from a cluster."""
         with subject.meter.limited():
             self.look(subject, *settled(subject.fresh(), np.random.default_rng(self.seed)))
         found = list(self.findings())
@@ -143,7 +143,7 @@ def _boxed(part: Atoms) -> Atoms:
 
 
 def _apart(part: Atoms, other: Atoms) -> Atoms:
-    """Return a structure of two fragments that are farther apart than the cutoff."""
+    """Return a structure of two fragments whose separation is larger than the cutoff."""
     there = other.copy()
     there.positions += [part.positions[:, 0].max() + _FAR - there.positions[:, 0].min(), 2.0, 3.0]
     return part + there

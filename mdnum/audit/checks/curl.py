@@ -36,12 +36,12 @@ class Loop:
 
     @property
     def conservative(self) -> bool:
-        """True if the curl of the forces is zero within its error."""
+        """True if the curl of the forces is zero within the error of the curl."""
         return abs(self.curl) <= _SIGNIFICANT * self.error
 
     @property
     def share(self) -> float:
-        """Antisymmetric part of the derivative of the forces, divided by the symmetric part."""
+        """Antisymmetric part of the derivative matrix of the forces, divided by the symmetric part."""
         return abs(self.curl) / self.stiffness if self.stiffness else (float("inf") if self.curl else 0.0)
 
 
@@ -98,7 +98,7 @@ class CurlCheck(AuditCheck):
 
 
 def agreed(tried: Sequence[Loop]) -> Loop:
-    """Return the loop with the smallest error; the error is larger if loops of other radii disagree.
+    """Return the loop with the smallest error, which is increased if loops with other radii disagree.
 
     The curl is the same for every small circle, while the work due to a jump of the forces depends on the
     radius.
@@ -112,7 +112,7 @@ def agreed(tried: Sequence[Loop]) -> Loop:
 def _planes(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator
 ) -> Iterator[tuple[str, Displacement, Displacement]]:
-    """Yield planes of two orthonormal displacements of all atoms, of one atom, or of two that interact."""
+    """Yield planes of two orthonormal displacements: of all atoms, of one atom, or of a pair of atoms."""
     count = len(atoms)
     if count > 1:
         for number in range(3):

@@ -1,6 +1,6 @@
 """Check the energy drift of a short run at constant energy, and find the causes of the drift.
 
-Runs use ASE's velocity Verlet algorithm; molecules of rigid models keep their shape.
+Runs use the velocity Verlet algorithm of ASE; molecules of rigid models keep their shape.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ _SOURCES = ("integrator", "flips", "elsewhere", "rest")
 class DynamicsCheck(AuditCheck):
     """Is the energy conserved in a short run at constant energy, and if not, why?
 
-    The check reports the energy drift with a block error, and the contributions of the integrator, the flips
-    and the rest. The drift that remains after subtracting flips and the work of the forces is due to the
-    integrator. It must fall to a quarter when the time step is halved; a second run tests this.
+    The check reports the energy drift with a block error, and the drift due to the integrator, to flips and
+    to other causes. The drift that remains after subtracting flips and the work of the forces is due to the
+    integrator. This drift must fall to a quarter when the time step is halved; a second run tests this.
     """
 
     name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
@@ -113,7 +113,7 @@ class DynamicsCheck(AuditCheck):
 
 
 def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor) -> tuple[float, float]:
-    """Return the largest difference between energies of the run and of new objects, and its limit, in eV."""
+    """Return the largest energy difference between the run and new calculator objects, and its limit, eV."""
     places = np.unique(np.linspace(0, len(ran.potential) - 1, count).astype(int))
     again = [subject.fresh().energy(ran.at(ran.positions[n])) for n in places]
     rounding = NoiseFloor(np.finfo(float).eps * largest(ran.potential), 0.0)
@@ -158,7 +158,7 @@ class TwoRuns:
     period: float  # of the fastest vibration, internal time
 
     def shares(self) -> dict[str, Drift]:
-        """Energy drift: total, by flips, by the rest, and by the integrator (two methods), meV/atom/ps."""
+        """Energy drift: total, due to flips, due to the integrator (two methods), the rest; meV/atom/ps."""
         one, other = self.whole, self.half
         rest, elsewhere = self.balance.filled, self.balance.elsewhere
         flips = wandering(one.time, self.balance.jumps)
@@ -187,7 +187,7 @@ class TwoRuns:
         return {name: share.times(factor) for name, share in found.items()}
 
     def outcome(self, unknown: str) -> CheckResult:
-        """Return the result of the check; `unknown` is the reason if no thresholds are known."""
+        """Return the result of the check; `unknown` gives the reason if no thresholds are known."""
         shares = self.shares()
         numbers = self._numbers(shares)
         crossed, measured = len(self.balance.crossed), len(self.balance.measured)
@@ -360,7 +360,7 @@ class TwoRuns:
 
 
 class _Bridge(Calculator):
-    """An ASE calculator around the audited calculator that saves structures on which the latter fails."""
+    """An ASE calculator that wraps the audited calculator, and saves structures on which that one fails."""
 
     implemented_properties = ["energy", "forces"]  # noqa: RUF012
 
@@ -381,7 +381,7 @@ def prepared(
     period: float,
     rng: np.random.Generator,
 ) -> Atoms:
-    """Return a structure with thermal velocities; `period` is that of its fastest mode, internal time."""
+    """Return a structure with thermal velocities; `period` is the period of the fastest vibration."""
     from ase import units
 
     # atoms at rest in their places take half of the kinetic energy into vibrations
@@ -400,7 +400,7 @@ def prepared(
 def fitting_timestep(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, iterations: int = _POWER_ITERATIONS
 ) -> tuple[float, float]:
-    """Estimate a time step and the period of the fastest vibration (inf if none), in internal time."""
+    """Estimate a time step and the period of the fastest vibration (inf for none), in internal time."""
     roots = np.sqrt(atoms.get_masses())[:, None]
     mode = direction(len(atoms), rng)
     mode /= np.linalg.norm(mode)
@@ -462,7 +462,7 @@ def run(
 
 @dataclass
 class RigidGroups:
-    """ASE constraint that fixes all distances within each of several groups of equally many atoms.
+    """ASE constraint that fixes all interatomic distances within groups of equal size, such as molecules.
 
     The class FixBondLengths of ASE treats one bond at a time in Python; this class treats one bond of every
     group at once, which is a hundred times faster for water.
@@ -518,10 +518,10 @@ class RigidGroups:
                 return
 
     def adjust_forces(self, atoms: Atoms, forces: Float[np.ndarray, "atoms 3"]) -> None:
-        """Leave the forces unchanged; in a run, the momenta are adjusted instead."""
+        """Leave the forces unchanged, since constrained runs adjust the momenta instead."""
 
     def todict(self) -> dict[str, Any]:
-        """Return the constraint as a dictionary, in the form of the constraints of ASE."""
+        """Return the constraint as a dictionary in ASE's format for constraints."""
         return {"name": "RigidGroups", "kwargs": {}}
 
 

@@ -67,7 +67,7 @@ class Slope:
 
     @property
     def gap(self) -> float:
-        """Absolute deviation between finite difference and force, eV/Å."""
+        """Absolute difference between the finite difference and the force, eV/Å."""
         return abs(self.difference - self.force)
 
     @property
@@ -80,7 +80,7 @@ class ForcesCheck(AuditCheck):
     """Are the forces minus the gradient of the energy, and of which energy?
 
     The error of a finite difference is |D(h) - D(h/4)| after extrapolation, plus the measured noise divided
-    by the step; of nine steps h, the step with the smallest error is used. A deviation from the force that
+    by the step; of nine steps h, the step with the smallest error is used. A difference from the force that
     grows like 1/h is reported as a jump of the energy, not as a wrong force.
     """
 
@@ -88,7 +88,7 @@ class ForcesCheck(AuditCheck):
     needed_to = ("run", "differentiate")
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compare forces with extrapolated central differences, and compute force sums that must be zero."""
+        """Compare forces with central differences of the energy; test whether net force and torque vanish."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
         ways = Ways()
@@ -257,11 +257,11 @@ def slope(
 def _best(
     gaps: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
 ) -> tuple[int, float]:
-    """Return the index and error of the most accurate finite-difference step, if other steps agree with it.
+    """Return index and error of the most accurate finite-difference step, if other steps agree with it.
 
     If the energy jumps at flips, two finite-difference steps may include the same jumps by chance, and agree
-    on a wrong slope. A wrong force, in contrast, gives the same deviation at every step that resolves it, in
-    particular at the shorter steps.
+    on a wrong slope. A wrong force, in contrast, causes the same difference at every sufficiently accurate
+    step, in particular at short steps.
 
     Args:
         gaps: finite difference minus force for each step, from the longest step to the shortest.
@@ -281,7 +281,7 @@ def _best(
 
 
 def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dict[str, Any]]:
-    """Net force, and net torque of a nonperiodic structure; both must be zero by symmetry of space."""
+    """Net force, and net torque of a nonperiodic structure; both are zero for a correct calculator."""
     size = float(np.sum(np.abs(forces)))
     allowed = noise.allowed.force * np.sqrt(len(atoms)) + 40 * np.finfo(float).eps * size
     net = float(np.linalg.norm(forces.sum(axis=0)))
@@ -296,7 +296,7 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
 def _drowned(
     worker: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, known: float, scale: float
 ) -> list[Observed]:
-    """Return a finding if noise that is larger than rounding hides the forces or the energy differences."""
+    """Return a finding if noise larger than rounding errors hides the forces or the energy differences."""
     stairs = steps(worker, atoms)  # which are another finding
     size = max(noise.force, 0.0 if stairs.energy else known)
     if size <= max(_DROWNED * scale, stairs.force):
@@ -342,7 +342,7 @@ def _row(one: Slope) -> dict[str, Any]:
 
 
 def _chart(slopes: list[Slope]) -> Chart:
-    """Chart of force deviation against step length: a valley if forces are correct, a plateau if not."""
+    """Chart of force error against finite-difference step: a valley for correct forces, else a plateau."""
     shown = slopes[:_DIRECTIONS]
     shown += [one for one in [_worst(slopes)] if one not in shown]
     lines = {one.direction: one.gaps[::-1].tolist() for one in shown}
@@ -357,7 +357,7 @@ def _chart(slopes: list[Slope]) -> Chart:
 def _two_energies(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, line: Displacement, along: Slope
 ) -> Iterator[Observed]:
-    """Yield a finding if `energy` and `free_energy` differ by more than a constant.
+    """Yield a finding if the energies `energy` and `free_energy` differ by more than a constant.
 
     By ASE's definition, the forces are minus the gradient of `free_energy`, which all other checks examine.
     If the two energies differ by at most a constant, the findings hold for both energies.

@@ -42,7 +42,7 @@ _SEPARATE = {
 
 @dataclass(frozen=True)
 class Same:
-    """Another representation of the same structure."""
+    """Another representation of a structure, for example with other periodic images of its atoms."""
 
     what: str  # how it differs
     code: str  # of the finding when the calculator gives it another answer
@@ -56,7 +56,7 @@ class Same:
 
 
 def _same(code: str, base: Atoms, what: str, there: Atoms, factor: float = 1.0, **more) -> Same:
-    """Return a representation of the structure in which the atoms keep their order."""
+    """Return a representation of a structure in which the atoms keep their order."""
     return Same(what, code, there, np.arange(len(there)), **{"rounding": factor * ulp(there, base), **more})
 
 
@@ -97,7 +97,7 @@ class InvarianceCheck(AuditCheck):
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Evaluate many representations of one structure."""
+        """Evaluate energy and forces for many representations of one structure."""
         rng = np.random.default_rng(self.seed)
         judge = _Judge(subject, rng)
         same = _in_turns(self.ways(judge.atoms, subject.atoms, rng))
@@ -141,7 +141,7 @@ class InvarianceCheck(AuditCheck):
         )
 
     def ways(self, atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-        """Yield other representations of a structure; arguments as for `all_of`."""
+        """Yield other representations of a structure, for example translated or with reordered atoms."""
         return all_of(atoms, given, rng)
 
     def _findings(
@@ -184,7 +184,7 @@ class InvarianceCheck(AuditCheck):
     def _without_topology(
         self, wrong: dict[str, list[_Difference]], judge: _Judge
     ) -> dict[str, list[_Difference]]:
-        """Return the differences not caused by a calculator that derives molecules from the atom order."""
+        """Return the differences that remain if the calculator derives molecules from the atom order."""
         rng = np.random.default_rng(self.seed + 1)
         grouped = by_molecule(judge.atoms, rng)
         try:
@@ -209,7 +209,7 @@ class InvarianceCheck(AuditCheck):
 
 
 class _Judge:
-    """Compares representations of a structure; allowed differences are measured once per size of rounding."""
+    """Compares representations of a structure with limits measured once for each size of rounding error."""
 
     def __init__(self, subject: CalculatorSubject, rng: np.random.Generator):
         self.subject, self.worker, self._rng = subject, subject.fresh(), rng
@@ -273,7 +273,7 @@ class _Judge:
 
 
 def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]:
-    """Yield findings about unsupported basic representations, and about results that are not finite."""
+    """Yield findings about basic representations that are not supported, and about nonfinite results."""
     empty = [one for one in refused if one[1].cause is None]
     raised = [one for one in refused if one[1].cause is not None and one[0].code in _MUST_ANSWER]
     for code, cases in (("NOT_FINITE", empty), ("FAILS", raised)):
@@ -286,7 +286,7 @@ def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]
 
 
 def _in_turns(ways: Iterable[Same]) -> list[Same]:
-    """Order representations so that the first of each kind come first, then the second of each kind."""
+    """Order representations so that the first of each kind comes first, then the second of each kind."""
     seen: dict[str, int] = {}
     turns = []
     for same in ways:
@@ -299,7 +299,7 @@ def _in_turns(ways: Iterable[Same]) -> list[Same]:
 
 
 def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield all representations of a structure that can be made from it.
+    """Yield all representations of a structure that are possible.
 
     Args:
         atoms: a structure in which no distance is exactly at a threshold.
@@ -350,7 +350,7 @@ def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield structures with one atom on a cell face, just outside the cell, and on the opposite face."""
+    """Yield structures with one atom on a cell face, just outside the cell, or on the opposite face."""
     if not atoms.pbc.any():
         return
     axes, cell = np.flatnonzero(atoms.pbc), atoms.cell.array
@@ -390,7 +390,7 @@ def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | None:
-    """Return structures with molecules reordered, and in other images; None if there are no molecules."""
+    """Return structures with molecules reordered and in other periodic images; None without molecules."""
     size = group(atoms)
     if size is None:
         return None
@@ -405,7 +405,7 @@ def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | N
 
 
 def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
-    """Yield structures whose cell is one rounding unit larger or smaller, with unchanged atom positions."""
+    """Yield structures whose cell is one rounding unit larger or smaller, with unchanged positions."""
     if not atoms.pbc.any():
         return
     for what, base in (("", atoms), (", of the structure as it was given", given)):
@@ -433,11 +433,11 @@ def repeated(atoms: Atoms) -> Iterator[Same]:
 
 
 def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield the supercell of a dense four-atom cell, to compare it with the cell itself.
+    """Yield a supercell of a dense four-atom cell, for comparison with the four-atom cell.
 
-    In a structure at least two cutoffs wide, no atom interacts with two images of another atom. Only
-    structures of one species, or of two in equal numbers as in a salt, are tested; with more species the
-    result would be ambiguous.
+    In larger cells (at least two cutoffs wide), no atom interacts with two images of another atom. The
+    four-atom cell has one species, or two in equal numbers as in a salt; structures with more species are not
+    tested, since the result would be ambiguous.
     """
     species = list(dict.fromkeys(atoms.symbols))
     nearest = nearest_distance(atoms)
@@ -454,7 +454,7 @@ def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def skewed(atoms: Atoms) -> Iterator[Same]:
-    """Yield the same lattice with other lattice vectors, also with left-handed sets of vectors."""
+    """Yield the same crystal lattice described by other lattice vectors, some of them left-handed."""
     if not atoms.pbc.all():
         return
     for what, matrix in (
@@ -470,7 +470,7 @@ def skewed(atoms: Atoms) -> Iterator[Same]:
 
 
 def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield the structure and its cell mirrored, rotated by arbitrary angles, and with exchanged axes."""
+    """Yield the structure and its cell mirrored, rotated by arbitrary angles, or with permuted axes."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     anyhow = q * np.sign(np.diag(r))
     anyhow *= np.sign(np.linalg.det(anyhow))
@@ -489,7 +489,7 @@ def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def without_periods(atoms: Atoms) -> Iterator[Same]:
-    """Yield a cluster in different nonperiodic cells, which must not change energy and forces."""
+    """Yield a cluster in several nonperiodic cells; the choice of cell must not change energy and forces."""
     base = modified(atoms, cell=np.zeros((3, 3)), pbc=False)
     span = np.ptp(base.positions, axis=0).max() + 30.0
     for what, cell in (
@@ -508,7 +508,7 @@ def _wrapped(atoms: Atoms) -> Atoms:
 
 
 def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
-    """Return a unit vector along the nonperiodic axes, perpendicular to the periodic axes."""
+    """Return a unit vector that is perpendicular to all periodic axes."""
     if free.all():
         return np.array([1.0, -0.7, 0.4]) / np.linalg.norm([1.0, -0.7, 0.4])
     if not atoms.cell.array[~free].any():
@@ -519,6 +519,6 @@ def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
 
 
 def ulp(*structures: Atoms) -> float:
-    """Return the unit in the last place of the largest coordinate or cell entry of some structures, Å."""
+    """Return the unit in the last place (ulp) of the largest coordinate or cell entry of structures, Å."""
     parts = (part for one in structures for part in (one.positions, one.cell.array))
     return float(np.spacing(max(map(largest, parts))))

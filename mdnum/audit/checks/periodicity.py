@@ -1,4 +1,4 @@
-"""Check structures with periodic and nonperiodic axes: atoms must have images along periodic axes only."""
+"""Check slabs and wires: atoms must interact with periodic images along periodic axes only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SHORT = 1.3  # of the nearest distance: length of a free vector with which atom
 class PeriodicityCheck(InvarianceCheck):
     """Do atoms interact with their images along periodic axes, and only along periodic axes?
 
-    Tests a slab and a wire of the structure, with long, short, zero and skewed nonperiodic cell vectors.
+    The test structures are a slab and a wire, with long, short, zero and skewed nonperiodic cell vectors.
     """
 
     name, title, order, calls = "periodicity", "Mixed periodicity", 45, 250
@@ -69,7 +69,7 @@ def mixed(atoms: Atoms, periodic: np.ndarray, rng: np.random.Generator) -> Itera
 
 
 def _with(atoms: Atoms, periodic: np.ndarray, free: np.ndarray) -> Atoms:
-    """Return the structure with other cell vectors along its nonperiodic axes, in a right-handed cell."""
+    """Return the structure with other cell vectors along nonperiodic axes, in a right-handed cell."""
     cell = atoms.cell.array.copy()
     cell[~periodic] = free
     if np.linalg.det(cell) < 0:

@@ -1,4 +1,4 @@
-"""Check the smoothness of the energy at every threshold, for pairs, triples and many-atom environments."""
+"""Check the smoothness of the energy at distance thresholds, for pairs, triples and larger environments."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class SmoothnessCheck(AuditCheck):
     neighbors, routes = 160, 2
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Move pairs and triples of atoms through thresholds, and surround atoms with many neighbors."""
+        """Move pairs and triples of atoms through distance thresholds, and give atoms many neighbors."""
         walks = walk_pairs(subject, progress)
         if not walks.walks and subject.meter.deadline.passed:
             raise TimeUp
@@ -87,7 +87,7 @@ _energy, _length = partial(Measured, unit="energy"), partial(Measured, unit="len
 
 
 def place(threshold: PairThreshold) -> Measured:
-    """Return the distance of a threshold with its error, as text."""
+    """Return the distance of a threshold and the error of this distance, as text."""
     return _length(threshold.radius, floor=threshold.located)
 
 
@@ -99,7 +99,7 @@ def _two(threshold: PairThreshold) -> str:
 def figures(
     walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
 ) -> tuple[tuple[list[str], dict[str, Any]], dict[str, Any]]:
-    """Return sentences about thresholds, the values in these sentences, and the numbers of the summary."""
+    """Return sentences about thresholds, the values in these sentences, and the numbers in the summary."""
     # (lowest derivative that jumps, jump of the energy, of the force) wherever something does
     seen = [(one.order, *one.jumps[:2]) for one in _all(walks)]
     seen += [(one.jump.order, one.jump.energy, one.force) for one in around.events]
@@ -157,7 +157,7 @@ def _rounded_up(value: float) -> float:
 
 
 def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield findings about pair thresholds, grouped by the lowest derivative that jumps."""
+    """Yield findings about pair thresholds, grouped by the lowest derivative of the energy that jumps."""
     for order, code in enumerate(("ENERGY_JUMP", "FORCE_JUMP", "CURVATURE_JUMP")):
         same = [one for one in _all(walks) if one.order == order]
         if not same:
@@ -186,7 +186,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
 
 
 def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield a finding if a lower derivative jumps at a pair threshold among many atoms than for two atoms."""
+    """Yield a finding if, at a pair threshold, a lower derivative jumps among many atoms than for a pair."""
     if not around.lower:
         return
     worst = min(
@@ -208,7 +208,7 @@ def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
 
 
 def _logged(subject: CalculatorSubject, walks: PairWalks) -> Iterator[Observed]:
-    """Yield a finding if `energy`, which a run logs, jumps at a threshold where `free_energy` does not."""
+    """Yield a finding if `energy`, which a run logs, jumps at a threshold and `free_energy` does not."""
     jumps: list[tuple[float, float, str, str]] = []
     for walk in walks.walks:
         for one in walk.thresholds:
@@ -285,7 +285,7 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
 
 
 def _steepness(walk: PairWalk) -> tuple[float, float] | None:
-    """Return the largest |curvature| beyond the minimum / that at the minimum, and its distance; or None."""
+    """Return the largest curvature beyond the energy minimum, relative to the minimum, and its distance."""
     curvature = -np.gradient(walk.force, walk.distance)
     bottom = int(np.argmin(walk.energy))
     if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:
@@ -302,7 +302,7 @@ def _steepness(walk: PairWalk) -> tuple[float, float] | None:
 
 
 def _first_to_jump(event: Event) -> str:
-    """Return the name of the lowest derivative that jumps at an event."""
+    """Return the name of the lowest derivative of the energy that jumps at an event."""
     order = event.jump.order
     return ORDERS[max(order, event.threshold.order) if order == SMOOTH and event.threshold else order]
 
@@ -371,7 +371,7 @@ def _charts(walks: PairWalks, subject: CalculatorSubject) -> list[Chart]:
 
 
 def _energies(walk: PairWalk, kT: float) -> Chart:
-    """Chart of the pair energy, limited to values at which jumps at thresholds are visible."""
+    """Chart of the pair energy, in an energy range in which the jumps at thresholds are visible."""
     depth = max(-float(walk.energy.min()), 2 * kT)
     shown = walk.energy < 2 * depth
     first = len(shown) - int(np.argmin(shown[::-1])) if not shown.all() else 0
@@ -385,7 +385,7 @@ def _energies(walk: PairWalk, kT: float) -> Chart:
 
 
 def _close_up(walk: PairWalk, threshold: PairThreshold, subject: CalculatorSubject) -> Chart:
-    """Chart of energy or force at the floating-point distances on both sides of a jump."""
+    """Chart of energy or force at adjacent floating-point distances on both sides of a jump."""
     below, above = [threshold.inside], [threshold.outside]
     for _ in range(_ULPS - 1):
         below.append(float(np.nextafter(below[-1], -np.inf)))

@@ -29,15 +29,15 @@ _EPS = np.finfo(float).eps
 class StateCheck(AuditCheck):
     """Do energy and forces depend on the structures that the calculator object evaluated before?
 
-    The check repeats calls, and compares a used calculator object with new objects while structures grow,
-    shrink, move and are strained.
+    The check repeats calls, and compares a used calculator object with new objects for sequences of growing,
+    shrinking, moving and strained structures.
     """
 
     name, title, order, basic, calls = "state", "Memory", 60, True, 500
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compare one calculator object that is used repeatedly with new objects."""
+        """Compare one calculator object that evaluates all structures with a new object for each."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
             atoms, noise = settled(subject.fresh(), rng, brief=self.brief)
@@ -106,7 +106,7 @@ class StateCheck(AuditCheck):
         )
 
     def _brief(self, subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> CheckResult:
-        """Run only the test that repeats identical calls."""
+        """Run only the test that evaluates one structure repeatedly."""
         repeats = _repeated(subject, atoms, brief=True)
         return CheckResult(
             says=([_how(repeats)], {}),
@@ -154,7 +154,7 @@ class Comparison:
 
     @property
     def refused(self) -> CalculatorError | None:
-        """Error of the new calculator object, or else of the used object; None if both succeeded."""
+        """Error of the new calculator object, or else of the used object; None if there was no error."""
         return next((one for one in (self.new, self.old) if isinstance(one, CalculatorError)), None)
 
     @property
@@ -170,7 +170,7 @@ class Comparison:
 
 
 def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
-    """Return sequences in which two atoms approach each other at the cutoff, and the skipped sequences."""
+    """Return sequences in which two atoms approach each other at the cutoff, and sequences to skip."""
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)
@@ -224,7 +224,7 @@ def _through(
 def _again(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, worst: Comparison
 ) -> bool:
-    """Return whether another calculator object reproduces the largest difference in the same sequence."""
+    """Return whether the largest difference in a sequence is reproduced by another calculator object."""
     end = next(k for k, one in enumerate(sequence) if (one.what, one.atoms) == (worst.what, worst.atoms))
     way = [step._replace(compared=place == end) for place, step in enumerate(sequence[: end + 1])]
     (again,) = _through(subject, way, noise, worst.sequence)
@@ -296,8 +296,8 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
     """Return the longest move of an atom or cell edge, Å, that leaves energy and forces unchanged; or 0.
 
-    Only moves that should change several of the last digits count; the expected change is proportional to the
-    length of the move.
+    A move counts only if it should change several of the last digits of the results; the expected change is
+    proportional to the length of the move.
     """
     # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate
     line = np.zeros((len(atoms), 3))
@@ -311,7 +311,7 @@ def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _kept_within(subject: CalculatorSubject, sizes: np.ndarray, at: Callable[[float], Atoms]) -> float:
-    """Return the longest of several successive moves after which one object still returns its last result."""
+    """Return the longest of successive moves after which a calculator object repeats its last result."""
     used = subject.fresh()
     used.forgets = False
     places = np.array([0.0, *np.cumsum(sizes)])
