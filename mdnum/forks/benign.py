@@ -1,16 +1,16 @@
-"""Test whether a fork is benign: whether two programs whose runs diverge still give the same averages.
+"""Test whether a fork is benign: whether two programs with diverging runs give the same averages.
 
-Runs of B are compared with an ensemble of runs of A at a step that is found by calibration. At early steps
-the runs differ by less than rounding errors can cause; at late steps, runs of a changed program have the same
-scatter, because every run has forgotten its start. The interval between depends on the system. Therefore
-programs with deliberate changes are run too; the step of the comparison is one at which these changes are
-distinguishable from rounding.
+Runs of program B are compared with an ensemble of runs of program A, at a step that is found by calibration.
+At early steps, runs differ by less than rounding errors can cause; at late steps, a changed program has the
+same scatter, because every run has forgotten its start. The suitable steps depend on the system. Therefore
+programs with deliberate changes are run too; at the chosen step, all deliberate changes are distinguishable
+from rounding.
 
 The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
 Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
-run is an outlier if at least two of its principal components exceed the limit; a program fails if two of its
-three runs are outliers. In other words, the median over its three runs of the second-largest component
-exceeds the limit.
+run is an outlier if at least two of its principal components exceed the limit; a program fails the test if
+two of its three runs are outliers. Equivalently, the median over the three runs of the second-largest
+component exceeds the limit.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _SEED = 1_000_003
 
 @dataclass(frozen=True)
 class Space:
-    """The principal components of the features of an ensemble of runs."""
+    """Principal components of the features (measured quantities) of an ensemble of runs."""
 
     # mean, spread: of each feature over the ensemble; infinite spread leaves a feature out
     mean: Float[np.ndarray, "features"]
@@ -85,7 +85,7 @@ class Space:
 
     @classmethod
     def of(cls, features: Float[np.ndarray, "runs features"]) -> Space:
-        """Compute 2 to 10 components that explain the variance, but no more than a third of the run count."""
+        """Compute 2 to 10 principal components that explain the variance, but at most a third of the runs."""
         mean, spread = features.mean(axis=0), features.std(axis=0, ddof=1)
         # nothing can be said of a feature that is constant, such as a distance that no pair has
         spread = np.where(spread > _ROUNDING * np.abs(mean), spread, np.inf)
@@ -108,19 +108,19 @@ class Space:
         return self.standardized(features) @ self.axes.T / self.sigma
 
     def second(self, features: Float[np.ndarray, "runs features"]) -> Float[np.ndarray, "runs"]:
-        """Return the second-largest component of each run; above the limit, the run is an outlier.
+        """Return the second-largest principal component of each run; above the limit, the run is an outlier.
 
-        A run that blew up has the value infinity and is always an outlier.
+        For a run that blew up, the result is infinity, so the run is always an outlier.
         """
         scores = np.abs(self.scores(features))
         return np.sort(np.where(np.isnan(scores), np.inf, scores), axis=1)[:, -2]
 
 
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
-    """Return the number of standard deviations beyond which a component counts as an outlier.
+    """Return the number of standard deviations above which a principal component counts as an outlier.
 
-    The limit is two, or larger if needed for at most a tenth of the ensemble's own runs to be outliers. Each
-    run is judged by components of other runs: it would stand out less in components that it influenced.
+    The limit is two, or more if needed for at most a tenth of the ensemble's own runs to be outliers. Each
+    run is judged by components computed from other runs: with its own influence it would stand out less.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -130,7 +130,7 @@ def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
 
 
 def triples(seconds: Float[np.ndarray, "runs"]) -> Float[np.ndarray, "tries"]:
-    """Return the median of each group of three successive runs, which the test compares with its limit."""
+    """Return the medians of groups of three successive runs, which the test compares with its limit."""
     tries = len(seconds) // RUNS
     return np.median(seconds[: RUNS * tries].reshape(tries, RUNS), axis=1)
 
@@ -141,7 +141,7 @@ def two_of_three(rate: float) -> float:
 
 
 def bounds(count: int, of: int) -> tuple[float, float]:
-    """Compute the exact (Clopper-Pearson) 95 % confidence interval for a rate of `count` events in `of`."""
+    """Compute the exact (Clopper-Pearson) 95 % confidence interval of a rate from `count` of `of` trials."""
     tail = 0.025
     low = betaincinv(count, of - count + 1, tail) if count else 0.0
     high = betaincinv(count + 1, of - count, 1 - tail) if count < of else 1.0
@@ -153,7 +153,7 @@ def bounds(count: int, of: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Planted:
-    """Result of the test for one program with a deliberate change."""
+    """Test result for one program with a deliberate change."""
 
     change: str  # what it is
     must_fail: bool  # whether it is another model; else only other rounding
@@ -164,7 +164,7 @@ class Planted:
 
     @property
     def ok(self) -> bool:
-        """True if a change that must fail always failed, or if any other change failed only by chance."""
+        """True if the test detected a change that it must detect, or rejected another only by chance."""
         if self.must_fail:
             return self.failures == self.tries
         return bounds(self.failures, self.tries)[0] <= ACCEPTED
@@ -172,7 +172,7 @@ class Planted:
 
 @dataclass(frozen=True)
 class Window:
-    """A step at which runs could be compared, with the principal components and the limit at this step."""
+    """A step at which runs can be compared, with the principal components and the limit at this step."""
 
     step: int  # of the comparison
     space: Space  # components of the ensemble
@@ -181,7 +181,7 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest score, in limits, among the deliberate changes that must fail; infinity without any."""
+        """Smallest score (in limits) of the deliberate changes that must be detected; infinity if none."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property
@@ -203,7 +203,7 @@ class Calibration:
 
     @property
     def rate(self) -> float:
-        """Probability of a false positive, estimated from the outliers among runs outside the ensemble."""
+        """Probability of a false positive, estimated from runs of the same program outside the ensemble."""
         return two_of_three(self.alone / self.held_out) if self.held_out else float("nan")
 
     @property
@@ -293,10 +293,10 @@ def calibrate(
 
 
 def choose(windows: Sequence[Window], name: str) -> Window:
-    """Return the latest window in which every deliberate change is detected, or else the best window.
+    """Return the latest step at which every deliberate change is detected, or else the best step.
 
     Raises:
-        InputError: no window distinguishes the deliberate changes from rounding.
+        InputError: at no step are the deliberate changes distinguishable from rounding.
     """
     good = [window for window in windows if window.ok and window.power > 1]
     clear = [window for window in good if window.power >= _CLEAR]
@@ -332,7 +332,7 @@ def _windows(simulation: Simulation, start: Start | None) -> list[int]:
 
 @result
 class Benign:
-    """Whether runs of B are statistically consistent with the ensemble of runs of A."""
+    """Whether runs of program B are statistically consistent with an ensemble of runs of program A."""
 
     passed: bool  # whether they do
     window: int  # step of the comparison
@@ -361,10 +361,10 @@ def benign(
     calibration: Calibration | None = None,
     progress: Progress | None = None,
 ) -> Benign:
-    """Compare three runs of B with an ensemble of runs of A.
+    """Compare three runs of program B with an ensemble of runs of program A.
 
-    B fails if, in two of its three runs, at least two principal components of the features exceed the limit.
-    If B passes, the choice between A and B had no larger effect than the smallest perturbation of a start.
+    B fails if at least two principal components of the features exceed the limit in two of three runs. If B
+    passes, the difference between A and B had no larger effect than the smallest perturbation of a start.
 
     Args:
         twin: the programs. Atom labels and axes of B do not matter, because no feature depends on them.
@@ -390,7 +390,7 @@ def benign(
 
 
 def _check(twin: Twin) -> None:
-    """Raise an error if an ensemble of one program cannot be used to test the other program."""
+    """Raise an error if an ensemble of one program cannot be used to test the other program of a pair."""
     twin.a.check(twin.b)
     keys = [one.simulation.integrator.random for one in (twin.a, twin.b)]
     a, b = (() if key is None else np.asarray(jax.random.key_data(key)) for key in keys)
@@ -403,7 +403,7 @@ def _check(twin: Twin) -> None:
 
 
 def _failing(calibration: Calibration, rows: np.ndarray, scores: np.ndarray) -> dict[str, float]:
-    """Return the features that contribute most to the components beyond the limit, largest first."""
+    """Return the features that contribute most to the principal components beyond the limit."""
     space, limit = calibration.window.space, calibration.window.limit
     z = np.median(space.standardized(rows), axis=0)
     middle = np.median(scores, axis=0)

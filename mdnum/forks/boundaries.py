@@ -1,6 +1,6 @@
-"""Values of a system parameter at which the decisions of a run change, located to adjacent floats.
+"""Find parameter values at which the decisions of a run change, located to adjacent floats.
 
-Between two such boundaries, the result of a run is a smooth function of the parameter. At a boundary, two
+Between two adjacent boundaries, the result of a run is a smooth function of the parameter. At a boundary, two
 adjacent floats lead to different decisions, and every later quantity of the run may jump.
 """
 
@@ -46,7 +46,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Boundary:
-    """Two adjacent parameter values whose runs make different decisions, and the first differing decision."""
+    """Two adjacent floats for which runs make different decisions, and the first differing decision."""
 
     # below, above: the two sides; above.at is the float after below.at
     below: Side
@@ -64,7 +64,7 @@ class Boundary:
 
     @property
     def jump(self) -> float:
-        """Loss just above the boundary minus loss just below it."""
+        """Loss just above the boundary minus loss just below the boundary."""
         return self.above.loss - self.below.loss
 
 
@@ -116,12 +116,12 @@ class BoundaryMap:
 
     @property
     def histories(self) -> int:
-        """Number of different histories (sequences of decisions) found."""
+        """Number of different histories (sequences of decisions) that were found."""
         return len({interval.digest for interval in self.intervals})
 
 
 class NumberLine:
-    """Runs of one system for different values of one parameter; a value is addressed by its float's ordinal.
+    """Runs of a system for different values of a parameter, each identified by the ordinal of the float.
 
     Args:
         program: the program with the system's own value of the parameter.
@@ -173,7 +173,7 @@ class NumberLine:
         return a, b
 
     def boundary(self, below: int, above: int) -> Boundary | None:
-        """Compare the runs at two ordinals whose decisions differ; return None if a run fails earlier."""
+        """Find the first differing decision of the runs at two ordinals; None if a run fails before it."""
         places = (below, above)
         runs = [self.run(place) for place in places]
         step = runs[0].first_difference(runs[1])
@@ -214,11 +214,11 @@ def boundaries(
 ) -> BoundaryMap:
     """Find the values of a parameter at which the decisions of a run change, within the resolution of a grid.
 
-    The system is run at every grid point. A grid cell is bisected if the histories at its ends differ, until
-    the ends are adjacent floats. If the other half contains a change too, it is searched later. The search
-    proceeds upward from the lowest value, so if there are more boundaries than requested, the others are
-    above those found. All runs use the same program as a normal run; for the cutoff radius, with the radius
-    as an argument. A new process repeats the runs on both sides of every boundary.
+    The system is run at every grid value of the parameter. If the histories at the ends of a grid cell
+    differ, the cell is bisected until its ends are adjacent floats. If the other half contains a change too,
+    it is searched later. Boundaries are searched from the lowest value upward, so if there are more than
+    requested, the highest are missing. All runs use the program of a normal run; for the cutoff radius, it
+    takes the radius as an argument. The runs on both sides of every boundary are repeated in a new process.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.
@@ -260,7 +260,7 @@ def boundaries(
 
 
 def checked(program: Program, key: str, low: float, high: float) -> Number:
-    """Return the parameter with this key, after checking that the program can use all values of an interval.
+    """Return the parameter with the given key, after checking that an interval of its values is valid.
 
     Raises:
         InputError: the parameter does not exist, or the interval is invalid (the message gives the reason).
@@ -286,7 +286,7 @@ def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
 
 
 def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progress) -> list[Boundary]:
-    """Repeat the runs on both sides of each boundary in a new process, and record whether they agree."""
+    """Repeat the runs on both sides of each boundary in a new process, and record any disagreement."""
     sides = [side for boundary in found for side in (boundary.below, boundary.above)]
     digests = digests_elsewhere(
         system,

@@ -1,13 +1,13 @@
-"""Reliability of decisions: of each run by itself, and of one run relative to another run.
+"""Reliability of the decisions of a run, by itself and relative to another run.
 
 Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound: exact arithmetic
 would give the same decisions for the same states. Up to the end of *protection*, the pair of atoms closest to
-its cutoff was further from the cutoff than the separation of the two runs can have moved this pair. Up to the
-earlier of these steps, all decisions of the two runs agree. If one program is at least as precise in every
-role of its arithmetic, the other makes the same decisions up to the *shadow horizon*.
+its cutoff was further from it than the separation of the two runs can have moved this pair. As long as both
+conditions are met, the decisions of the two runs agree. If one program is at least as precise in every role,
+the other makes the same decisions up to the *shadow horizon*.
 
-All these steps refer to decisions for the states of the run. A run whose decisions are all correct for its
-states may have left the exact history long before (`forks.exact.certify` finds when).
+All these steps refer to decisions for the actual states of the run. A run with correct decisions for its
+states may have left the exact history long before (`forks.exact.certify` finds the step).
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
     """Return, per step, the distance of the nearest pair from its cutoff and the required distance (lengths).
 
-    Each of two atoms may be displaced by the separation of the runs, so their distance may change by twice
+    Each atom may be displaced by the separation of the runs, so the distance of two atoms may change by twice
     the separation. The margins are taken from the run with the smaller rounding error; this error is added to
     the required distance.
     """
@@ -107,15 +107,15 @@ def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray
 
 
 def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
-    """Return the decision thresholds as distances, in the dtype of the program."""
+    """Return the thresholds of the decisions as distances, in the dtype of the program."""
     values = np.array([threshold.value for threshold in decider.thresholds])
     return np.sqrt(values) if decider.space == "r2" else values
 
 
 def wider(twin: Twin) -> str | None:
-    """Return the program with higher precision in some role and lower precision in none, or None.
+    """Return the program that is more precise in some role and less precise in none; None if there is none.
 
-    The programs must be identical otherwise: a different time step, for example, is not rounding.
+    The programs must be identical otherwise: the effect of a different time step is not rounding.
     """
     a, b = twin.a.simulation, twin.b.simulation
     if twin.a.begin is not None or twin.b.begin is not None or _but_for_roles(a) != _but_for_roles(b):
@@ -131,7 +131,7 @@ def wider(twin: Twin) -> str | None:
 
 
 def _but_for_roles(run: Simulation) -> tuple[Any, ...]:
-    """Return the properties that must be the same in two programs that differ only in precision."""
+    """Return all properties of a program except the precision of each role."""
     tables = program(run)
     tables["precision"] = {key: value for key, value in tables["precision"].items() if key not in ROLES["md"]}
     return tables, repr(run.reduction)
@@ -142,7 +142,7 @@ def _but_for_roles(run: Simulation) -> tuple[Any, ...]:
 
 @dataclass(frozen=True)
 class AmbiguousDecision:
-    """A decision whose distance from the threshold is smaller than the rounding bound."""
+    """A decision for which the margin is smaller than the rounding bound."""
 
     # step, i, j: which decision; i < j
     step: int
@@ -205,11 +205,11 @@ def exact_margin(
     end: Float[np.ndarray, "3"],
     kind: int = 0,
 ) -> tuple[Fraction, bool]:
-    """Compute the margin of a pair without rounding, and the decision that follows from this margin.
+    """Compute the margin of a pair without rounding, and the resulting decision.
 
-    The positions are the floating-point numbers of the state. The threshold and the lattice vectors are the
-    doubles of the system, as in the exact program, whatever the dtype of the decision. As a distance, the
-    margin is accurate to 400 binary digits; the decision is exact.
+    The positions are the floating-point numbers of the state, taken as exact. The threshold and the lattice
+    vectors are the double-precision numbers of the system, as in the exact program, whatever the dtype of the
+    decision. Expressed as a distance, the margin is accurate to 400 binary digits; the decision is exact.
 
     Args:
         start, end: positions of the two atoms, length.

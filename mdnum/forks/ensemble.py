@@ -1,7 +1,7 @@
-"""Runs from slightly perturbed starts, features measured at some steps, and programs with deliberate changes.
+"""Runs from perturbed starts, features measured at a few steps, and programs with deliberate changes.
 
-Every feature is a continuous function of the positions, so that small differences between members remain
-small in the features of short runs. Pairs are therefore counted with hat functions and not in bins.
+Every feature is a continuous function of the positions, so that small differences between the runs of an
+ensemble remain small in the features. Pairs are therefore counted with hat functions and not in bins.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ _NUMBERS = (
 
 
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
-    """Return the distances of the peaks of the pair histogram's hat functions, ascending, then the upper end.
+    """Return the distances at which the hat functions of the pair histogram peak, and its upper end.
 
-    The distances extend from that of the closest pairs in a start to the largest distance that is counted.
+    The distances extend from the closest pairs of a start to the largest distance that is counted.
     """
     simulation = simulation.in_row(start.state.cells[0])
     half = float(np.min(simulation.cell.widths)) / 2
@@ -62,7 +62,7 @@ def feature_names(nodes: Float[np.ndarray, "nodes"]) -> tuple[str, ...]:
 def measure(
     simulation: Simulation, segment: Segment, nodes: Float[np.ndarray, "nodes"]
 ) -> Float[np.ndarray, "features"]:
-    """Compute the features at the last step of a segment of a run, in the internal units of the system.
+    """Compute the features at the last step of a part of a run, in the internal units of the system.
 
     Energies, virial and forces are taken from the run; pairs are counted with a separate neighbor list.
     """
@@ -105,10 +105,10 @@ def pair_distances(
 def hats(
     distances: Float[np.ndarray, "pairs"], nodes: Float[np.ndarray, "nodes"]
 ) -> Float[np.ndarray, "hats"]:
-    """Count distances in a histogram of hat functions: each distance counts for the two nearest nodes.
+    """Count pair distances with hat functions: each distance contributes to the two nearest nodes.
 
-    The contribution to a node grows linearly with its proximity to the distance. Distances below the first
-    node count for this node. The last node only marks the end, so a pair moving out of range causes no jump.
+    The contribution to a node grows linearly as the distance approaches the node. Distances below the first
+    node count for this node. The last node only marks the end: a pair leaving the histogram causes no jump.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)
@@ -122,19 +122,19 @@ def hats(
 
 
 def noise_size(simulation: Simulation) -> float:
-    """Return the displacement (length) of the most displaced atom in a perturbed start."""
+    """Return the displacement (length) of the atom that moves most when a start is perturbed."""
     largest = np.abs(np.asarray(first_state(simulation).state.x)).max()
     return NOISE * float(np.spacing(np.float32(largest)))
 
 
 def starts(simulation: Simulation, count: int, seed: int, start: Start | None = None) -> list[Start]:
-    """Create the starts of an ensemble: the simulation's own start with different noise for each member."""
+    """Create the starts of an ensemble: the simulation's own start, with different noise for each run."""
     programs = MdProgram(simulation, start).nudged(noise_size(simulation), count, seed)
     return [program.start for program in programs]
 
 
 def stretches(simulation: Simulation, start: Start, steps: Iterable[int]) -> Iterator[Segment]:
-    """Run to each of the ascending steps, and yield the run segment that ends there, until a run blows up."""
+    """Run to each of several ascending steps, and yield each part of the run; stop if the run blows up."""
     for step in steps:
         for segment in Engine(simulation, step, start=start, record=False).segments():
             if segment.closes in FAILURES:
@@ -172,7 +172,7 @@ def ensemble(
 
 
 def steps_to_diverge(simulation: Simulation, start: Start | None, separation: float, seed: int) -> int | None:
-    """Return the step at which the separation of two members of an ensemble reaches a given length.
+    """Return the step at which the separation of two runs of an ensemble reaches a given length.
 
     The result is None if the separation remains smaller for 20,000 steps, or if a run blows up.
     """
@@ -202,9 +202,9 @@ class Change:
 def planted(a: Simulation) -> tuple[Change, ...]:
     """Create the programs with deliberate changes that are possible for a simulation.
 
-    The programs with a longer time step and a shorter cutoff must fail the comparison. Forces in another
-    precision, pairs in another order and the other neighbor search must pass. The cutoff and the precision of
-    a many-body potential cannot be changed, so these two programs are omitted for such a potential.
+    The test must detect a longer time step and a shorter cutoff. Forces in another precision, pairs in
+    another order and the other neighbor search must pass. The cutoff and the precision of a many-body
+    potential cannot be changed, so these two programs are omitted.
     """
     longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
     search = next(name for name in BUILDERS if name != a.builder)

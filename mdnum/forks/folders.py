@@ -1,10 +1,10 @@
 """Find where two finished runs diverge, and how the runs differ, using only their folders.
 
-Neither run is repeated. The first differing bit and the fork (first differing decision) are read from tables
-in both folders. For positions, `twin_of` rebuilds both programs, and `mdnum.forks.fork` repeats the runs.
+Neither run is repeated. The first differing bit and the fork (first differing decision) are read from both
+folders. To compare positions, `twin_of` rebuilds the programs, and `mdnum.forks.fork` repeats the runs.
 
-Steps or decisions of two runs do not correspond if the systems differ in their atoms, box, potential or
-contact. Any other difference, in a parameter or in a choice of the program, is allowed, however large.
+Runs cannot be compared if their systems differ in atoms, box, potential or contact. Any other difference, in
+a parameter or a numerical choice, is allowed.
 """
 
 from __future__ import annotations
@@ -225,8 +225,8 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """Return the choices to which differing keys of the system file belong: all dtypes of roles are one
-    choice; a cutoff with its parameters is one choice too.
+    """Return the choices to which differing keys belong: the dtypes of all roles are one choice; a cutoff
+    with its parameters is another.
     """
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}
@@ -247,7 +247,7 @@ def _different(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Differe
 def _alone(
     first: RunFolder, second: RunFolder, table: str, labels: tuple[str, ...], steps: int, clock: str = "step"
 ) -> tuple[int | None, list[StoredFlip]]:
-    """Return the first step with a flip that only one of two tables contains, and these flips."""
+    """Return the first step with a flip that only one of two tables contains, and the flips of this step."""
     known = [folder.table(table, rows=1).column_names for folder in (first, second)]
     names = (clock, *labels, "entered", *["terms"] * all("terms" in one for one in known))
     further = ("distance", "ambiguous") if table == "flips" else ()
@@ -356,7 +356,7 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
 
 
 def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
-    """Compare two sets of atoms property by property; yield whether they agree, and a message if not."""
+    """Compare two sets of atoms property by property; yield whether they agree, with a message if not."""
     yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
     symbols = [each.get_chemical_symbols() for each in (one, other)]
     yield symbols[0] == symbols[1], "species or their order differ"

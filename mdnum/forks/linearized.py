@@ -1,15 +1,15 @@
 """The linearized run: how a small perturbation of the start grows, and which decisions it changes.
 
-The tangent is propagated along the recorded states of the run, with the same neighbor lists, so the reference
-trajectory is the recorded run, bit for bit. The exponential growth rate of the tangent is the largest
-Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn 1980) and
-therefore does not saturate, whereas the separation of two runs does.
+The tangent (the derivative of the state) is propagated along the recorded states with the same neighbor
+lists, so that the reference is the recorded run, bit for bit. The exponential growth rate of the tangent is
+the largest Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn
+1980), so it does not saturate, unlike the separation of two runs.
 
 Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation: to first order
-the decision flips at a = -m / (dm/da). The smallest of these amplitudes at each step is a limit for all
-perturbations, as long as the perturbed run remains close to the reference run and makes the same decisions.
-If the force jumps at the cutoff, the first flip kicks the two atoms; the linearization then describes another
-run, and the forecast ends. If the force is continuous, a flip changes nothing to first order.
+the decision flips at a = -m / (dm/da). The smallest amplitude at each step is a limit for all perturbations,
+as long as the perturbed run remains close to the reference run and makes the same decisions. If the force
+jumps at the cutoff, the first flip kicks the two atoms, and the forecast ends because the linearization then
+describes another run. If the force is continuous at the cutoff, a flip changes nothing to first order.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _ULPS = 8.0
 
 @dataclass(frozen=True)
 class StepTangents:
-    """The tangent of a run during the steps that use one neighbor list."""
+    """The tangent of a run during the time steps in which one neighbor list is used."""
 
     segment: Segment  # the steps
     # log of the length of the tangent (positions, and velocities times 30 time steps) at each step, relative
@@ -141,7 +141,7 @@ def _length(tangent, clock: float) -> float:
 
 
 def _labels(segment: Segment, slot: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-    """Return the atom pairs in the given slots of the flattened neighbor list, or -1 for an empty slot."""
+    """Return the atom pairs in given slots of the flattened neighbor list, or -1 for empty slots."""
     order = segment.table.order
     row, column = np.divmod(slot, len(order))
     ends = np.stack([order[column], np.append(order, -1)[segment.table.index[row, column]]], axis=-1)
@@ -241,10 +241,10 @@ class Lyapunov:
         return seen.rate / self.rate if self.chaotic else float("nan")
 
     def steps_to(self, start: float, end: float) -> float | None:
-        """Return the step at which a displacement of the start has grown from one length to another.
+        """Return the step at which an initial displacement has grown from one length to another.
 
-        The growth is taken from the run, and extrapolated exponentially beyond its end. The result is None if
-        the run is not chaotic and the displacement does not reach the final size.
+        The growth is taken from the run, and extrapolated exponentially beyond the end of the run. The result
+        is None if the run is not chaotic and the displacement does not reach the final size.
 
         Args:
             start: largest displacement of an atom at the start, length; for example one rounding unit.
@@ -306,7 +306,7 @@ class PredictedFlip:
 
 
 class ForecastRange(NamedTuple):
-    """The last step for which a forecast for one amplitude is valid, and the reason why it ends there."""
+    """The last step at which a forecast for an amplitude is valid, and the reason why it ends there."""
 
     step: int  # the last one; -1 for none
     # why there: "end" of the run; "flip", the first one kicks its atoms; "close", whether a decision of the
@@ -365,7 +365,7 @@ class Forecast:
         return last
 
     def first(self, amplitude: float, count: int = 3) -> tuple[PredictedFlip, ...]:
-        """Predict the first decisions that a perturbation flips, by step, while the forecast is valid.
+        """Predict the decisions that a perturbation flips first, by step, while the forecast is valid.
 
         At most `KEPT` flips of a step are listed; a step with `KEPT` flips may have more.
 
@@ -384,8 +384,8 @@ class Forecast:
     def nearest(self, count: int = 10) -> tuple[PredictedFlip, ...]:
         """Return the decisions flipped at the smallest amplitudes of either sign, one for each atom pair.
 
-        A flip is included only if the forecast is valid up to its step: if flips kick the atoms, a flip that
-        follows another flip cannot be predicted at any amplitude.
+        A flip is included only if the forecast is valid up to its step: if flips kick the atoms, no flip
+        after the first can be predicted.
         """
         # where flips kick, only what flips sooner or at less than all before it can be the first
         least = np.minimum.accumulate(self.reach.min(axis=2), axis=1)
@@ -437,7 +437,7 @@ def forecast(
     *,
     seed: int = 0,
 ) -> Forecast:
-    """Predict flips caused by perturbing the start along a direction.
+    """Predict the flips caused by a perturbation of the start in a given direction.
 
     Args:
         simulation: a simulation with a pair potential.

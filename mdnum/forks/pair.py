@@ -1,4 +1,4 @@
-"""Comparison of two runs until they split: steps of fork and split, the deciding flip, and the verdict."""
+"""Compare two runs until they split: steps of fork and split, the deciding flip, and the verdict."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Return whether to run B under A's decisions, whether to run A under B's, and the maximum of repeats.
+    """Return whether to run B under A's decisions, and A under B's, and the largest number of repeats.
 
     Raises:
         InputError: a requested counterfactual run or repeat is not possible.
@@ -208,7 +208,7 @@ def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such ru
 
 
 def _beyond(step: int) -> int:
-    """Return the step to which a run must be continued for the absence of a split to be significant."""
+    """Return the step to which a run must be continued to conclude that the runs do not split."""
     return int(np.ceil(PATIENCE * step)) + 1
 
 
@@ -216,7 +216,7 @@ def displacements(fork: Fork) -> tuple[float, float]:
     """Return two displacements (lengths) for starts of repeats: the initial separation of the runs, and less.
 
     At a hundredth of the first displacement, a repeat begins to have the same rounding errors as the pair of
-    runs; at much smaller displacements, the repeat equals the pair and proves nothing. If a hundredth is less
+    runs; at much smaller displacements, the repeat equals the pair and is no evidence. If a hundredth is less
     than an ulp, the second displacement may be larger than the first.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
@@ -228,7 +228,7 @@ def displacements(fork: Fork) -> tuple[float, float]:
 
 
 def _repeated(found: Fork, most: int, progress: Progress | None) -> Fork:
-    """Return the comparison with as many repeats as its verdict requires."""
+    """Add as many repeats to a comparison of two runs as the verdict requires."""
     a, b, series, tolerance = found.twin.a, found.twin.b, dict(found.series), found.tolerance
     while wanted := found.verdict.wanted:
         place, sizes = int(found.verdict.other is not None), displacements(found)
@@ -338,7 +338,7 @@ class Screened:
 
     @property
     def held(self) -> bool | None:
-        """True if all bits agreed in these steps; None if the choice was not run."""
+        """True if all bits of the two runs agreed; None if the choice was not run."""
         return None if self.reason_unavailable is not None else self.first_bit is None
 
 
@@ -348,7 +348,7 @@ def screen(
     choices: Sequence[Choice] | None = None,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[Screened]:
-    """Compare runs of a system for every choice, without counterfactual runs; earliest fork first.
+    """Compare runs of a system for every numerical choice, without counterfactual runs; earliest fork first.
 
     Args:
         system: a system that was loaded from a file.

@@ -1,12 +1,12 @@
 """Separate processes that repeat decisions, or run one system in several differently compiled programs.
 
 Programs of one system (compiled or not, batched, inside a gradient, for other processors) compute the same
-formulas, but the compiler may round them differently. XLA flags apply to a whole process, so each variant of
-the program runs in its own process. Variants whose positions have equal hashes at every step are numerically
-the same program; if the hashes differ, the pattern of agreement between variants reveals the cause.
+formulas, but may round differently. XLA flags apply to a whole process, so each variant of a program runs in
+its own process. Variants whose positions have equal hashes at every step are numerically the same program; if
+the hashes differ, the pattern of agreement between variants reveals the cause.
 
 `python -m mdnum.forks.processes FILE` executes the task described in a JSON file. For `digests_elsewhere`,
-the result is one digest per line on standard output; for `variants`, a file with an array of positions.
+the process prints one digest per line; for `variants`, it writes a file with an array of positions.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _NO_FMA = ("--xla_cpu_max_isa=AVX",)
 
 @dataclass(frozen=True)
 class Variant:
-    """One of several programs that run the same steps."""
+    """One of several differently compiled programs that run the same steps."""
 
     name: str  # what to call it
     # "scan" (one compiled loop), "rollout" (mdnum's own), "vmap" (the first of a batch of equal copies),
@@ -84,7 +84,7 @@ VARIANTS: tuple[Variant, ...] = (
 
 @dataclass(frozen=True)
 class Ran:
-    """Result of running one variant of the program."""
+    """Result of running one variant of a program."""
 
     variant: Variant  # which
     hashes: tuple[str, ...]  # of the positions at steps 1, 2, ..., hexadecimal; empty where it failed
@@ -109,7 +109,7 @@ class Ran:
 
 @result
 class Variants:
-    """Variants of the program of one system, grouped by their results."""
+    """Variants of the program for one system, grouped by their results."""
 
     rows: tuple[Ran, ...]  # one a variant, in the order asked for
     reference: str  # name of the one that the others are compared with: the first that ran
@@ -119,7 +119,7 @@ class Variants:
 
     @property
     def clusters(self) -> list[list[str]]:
-        """Names of the variants in each cluster of bitwise agreement; the reference's cluster is first."""
+        """Names of variants whose results agree bit for bit, in groups; that of the reference is first."""
         count = max(row.cluster for row in self.rows) + 1
         return [[row.variant.name for row in self.rows if row.cluster == k] for k in range(count)]
 
@@ -133,7 +133,7 @@ def variants(
     """Run a system in several variants of its program, two processes at a time, and find which results agree.
 
     All variants use a single neighbor list, with twice the skin if the box is large enough, and stop before
-    motion exceeds this skin. Other machines may give other clusters: some processors lack fused multiply-add.
+    motion exceeds this skin. Other machines may give other groups: some processors lack fused multiply-add.
 
     Args:
         system: a system that was loaded from a file and has a pair potential.
@@ -212,7 +212,7 @@ def _ran(variant: Variant, question: Mapping[str, Any], file: Path) -> tuple[Ran
 
 
 def clustered(rows: Sequence[Ran]) -> list[Ran]:
-    """Add cluster numbers to the rows; the first variant that succeeded, the reference, is in cluster 0."""
+    """Add cluster numbers to the rows; cluster 0 contains the reference, the first variant that succeeded."""
     reference = next((row for row in rows if not row.failed), None)
     # the longest of each cluster stands for it, so that a short run joins whom it agrees with
     heads: list[Ran] = []
@@ -226,7 +226,7 @@ def clustered(rows: Sequence[Ran]) -> list[Ran]:
 
 
 def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
-    """Derive causes, as codes, from the pattern of agreement; variants that were not run give no cause.
+    """Derive causes, as codes, from the agreement between variants; variants that were not run are ignored.
 
     Codes: "fused", "others" and "not_fused" for programs without fused operations; "eager_..." for the
     program without a compiler; "same", "fuses", "orders" and "leaves" for other programs, named in "program";
@@ -271,9 +271,9 @@ def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
 def positions_of(
     simulation: Simulation, steps: int, program: ProgramName
 ) -> Float[np.ndarray, "steps 3 atoms"]:
-    """Compute wrapped positions at steps 1, 2, ... with one program, in this process and the user's order.
+    """Compute wrapped positions at steps 1, 2, ... with one program, in the user's order of atoms.
 
-    The result ends before an atom has moved by half the skin of the only neighbor list.
+    The result ends before an atom has moved by half the skin, since there is only one neighbor list.
     """
     from mdnum.md.cell import displacement
     from mdnum.rollout.engine import Engine, first_state
@@ -350,7 +350,7 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
 
 
 def digests(system: Simulation | BallSystem, key: str, steps: int, values: Sequence[float]) -> list[str]:
-    """Compute digests of all decisions of a run for several values of a parameter, one after another."""
+    """Compute digests of all decisions of a run, for each of several values of a parameter."""
     number = program_of(system, steps).number(key)
     return [number.at(value).history(steps).digest for value in values]
 
@@ -362,7 +362,7 @@ def digests_elsewhere(
     values: Sequence[float],
     progress: Callable[[int], None] | None = None,
 ) -> list[str]:
-    """Compute the digests of decisions in a new process, to confirm boundaries independently.
+    """Compute digests of decisions in a new process, to confirm boundaries independently.
 
     The system is written to a folder and read from there without rounding, and its program is compiled again
     in the same environment.
@@ -395,7 +395,7 @@ def digests_elsewhere(
 
 
 def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
-    """Return the system in a form from which another process can recreate it, bit for bit.
+    """Return a system in a form from which another process can recreate it, bit for bit.
 
     Raises:
         InputError: the system was made from objects, which exist only in this process.
@@ -414,7 +414,7 @@ def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
 
 
 def _question(system: Simulation | BallSystem, steps: int, folder: Path) -> dict[str, Any]:
-    """Assemble the input of a process: the system, written to a folder, and the last step."""
+    """Assemble the input of a process: the system, saved in a folder, and the last step."""
     path = in_a_file(system).write(folder / "system")
     return {"path": str(path), "steps": steps, "code": is_allowed()}
 

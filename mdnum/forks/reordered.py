@@ -1,12 +1,12 @@
 """Simulations whose neighbor lists hold the same pairs in another order: that of a jax-md format, or
 shuffled.
 
-The forces of a pair on its two atoms are exactly opposite, so that a list format changes only the order of
-the sums. Dense and sparse lists contain each pair twice, and each entry contributes half of the pair force.
-For a sparse list, the halves from an atom's own row form one sum, those from rows that contain the atom as a
-neighbor another, and both sums are added; with sorted rows this is one loop over atom labels. For a dense
-list, the second halves are added one by one to the sum of the first halves. An ordered-sparse list contains
-each pair once: the terms of an atom with later atoms form one sum, those with earlier atoms another sum.
+The two forces of a pair are exactly opposite, so that a list format changes only the order of sums. Dense and
+sparse lists contain each pair twice, and each entry contributes half of the pair force. For a sparse list,
+the halves from an atom's own row form one sum, those from rows that contain the atom as a neighbor another,
+and both sums are added; with sorted rows, one loop over atom labels does the same. For a dense list, the
+second halves are added one by one to the sum of the first halves. An ordered-sparse list contains each pair
+once: the terms of an atom with later atoms form one sum, those with earlier atoms another sum.
 
 Source: jax_md.smap.pair_neighbor_list and the transpose of its gathers, whose forces have these orders bit
 for bit (tests/forks/test_choices.py, jax-md 0.2.29). One detail of XLA is not reproduced: rows with more than
@@ -45,11 +45,11 @@ class ReorderedSimulation(Simulation):
 
     @property
     def lists(self):
-        """Properties that identify the neighbor lists; lists in another order are different lists."""
+        """Properties that identify neighbor lists; lists with another order have other properties."""
         return (*super().lists, self.order)
 
     def verlet_list(self, skin: float | None = None) -> VerletList:
-        """Create the simulation's own Verlet list, with the pairs in the other order."""
+        """Create the Verlet list of the simulation, with the pairs in another order."""
         made = super().verlet_list(skin)
         if isinstance(self.order, str):
             return FormattedList(**_fields(VerletList, made), format=self.order)

@@ -1,8 +1,8 @@
 """Molecular-dynamics runs repeated around a fork: nearby atoms, overridden decisions, and minimal causes.
 
-To override a decision, the decision of run A is imposed on run B; B makes all other decisions itself. The
-smallest set of pairs whose overridden decisions keep B with A is found by bisection and delta debugging, the
-method by which Verrou finds the instructions that cause an error.
+To override a decision of run B, the decision of run A is imposed; B makes all other decisions itself. The
+smallest set of overridden pairs that keeps B with A is found by bisection and delta debugging, the method by
+which Verrou finds the instructions that cause an error.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Neighborhood:
 
 
 def neighborhood(fork: Fork) -> Neighborhood | None:
-    """Repeat both runs and return the atoms around the pair at the fork; None if the fork has no pair."""
+    """Repeat both runs and return the atoms around the pair at the fork; None if no pair forked."""
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
@@ -152,7 +152,7 @@ def _check_pair(pair: tuple[int, int], atoms: int) -> None:
 
 
 def parse_pin(text: str, atoms: int) -> dict[str, Any]:
-    """Parse the text of a pin (imposed decision), "fork", "3-75" or "3-75:600..700", for `pinned`.
+    """Parse the text of imposed decisions, "fork", "3-75" or "3-75:600..700", into arguments of `pinned`.
 
     Raises:
         InputError: the text has none of these forms, or the pair of atoms does not exist.
@@ -216,7 +216,7 @@ def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
 
 @dataclass(frozen=True)
 class Minimal:
-    """A smallest set of pairs; imposing A's decisions on these pairs keeps B with A."""
+    """A smallest set of pairs of atoms such that imposing A's decisions on them keeps B close to A."""
 
     # pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A; None where
     # no set does
@@ -230,14 +230,14 @@ class Minimal:
 
     @property
     def proven(self) -> bool:
-        """True if each of these pairs was shown to be necessary."""
+        """True if each pair in the set was shown to be necessary."""
         return self.code in ("alone", "proven")
 
 
 def minimal_cause(
     fork: Fork, *, tests: int = 80, progress: Callable[[int, int], None] | None = None
 ) -> Minimal:
-    """Find a 1-minimal set of pairs such that imposing A's decisions on them removes a split.
+    """Find a minimal set of atom pairs such that imposing A's decisions on them prevents the split of B.
 
     Args:
         fork: a pair of runs with the same atom labels that has forked and split.
@@ -271,7 +271,7 @@ def minimal_cause(
 
 
 class _Search:
-    """Runs of B with A's decisions imposed on some pairs, and whether B remained with A."""
+    """Runs of B with A's decisions imposed on some pairs, to test whether B stays close to A."""
 
     def __init__(
         self,
@@ -300,7 +300,7 @@ class _Search:
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Test whether B remains with A under A's decisions on some pairs; False if no run is allowed."""
+        """Test whether B stays close to A under A's decisions on some pairs; False if no run is left."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():
@@ -331,8 +331,8 @@ class _Search:
 def _required(keys: list[int], search: _Search, until: int) -> list[int]:
     """Find a sufficient set of pairs by bisecting for one necessary pair after another (QuickXplain).
 
-    Each pair takes about log2(n) runs; with delta debugging, runs are quadratic in the number of pairs. The
-    method assumes that imposing further decisions does no harm; it stops after `until` runs.
+    Each pair takes about log2(n) runs; for delta debugging, the runs are quadratic in the number of pairs.
+    The method assumes that imposing more decisions does no harm, and stops after `until` runs.
 
     Source: Junker, QuickXplain, AAAI 2004.
     """

@@ -30,7 +30,7 @@ class DecisionTape:
 
     @property
     def flips(self) -> int:
-        """Number of flips stored on the tape."""
+        """Number of stored flips."""
         return len(self.step)
 
     @cached_property
@@ -42,7 +42,7 @@ class DecisionTape:
         return {key: tuple(own.tolist()) for key, own in zip(keys.tolist(), steps, strict=True)}
 
     def pins(self, keys: Iterable[int], first: int, last: int) -> Pins:
-        """Return the decisions on some pairs in a form that imposes them over an interval of steps."""
+        """Return decisions on some pairs in a form that can be imposed on another run for some steps."""
         begins = set(self.first.tolist())
         return Pins(
             [
@@ -65,7 +65,7 @@ class DecisionTape:
 
 
 def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
-    """Find the first step at which the decisions on two tapes differ; None if all decisions agree.
+    """Find the first step at which the decisions of two runs differ; None if all decisions agree.
 
     Raises:
         ValueError: the tapes have different numbers of atoms.

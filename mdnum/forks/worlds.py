@@ -1,7 +1,7 @@
-"""The program, the parameters and the variations of a system of molecular dynamics or of a ball.
+"""Programs and parameters of systems, for molecular dynamics and for the bouncing ball.
 
-Modules of molecular dynamics are imported inside the functions, because those modules import jax_md, which a
-ball does not need.
+Modules of molecular dynamics are imported inside functions, because these modules import jax_md, which a ball
+does not need.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Pro
 
 
 def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> Any:
-    """Return a copy of the system with other values of some keys, validated like the keys of a system file.
+    """Return a copy of a system with other values of some keys, validated like the keys of a system file.
 
     Args:
         system: a simulation, or the system of a ball.
@@ -74,8 +74,8 @@ def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> 
 
 
 def alike(a: Any, b: Any) -> tuple[Any, Any]:
-    """Return two systems whose pair decisions correspond: if only one system shares decisions between terms,
-    both get one decision for each term.
+    """Return two systems with comparable decisions: if only one system shares decisions between terms, both
+    get one decision for each term.
     """
     if isinstance(a, BallSystem) or not (a.pairwise and b.pairwise):
         return a, b

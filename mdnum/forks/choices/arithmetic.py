@@ -1,8 +1,8 @@
 """Choices of arithmetic: the floating-point format of each role, and the order in which sums are computed.
 
-The order of a sum is given by a reduction, or by the order of pairs in neighbor lists, which depends on how
+The order of a sum is given by the reduction, or by the order of pairs in neighbor lists, which depends on how
 and when the lists are built. These choices do not change which pairs interact if every list is rebuilt before
-the motion of the atoms exceeds the skin. If the sums do not depend on order, the choices must have no effect.
+the motion of the atoms exceeds the skin. If sums do not depend on order, these choices must have no effect.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class Summation(Choice):
 
 
 def sums_residuals(system: Any) -> None:
-    """Raise an `InputError` if a ball's system does not sum residuals over several balls."""
+    """Raise an `InputError` unless the solver of a ball system sums residuals over several balls."""
     stop = system.spec.stop
     applies(stop is not None, "its steps use no solver, so there is no residual to sum")
     reason = f"its solver is stopped by the rule {stop.rule}, which sums nothing"
@@ -288,7 +288,7 @@ class Builder(Summed):
 
 @choice("skin")
 class Skin(Summed):
-    """Another skin: neighbor lists hold more or fewer distant pairs, and are rebuilt at other steps."""
+    """Another skin: neighbor lists hold more or fewer pairs beyond the cutoff, rebuilt at other steps."""
 
     screened = "skin skin@exact"
     # of the skin; None for half as much again, or three quarters where the box has no room

@@ -1,4 +1,4 @@
-"""Choices only for a ball: the stopping rule of its iterative solver, and single inverted decisions."""
+"""Choices for a ball only: the stopping rule of its iterative solver, and single inverted decisions."""
 
 from __future__ import annotations
 

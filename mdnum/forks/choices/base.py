@@ -1,4 +1,4 @@
-"""The base class of numerical choices, for molecular dynamics and balls, and the two programs of a choice."""
+"""The base class of numerical choices, and the two programs that differ in a choice."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _SIGNED = ("ulps", "more")
 
 
 class Choice:
-    """One numerical choice that can be made differently; its arguments are the fields of a frozen dataclass.
+    """One numerical choice, such as the precision; its arguments are the fields of a frozen dataclass.
 
-    To add a choice, write a subclass and decorate it with `choice("family")`; the family is the word before
-    "=" in the text of the choice. A choice defined by another package sets its own `family`, is decorated
-    with `choice(None)` and is registered as an entry point of the group "mdnum.choices". The fields of a
-    choice are written after "=", separated by ":"; the field `both`, if it exists, is written after "@". The
-    first line of the class docstring describes the choice.
+    To add a choice, decorate a subclass with `choice("family")`, where the family is the word before "=" in
+    the text of the choice. A choice in another package sets its own `family`, is decorated with
+    `choice(None)` and is registered as an entry point of the group "mdnum.choices". The fields of a choice
+    are written after "=", separated by ":"; the field `both`, if it exists, is written after "@". The first
+    line of the class docstring describes the choice for users.
     """
 
     family: ClassVar[str] = ""  # the word before "="
@@ -53,7 +53,7 @@ class Choice:
 
     @property
     def argument(self) -> str:
-        """Text of the choice's argument, which is written after "="."""
+        """Argument of the choice as text, as written after "="."""
         values = {one.name: getattr(self, one.name) for one in self._fields()}
         if not self.shown and all(values[one.name] == one.default for one in self._fields()):
             return ""
@@ -72,7 +72,7 @@ class Choice:
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """Create the choice from the parts of "family.role=argument@both"; missing parts are empty.
+        """Create a choice from the parts of the text "family.role=argument@both"; missing parts are empty.
 
         Raises:
             InputError: the argument is not valid for this choice.
@@ -87,7 +87,7 @@ class Choice:
         return cls(**values)
 
     def make(self, system: Any) -> Twin:
-        """Make the two programs for a `Simulation` of molecular dynamics or the `BallSystem` of a ball.
+        """Make two programs that differ in this choice, for a `Simulation` or a `BallSystem`.
 
         Raises:
             InputError: the choice does not apply to the system; the message gives the reason.
@@ -104,7 +104,7 @@ CHOICES: Registry[Any] = Registry("choice", "mdnum.choices", Choice)
 
 @dataclass_transform(frozen_default=True)
 def choice(family: str | None):
-    """Make a subclass of `Choice` a frozen dataclass, and register it if a family is given."""
+    """Make a subclass of `Choice` a frozen dataclass, and register the subclass if a family is given."""
 
     def add(cls: type[Any]) -> type[Any]:
         made = dataclass(frozen=True)(cls)
@@ -117,7 +117,7 @@ def choice(family: str | None):
 
 
 def shipped(world: str) -> dict[str, Choice]:
-    """Return the built-in choices for molecular dynamics or balls that are screened by default, by name."""
+    """Return the built-in choices for molecular dynamics or balls that are tested by default, by name."""
 
     def of_family(kind: type[Choice]) -> Iterable[Choice]:
         words = kind.screened if isinstance(kind.screened, str) else kind.screened[world]
@@ -128,13 +128,13 @@ def shipped(world: str) -> dict[str, Choice]:
 
 
 def unavailable(choice: Choice, system: Simulation | System | BallSystem) -> str | None:
-    """Return the reason why a choice does not apply to a system, or None if the choice applies."""
+    """Return the reason why a choice does not apply to a system; None if the choice applies."""
     made = twin_or_reason(choice, system)
     return made if isinstance(made, str) else None
 
 
 def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> Twin | str:
-    """Make the two programs of a choice, or return the reason why it does not apply to the system."""
+    """Make two programs that differ in a choice, or return the reason why this is not possible."""
     if world_of(system) not in choice.worlds:
         return f"it is a choice {_WORLDS[choice.worlds[0]]}"
     try:
@@ -152,7 +152,7 @@ def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> 
 
 
 def twin_of(choice: Choice, system: Simulation | System | BallSystem) -> Twin:
-    """Make the two programs of a choice for a system.
+    """Make two programs of a system that differ in a choice.
 
     Raises:
         InputError: the choice does not apply to the system.
@@ -210,19 +210,19 @@ def parse(text: str, world: str | None = None) -> Choice:
 
 
 def check(is_good: bool, message: str, where: str, remedy: str | None = None) -> None:
-    """Raise an `InputError` with the message unless an argument is valid."""
+    """Raise an `InputError` with the given message unless an argument is valid."""
     if not is_good:
         raise InputError(message, where=where, remedy=remedy)
 
 
 def applies(is_so: bool, reason: str) -> None:
-    """Raise an `InputError` with the reason unless a choice applies to a system."""
+    """Raise an `InputError` with the given reason unless a choice applies to a system."""
     if not is_so:
         raise InputError(reason)
 
 
 def number(text: str, kind: type, where: str) -> Any:
-    """Parse a number in a choice's argument; raise an `InputError` if the text is not a number."""
+    """Parse a number in the argument of a choice; raise an `InputError` if the text is not a number."""
     try:
         return kind(text)
     except ValueError:
@@ -241,7 +241,7 @@ def plural(count: int, noun: str) -> str:
 
 
 def summing(both: str | None) -> str:
-    """Return the end of a sentence, which describes how both runs compute sums."""
+    """Return a phrase that describes how both runs compute sums."""
     return "" if both is None else f" (both with {both} sums)"
 
 
@@ -260,7 +260,7 @@ def summed(simulation: Simulation, both: str | None = None) -> Simulation:
 
 
 def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
-    """Make the pair of programs of two molecular-dynamics simulations."""
+    """Make a pair of programs from two molecular-dynamics simulations."""
     from mdnum.rollout.program import MdProgram
 
     one, other = alike(a, b)
@@ -269,7 +269,7 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice that can impose a reduction on both runs; with order-independent sums the runs must agree."""
+    """A choice that can set the summation of both runs; if sums do not depend on order, they must agree."""
 
     worlds = ("md",)
     both: str | None = None  # reduction of both runs; None for the system's own
@@ -284,5 +284,5 @@ class Summed(Choice):
         return self.both in ORDERLESS
 
     def twin(self, a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
-        """Make the pair of programs of two simulations; the label of the difference names the reduction."""
+        """Make a pair of programs from two simulations; the label of the pair includes the reduction."""
         return simulations(a, b, difference + summing(self.both), frame)

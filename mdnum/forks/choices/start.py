@@ -94,8 +94,8 @@ class Relabel(Summed):
 class Rotate(Summed):
     """The axes of the box exchanged or reversed.
 
-    An exchange of axes is exact, but the squared components of a distance are added in another order. If the
-    sign of an axis changes, the positions are rounded once when they are wrapped into the box.
+    An exchange of axes is exact, but the squared components of a distance vector are added in another order.
+    If the sign of an axis changes, positions are rounded once more when they are wrapped into the box.
     """
 
     screened = "rotate rotate@exact"
@@ -175,9 +175,9 @@ class Translate(Summed):
 class Images(Choice):
     """Atoms that start in other periodic images.
 
-    Positions are wrapped before the first step, so this choice changes no bit if the images are exact; in
-    general, the sum of a position and a lattice vector is rounded. Both runs start at positions for which
-    this sum is exact, within one rounding unit of a lattice vector from the positions in the file.
+    Positions are wrapped before the first step, so this choice changes no bit if the images are exact;
+    usually, the sum of a position and a lattice vector is rounded. Both runs start at positions for which
+    this sum is exact; these differ from the positions in the file by at most one ulp of the lattice vector.
     """
 
     worlds = ("md",)
@@ -219,8 +219,8 @@ def exact_images(
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"], int]:
     """Return wrapped positions near given ones, their images, and the number of atoms without exact image.
 
-    Wrapping the images gives the wrapped positions, bit for bit. In a box along the axes, a position whose
-    image was rounded has an exact image (Sterbenz's lemma: the lattice vector is subtracted again without
+    Wrapping the images gives the wrapped positions, bit for bit. In a box along the axes, a position with a
+    rounded image has an exact image (Sterbenz's lemma: the lattice vector is subtracted again without
     rounding); a second iteration is needed only if the first crosses a face of the box.
     """
     from mdnum.md.cell import wrap_positions
@@ -242,8 +242,8 @@ def exact_images(
 class Ulps(Choice):
     """A parameter of the system file, changed to a nearby float in the format in which the parameter is used.
 
-    For a run at constant energy, the temperature is that of the randomly drawn initial velocities of both
-    runs.
+    For a run at constant energy, the temperature is that of the initial velocities, which both runs draw at
+    random.
     """
 
     screened: ClassVar = {world: " ".join(f"ulps={key}" for key in keys) for world, keys in OFTEN.items()}

@@ -54,11 +54,11 @@ def nearest(value: Decimal) -> float:
 
 
 def ball_history(world: World, start: BallState, steps: int) -> BallRun:
-    """Compute the run of a ball in exact arithmetic, from the numbers that the ball's `world` stores.
+    """Compute the run of a ball in exact arithmetic, from the numbers stored in `world`.
 
     Quantities that do not affect decisions (residuals, stopping margins, the ledger) are not recorded.
 
-    Error: none, except that the values in the record are rounded to double precision.
+    Error: none, except that recorded values are rounded to double precision.
 
     Raises:
         InputError: steps is below 1, or a time step does not consist of sums and products.
@@ -82,7 +82,7 @@ def ball_history(world: World, start: BallState, steps: int) -> BallRun:
 
 
 class _ExactBall:
-    """State and time step of the balls in exact numbers."""
+    """State of the balls in exact numbers, and the function that makes one time step."""
 
     def __init__(self, world: World, start: BallState):
         contact, scheme = world.contact, world.integrator
@@ -219,7 +219,7 @@ class _ExactRule:
         self.tol = None if isinstance(rule, FixedCount) else _held(world, rule.tol)
 
     def measure(self, depths: Balls) -> Balls:
-        """Return the residual of the batch, or the residual of each ball."""
+        """Return the residual of the batch of balls, or the residual of each ball."""
         if isinstance(self.rule, PerInstance):
             return depths
         if isinstance(self.rule, GlobalSum):

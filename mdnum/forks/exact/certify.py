@@ -76,7 +76,7 @@ class PolicyHorizon:
 
     @property
     def margin(self) -> float:
-        """Margin, in the exact run, of the first decision that is made wrongly; NaN if none is wrong."""
+        """Margin, in the exact run, of the first decision that a run makes wrongly; NaN if there is none."""
         return float("nan") if self.decision is None else self.decision.margins["A"]
 
     def is_all(self, dtype: str) -> bool:
@@ -227,7 +227,7 @@ def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], 
 
 
 def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
-    """Return ln 2 / growth rate (steps per bit) of the run whose growth could be measured over most steps."""
+    """Return ln 2 / growth rate (steps per bit) for the run in which growth was measured longest."""
     # separations that grow by a power of time, as those of a lone pair, are no exponentials
     fits = [row.growth for row in rows if row.growth is not None]
     fits = [fit for fit in fits if fit.rate > 0 and fit.r_squared > _EXPONENTIAL]
@@ -237,7 +237,7 @@ def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
 
 
 def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
-    """Add to each policy its gain over pure single precision, if that precision leaves the exact history."""
+    """Add to each precision policy its gain over single precision, if that one leaves the exact history."""
     low = next((row for row in rows if row.is_all("float32")), None)
     high = next((row for row in rows if row.is_all("float64")), None)
     if low is None or low.horizon is None:
@@ -254,7 +254,7 @@ def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
 
 
 def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
-    """Return how many bits closer one run is to the exact positions than another, while all decisions agree.
+    """Return how many bits closer to the exact positions one run is than another, while decisions agree.
 
     The value is the median over the second half of the steps before the first wrong decision. Unlike the
     horizon, this median does not depend on which pair of atoms happens to approach its cutoff.

@@ -1,8 +1,8 @@
-"""The time steps of a run in exact real arithmetic. Ball arithmetic (Arb) proves every decision.
+"""The time steps of a run in exact real arithmetic. Ball (interval) arithmetic proves every decision.
 
-The start and all constants are the double-precision numbers of the program, taken as exact dyadic rationals.
-Positions and velocities are balls (intervals) with many bits. A decision is proven if the ball of its margin
-lies on one side of the threshold; otherwise the run is repeated with more bits. The result is the sequence of
+The initial state and all constants are the double-precision numbers of the program, taken as exact. Positions
+and velocities are balls (intervals) with many bits. A decision is proven if the interval of its margin lies
+on one side of the threshold; otherwise the run is repeated with more bits. The result is the sequence of
 decisions that the program would make without any rounding.
 
 Source: Johansson, Arb, IEEE Transactions on Computers 66 (2017) 1281.
@@ -49,10 +49,10 @@ _U = 2.0**-53
 def pull_of(
     potential: PairPotential, constants: Mapping[str, float], cutoff: str, r_cut: float, r_onset: float
 ) -> Callable[[Any], Any]:
-    """Return the function that computes 2 du/d(r²) of a pair inside its cutoff from the ball of r².
+    """Return the function that computes 2 du/d(r²) of a pair inside the cutoff from an interval of r².
 
-    This derivative is the factor of the displacement x_j - x_i in the force on i. Constants are exactly the
-    given doubles; derived values are enclosed with the precision set at the time of the call.
+    The factor 2 du/d(r²) multiplies the displacement x_j - x_i in the force on i. Constants are exactly the
+    given doubles; derived values are intervals of the precision set at the time of the call.
 
     Raises:
         TypeError: the potential uses an operation that ball arithmetic does not support.
@@ -120,7 +120,7 @@ class ExactHistory:
 
     @property
     def bits_per_step(self) -> float:
-        """Bits by which the largest ball grows per step in the second half of a run; NaN for a short run."""
+        """Bits by which the largest interval grows per step in the second half of a run; NaN if too short."""
         rows = np.flatnonzero(np.isfinite(self.radius))
         if len(rows) < 4:
             return float("nan")
@@ -201,7 +201,7 @@ def _without_balls(simulation: Simulation) -> InputError | None:
 
 
 def _pulls(simulation: Simulation) -> list[Callable[[Any], Any]]:
-    """Return, for each pair type, the function made by `pull_of`."""
+    """Return, for each pair type, a function that computes 2 du/d(r²) in ball arithmetic."""
     model, bare = simulation.model, simulation.model.potential
     radii = zip(np.asarray(model.r_cut), np.asarray(model.r_onset), strict=True)
     return [
@@ -249,7 +249,7 @@ class ExactProgram:
         bits: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> ExactHistory:
-        """Prove every decision up to a step, with more bits wherever the first attempt is insufficient.
+        """Prove every decision up to a step, with more bits if the first attempt fails.
 
         Args:
             steps: last step.
@@ -278,7 +278,7 @@ class ExactProgram:
 
 
 class _Run:
-    """One attempt to prove all decisions, which begins with a fixed number of bits."""
+    """One attempt to prove all decisions of a run with a given number of bits."""
 
     def __init__(self, program: ExactProgram, steps: int, bits: int):
         self.program, self.steps, self.bits, self.step = program, steps, bits, 0
@@ -289,7 +289,7 @@ class _Run:
         self._close = 0
 
     def bits_needed(self) -> int:
-        """Estimate the number of bits required from the growth of the balls so far."""
+        """Estimate the required number of bits from the growth of the intervals so far."""
         grown = self._radius[: self.step + 1]
         known = np.flatnonzero(np.isfinite(grown))
         if len(known) < 50:
@@ -298,7 +298,7 @@ class _Run:
         return math.ceil(1.1 * rate * self.steps) + 2 * _BITS_LEFT
 
     def all(self, progress, restarts: int) -> ExactHistory:
-        """Run all steps and return the exact history."""
+        """Run all steps, and return the decisions with their proof."""
         from flint import ctx
 
         begin, before = time.perf_counter(), ctx.prec
@@ -388,7 +388,7 @@ class _Run:
         return first
 
     def _shift(self, n: list[int]) -> tuple[Any, Any, Any]:
-        """Return the sum of integer multiples n of the lattice vectors, exactly."""
+        """Return n1 a1 + n2 a2 + n3 a3 exactly, for integers n and lattice vectors a."""
         key = (n[0], n[1], n[2])
         if key not in self._shifts:
             rows = self._lattice
@@ -399,11 +399,11 @@ class _Run:
     def _decide(
         self, x, centers: Float[np.ndarray, "atoms 3"], radius: float, thresholds: list
     ) -> tuple[Bool[np.ndarray, "all_pairs"], Int[np.ndarray, "all_pairs 3"], Float[np.ndarray, "all_pairs"]]:
-        """Make all decisions of a step with double-precision bounds, or with balls where bounds are too
-        coarse.
+        """Make all decisions of a step with double-precision bounds, or with intervals if these do not
+        suffice.
 
-        If the nearest image in double precision is not the exact nearest image, the pair is further apart
-        than r_cut in both images, because half the box exceeds r_cut by more than rounding.
+        If the nearest image in double precision is not the exact one, both images are further than r_cut,
+        because half the box exceeds r_cut by more than rounding.
         """
         program = self.program
         i, j, matrix = program._i, program._j, program._matrix
@@ -436,7 +436,7 @@ class _Run:
 
 
 def _log2_radius(ball) -> float:
-    """Return an upper bound on log2 of a ball's radius, even for radii outside the range of doubles."""
+    """Return an upper bound on log2 of an interval's radius, even for radii outside the range of doubles."""
     if ball.is_exact():
         return -math.inf
     mantissa, exponent = ball.rad().man_exp()
