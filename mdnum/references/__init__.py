@@ -1,4 +1,4 @@
-"""Reference results from ASE, other neighbor searches and plain numpy, and mdnum as an ASE calculator.
+"""Reference calculations with ASE, neighbor searches of libraries and numpy; mdnum as an ASE calculator.
 
 Modules are imported at first use, since importing ASE, MDAnalysis or jax takes a second or more.
 """

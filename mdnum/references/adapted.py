@@ -77,7 +77,7 @@ class SpeciesSum(ClassicalCalculator):
 
 
 def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, Any]:
-    """Return energy, forces, atomic energies if available and, as six numbers, stress of a structure."""
+    """Return energy, forces, atomic energies (if available) and stress (six numbers) of a structure."""
     bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
     names = ["energy", "forces", *(["stress"] if stress else [])]
     if "energies" in calculator.implemented_properties:  # ASE's EAM has the total only
@@ -102,7 +102,7 @@ def lennard_jones(form: PairForm, **options: Any) -> Calculator:
 
 
 def _inside_list(form: PairForm) -> Callable[..., Any]:
-    """Return a neighbor list for ASE's MorsePotential with only the pairs inside the file's cutoff."""
+    """Return a neighbor list for ASE's MorsePotential that has only pairs inside the system's cutoff."""
 
     def listed(quantities: str, atoms: Atoms, cutoff: float) -> tuple[ndarray, ...]:
         edges = edges_of(atoms, form.r_cut)
@@ -122,7 +122,7 @@ def morse(form: PairForm, begin: float, end: float) -> Calculator:
 
 
 def short_listed_eam(file: Path) -> Calculator:
-    """Return ASE's EAM with a neighbor list shorter than ASE's 2 (cutoff + skin), which takes minutes."""
+    """Return ASE's EAM with a shorter neighbor list; its own list reaches 2 (cutoff + skin), and is slow."""
     from ase.calculators.eam import EAM
     from ase.neighborlist import NeighborList
 
@@ -141,8 +141,8 @@ def short_listed_eam(file: Path) -> Calculator:
 class EnergyOnNeighborList(ClassicalCalculator):
     """ASE calculator for an energy function, compiled separately and evaluated on ASE's neighbor list.
 
-    This reference tests neighbor lists, cutoff decisions and time steps, but neither the energy function nor
-    its derivatives, since jax also evaluates these for the reference.
+    This reference tests neighbor lists, cutoff decisions and time steps; it tests neither the energy function
+    nor its derivatives, since the reference uses jax for these too.
     """
 
     implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012

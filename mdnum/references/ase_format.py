@@ -1,7 +1,6 @@
-"""The file format "mdnum" of ASE, for run folders; ASE imports this module together with its own formats.
+"""The ASE file format "mdnum" for run folders; ASE imports this module together with its own formats.
 
-The format is not in `ase_plugin`, because the plugins of ASE import its formats while that module is still
-empty.
+The format is not in `ase_plugin`, because ASE's plugins import its formats while `ase_plugin` is still empty.
 """
 
 from __future__ import annotations

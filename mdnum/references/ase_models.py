@@ -15,8 +15,8 @@ Differences between mdnum and ASE, with the conversions that remove these differ
 | an energy function | no ASE class | the function on ASE's neighbor list, and labeled so |
 | all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), and labeled so |
 
-LennardJones of ASE keeps a pair at r == rc (only r² > rc² is dropped); ASE's neighbor lists do not (r < rc).
-The energy of a pair at r == rc is zero for shifted and switched cutoffs, so only its force can differ.
+ASE's LennardJones keeps a pair at r == rc (it drops r² > rc²); ASE's neighbor lists do not (r < rc). The
+energy of a pair at r == rc is zero for shifted and switched cutoffs, so only its force can differ.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def reference(subject: Simulation | System) -> Reference:
 
 
 def independent(subject: Simulation | System) -> Reference:
-    """Return a plain-numpy reference, in addition to ASE, for any potential except eam."""
+    """Return a plain-numpy reference for any potential except eam, even if ASE has a class for it."""
     simulation = _objects(subject)
     model, compare = simulation.model, simulation.decider.compare
     if isinstance(model, EnergyFunction):

@@ -1,4 +1,4 @@
-"""Entry for ASE's list of plugins; ASE imports this module, which imports no other module of mdnum."""
+"""Registers mdnum as a plugin of ASE; ASE imports this module, which imports no other module of mdnum."""
 
 from __future__ import annotations
 

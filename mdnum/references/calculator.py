@@ -31,7 +31,7 @@ _SAID = {"potential", "cutoff", "terms", "units"}
 
 
 class _Recipe(NamedTuple):
-    """Recipe that builds a simulation for given atoms."""
+    """Recipe for building a simulation of given atoms."""
 
     make: Callable[[Atoms], Simulation]  # without a skin: the evaluator keeps what the box has room for
     skin: float  # length
@@ -48,7 +48,7 @@ def _of_system(system: Simulation | System) -> _Recipe:
 
 
 def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
-    """Return a recipe for simulations with potential objects, or with the tables of a system file."""
+    """Return a recipe for simulations with given potential objects, or with the tables of a system file."""
     if isinstance(potential, Mapping):
         made = interaction(potential, cutoff)
         end, model = made.cutoff, lambda atoms: model_of(made, atoms, Path())
@@ -77,8 +77,8 @@ class MdnumCalculator(ClassicalCalculator):
     """ASE calculator that evaluates a potential with mdnum.
 
     Use this calculator to relax structures with ase.optimize, to compute stress and equations of state, and
-    to compare mdnum's forces with ASE's own tools. A Verlet list is kept between calls as long as motion and
-    box strain do not exceed its skin; for molecular dynamics use mdnum's rollout, which records its flips.
+    to compare mdnum's forces with ASE's own tools. The Verlet list is kept between calls until motion and box
+    strain exceed its skin. For molecular dynamics use mdnum's rollout, which records flips.
 
     Args:
         system: a `Simulation`, a `System`, or the name or path of a system file; the evaluated atoms may
@@ -168,7 +168,7 @@ class MdnumCalculator(ClassicalCalculator):
         return results
 
     def _made_for(self, atoms: Atoms) -> Evaluator:
-        """Return an evaluator for the given atoms, which accepts any positions and any cell."""
+        """Return an evaluator for the given atoms, at any positions and in any cell."""
         # only what the forces depend on: constraints and the like stay with ASE
         bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
         if self._given is not None:

@@ -92,7 +92,7 @@ class EnergyReport:
 
     @property
     def worst(self) -> dict[str, Any]:
-        """Largest deviations over all frames, under the names in the entry `ase` of summary.json."""
+        """Largest deviations from the reference over all frames, under the names used in summary.json."""
         stress = [frame.stress_max for frame in self.frames if frame.stress_max is not None]
         names = ("energy_rel", "force_max", "force_scale")
         worst = {name: max(getattr(frame, name) for frame in self.frames) for name in names}
@@ -180,7 +180,7 @@ def narrowest(simulation: Simulation, roles: Sequence[str] = ("state", "force", 
 
 
 def _places(simulation: Simulation) -> str:
-    """Return the narrowest float type of positions; for 16-bit forces, that of state and decision only."""
+    """Return the narrowest float type that affects positions; for 16-bit forces, of state and decision."""
     wide = simulation.policy.force in WIDE
     return narrowest(simulation) if wide else narrowest(simulation, ("state", "decision"))
 
@@ -266,7 +266,7 @@ def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
 
 
 def _over(difference: float, scale: float) -> float:
-    """Return difference / scale; a zero difference gives 0 for any scale."""
+    """Return difference / scale, or 0 for a zero difference."""
     return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
 
 
@@ -287,7 +287,7 @@ class _Scales:
 
     @classmethod
     def of(cls, simulation: Simulation, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]) -> _Scales:
-        """Return the scales of a frame: sums over pairs for a pair potential, else values from the totals."""
+        """Return the scales of a frame, from sums over pairs for a pair potential, else from the totals."""
         unit, places = unit_roundoff(narrowest(simulation)), unit_roundoff(_places(simulation))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
@@ -466,8 +466,8 @@ def neighborhoods(
     """Yield free clusters at random positions: each is a group of atoms plus all atoms within `reach` of it.
 
     For a pair potential with range `reach`, the atoms of the group have the same energies and forces in the
-    cluster as in the whole system, so a difference in the cluster is a difference in the whole system.
-    Neighbors are found from distances between atoms and images, without mdnum's cell lists.
+    cluster as in the whole system. Neighbors are found from distances between atoms and images, without
+    mdnum's cell lists.
 
     Args:
         atoms: the whole system, with any cell; coordinates may lie outside the cell.

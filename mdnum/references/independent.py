@@ -1,11 +1,11 @@
 """Energies, forces and stress in plain numpy on ASE's neighbor list, computed from the formulas alone.
 
-This code is independent of the code used in a run (each cutoff has its own numpy `reference`). It is the
-reference if ASE has no class for a potential or a cutoff, and an additional reference otherwise.
+This code is independent of the code used in a run (each cutoff has its own numpy `reference`). The numpy code
+is the reference if ASE has no class for a potential or a cutoff, and an additional reference otherwise.
 
 A model takes directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
-the total energy with respect to every d. Forces and stress are computed from this gradient g: F_i += g, F_j
--= g, stress = sum(g outer d) / volume.
+the total energy with respect to every d. Forces and stress follow from the gradient g of the energy with
+respect to the displacements: F_i += g, F_j -= g, stress = sum(g outer d) / volume.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ SLACK = 1e-12  # what `edges_of` adds to the length it is asked for, relative
 def edges_of(atoms: Atoms, reach: float) -> Edges:
     """Return the pairs within slightly more than `reach`, in both directions, from ASE's neighbor list.
 
-    ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster at 500 atoms than its
-    neighbor_list. ASE lists only pairs with r < reach, while the model decides whether r = reach is inside,
+    ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster at 500 atoms than ASE's
+    neighbor_list. ASE lists only pairs with r < reach, while the model decides whether r = reach is inside;
     so the list reaches slightly farther, by SLACK.
     """
     arrays = (atoms.positions, atoms.numbers, atoms.cell.array, atoms.pbc)
@@ -165,7 +165,7 @@ class PairForm:
 
 
 def pair_forms(model: CutPotential, symbols: Sequence[str], compare: str) -> dict[tuple[str, str], PairForm]:
-    """Return the interaction for every two species, in both orders.
+    """Return the interaction for every two species, in both orders of the species.
 
     Args:
         symbols: symbols of the species, sorted.
@@ -228,7 +228,7 @@ class PairModel(Model):
         return max(form.r_cut for forms, _ in self.terms for form in forms.values())
 
     def groups(self, edges: Edges) -> Iterator[tuple[PairForm, ndarray, Any]]:
-        """Yield the edges inside the cutoff for each interaction: (interaction, edge indices, factors)."""
+        """Yield (interaction, edge indices, factors) for the edges inside the cutoff of each interaction."""
         first, second = edges.symbols[edges.i], edges.symbols[edges.j]
         for forms, weights in self.terms:
             for a, b in product(sorted(set(edges.symbols.tolist())), repeat=2):
@@ -274,7 +274,7 @@ def _add_rows(target: ndarray, rows: ndarray, values: ndarray) -> None:
 
 
 class _OneSpecies(Model):
-    """A model that includes all edges shorter than its reach, whatever the species."""
+    """A model in which all edges shorter than the cutoff interact, whatever the species of the atoms."""
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:

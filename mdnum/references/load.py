@@ -1,7 +1,7 @@
 """Load a Python object named by `package.module:thing(argument=value)` or `file.py:thing(argument=value)`.
 
-A module is imported or a file is executed, the object is looked up by its name, and is called if arguments
-are given. Arguments must be literals; nothing else is evaluated.
+A module is imported or a file is executed, and the object is looked up by name; if arguments are given, the
+object is called. Arguments must be literals; nothing else is evaluated.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class NamedObject:
 
     @property
     def is_file(self) -> bool:
-        """True if `home` is a Python file, which is executed, and not a module, which is imported."""
+        """True if `home` is the path of a Python file, and not the name of a module."""
         return self.home.endswith(".py")
 
     @property

@@ -49,11 +49,11 @@ def widths(cell: Vectors) -> Float[ndarray, "3"]:
 def rounding_bound(
     positions: Positions, cell: Vectors, r_cut: float, *, unit_roundoff: float = 2.0**-53
 ) -> float:
-    """Upper bound on the rounding error of a computed distance close to r_cut, length.
+    """Upper bound on the rounding error of a computed distance that is close to r_cut, length.
 
-    The bound is valid for a code that wraps the coordinates, adds a lattice vector, subtracts and takes the
-    norm: each operation acts on numbers no larger than the coordinates plus the cell, and rounds each number
-    once or twice. Typical errors are a tenth of this bound.
+    The bound is valid for a code that wraps coordinates, adds a lattice vector, subtracts and takes the norm:
+    numbers are at most as large as the coordinates plus the cell, and each operation rounds once or twice.
+    Typical errors are a tenth of this bound.
 
     Args:
         positions: coordinates as passed to the code.
@@ -71,7 +71,8 @@ def exactly_inside(
 ) -> bool:
     """Decide in exact arithmetic whether a pair is inside r_cut; `closed` counts r == r_cut as inside.
 
-    In exact arithmetic, r < r_cut and r² < r_cut² are equivalent; only rounding can make them differ.
+    In exact arithmetic, r < r_cut and r² < r_cut² are equivalent; in floating-point arithmetic they may
+    differ.
     """
     squared, threshold = Fraction(0), Fraction(float(r_cut)) ** 2
     for axis in range(3):
@@ -91,12 +92,12 @@ def all_pairs(
     closed: bool = False,
     reach: float | None = None,
 ) -> PairSet:
-    """Find every pair within a distance by brute force, and decide exactly whether each is inside r_cut.
+    """Find every pair within `reach` by brute force, and decide exactly whether it is inside r_cut.
 
-    All pairs of atoms are tested with every lattice vector that could bring the atoms together, without cell
-    list or skin. The result is therefore valid for triclinic cells, periodicity along some axes, atoms
-    outside the cell, and cells smaller than the cutoff (a pair then appears once per image). The cost is
-    deliberately proportional to the square of the number of atoms.
+    All pairs are tested with every lattice vector that could bring the atoms together, without cell list or
+    skin. The result is therefore valid for triclinic cells, periodicity along some axes, atoms outside the
+    cell, and cells smaller than the cutoff (a pair then appears once per image). The cost is proportional to
+    the square of the number of atoms, by design.
 
     Args:
         positions: coordinates, wrapped or not.

@@ -31,7 +31,7 @@ _NEARBY = 3  # ulps either side of r_cut in which oriented pairs are placed
 
 @dataclass(frozen=True)
 class Search:
-    """A neighbor list that is called with positions and cell in the form that the list requires."""
+    """A neighbor list, called with positions and cell in the form that this list requires."""
 
     listed: PairList
 
@@ -42,7 +42,7 @@ class Search:
 
     @property
     def ours(self) -> bool:
-        """True if the neighbor search belongs to mdnum, so that a run depends on its result."""
+        """True if the neighbor search is used by mdnum, so that the decisions of a run depend on it."""
         return self.listed.package == "mdnum"
 
     @property
@@ -113,7 +113,7 @@ def all_searches(system: Simulation) -> tuple[Search, ...]:
 
 
 def own_searches(system: Simulation) -> tuple[Search, ...]:
-    """Return the neighbor searches of mdnum, set up for this system.
+    """Return the neighbor searches of mdnum, set up for a system.
 
     "mdnum force loop" is the cutoff decision of the force evaluation, outside jit. "mdnum, host list" and
     "mdnum, jax-md list" are mdnum's two list builders, with the same cutoff decision made on the host.
@@ -242,9 +242,9 @@ def check_pairs(
 ) -> PairsReport:
     """Compare the pairs that every neighbor search finds inside the cutoff with brute force.
 
-    Each neighbor search runs once for each cutoff radius of the species pairs. Brute force uses the
-    comparison (< or <=) of the system file, in rational arithmetic near the cutoff. A search whose decisions
-    differ only for such pairs "differs at the cutoff", which is rounding or convention and not an error.
+    Each neighbor search is run once for each cutoff radius of the species pairs. Brute force uses the
+    comparison (< or <=) of the system file, in rational arithmetic near the cutoff. If only decisions near
+    the cutoff differ, the search "differs at the cutoff", which is rounding or convention and not an error.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
@@ -299,7 +299,7 @@ def check_pairs(
 
 
 def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: float) -> tuple[int, int, int]:
-    """Return (missing, extra, borderline) counts of the pairs from a neighbor search against brute force.
+    """Return the numbers of (missing, extra, borderline) pairs in a neighbor search, against brute force.
 
     Args:
         i, j: pairs from the neighbor search, i <= j, one row per periodic image.
@@ -346,8 +346,7 @@ def effective_cutoff(
     """Find the largest distance (double) of two atoms that a neighbor search counts as inside r_cut.
 
     The two atoms differ only in x and the first has x = 0, so that their distance is exactly the coordinate
-    of the second and the result depends on the search alone; in a periodic box (5 r_cut wide) this includes
-    wrapping by the search.
+    of the second atom; in a periodic box (5 r_cut wide) the result includes wrapping by the search.
 
     Args:
         periodic: use a periodic box, as in a simulation; otherwise atoms without a box.

@@ -1,1 +1,1 @@
-"""Output shared by all commands of mdnum: findings, sections, figures, and the page."""
+"""Report elements shared by all commands of mdnum: findings, sections, figures and pages."""

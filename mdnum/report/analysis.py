@@ -1,4 +1,4 @@
-"""Statistics of a run's tables: flip reversals, residence times, most frequent pairs, margins, energies."""
+"""Statistics of a run's flips (reversals, residence times, busiest pairs, margins), and of its energies."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Stays:
 
     @property
     def total(self) -> int:
-        """Number of stays inside or outside the cutoff."""
+        """Number of residence times counted, inside and outside the cutoff."""
         return int(self.inside.sum() + self.outside.sum())
 
     def undone_within(self, steps: int) -> int:
@@ -39,7 +39,7 @@ class Stays:
 
 
 def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
-    """Return the median stay, given the numbers of stays of 0, 1, 2, ... steps; None without any stays."""
+    """Return the median residence time, given the numbers of stays of 0, 1, 2, ... steps; or None."""
     total = int(counts.sum())
     if not total:
         return None
@@ -50,7 +50,7 @@ def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
 
 @dataclass(frozen=True)
 class PairCounts:
-    """Pairs sorted by the number of their flips, in descending order."""
+    """Pairs of atoms, sorted by the number of their flips in descending order."""
 
     i: Int[np.ndarray, "pairs"]
     j: Int[np.ndarray, "pairs"]
@@ -58,7 +58,7 @@ class PairCounts:
     terms: np.ndarray  # names of the terms whose decisions they are; "" where there are none
 
     def rows(self, most: int) -> list[dict[str, Any]]:
-        """Return the first pairs as rows of plain values."""
+        """Return the first pairs and their numbers of flips as plain values."""
         columns = {name: values[:most].tolist() for name, values in vars(self).items()}
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
@@ -66,8 +66,8 @@ class PairCounts:
 class Scan:
     """Statistics of a table of flips that may be larger than memory, read block by block.
 
-    A scan stores one row per pair, one count for each step and for each length of a stay, the flips nearest
-    to their threshold, and the margin of every flip.
+    A scan stores a row for each pair, a count for each step and for each residence time, the flips nearest to
+    their threshold, and the margin of every flip.
 
     Args:
         steps: number of steps in the run's series; flips happen at the steps 0 to steps - 1.
@@ -95,7 +95,7 @@ class Scan:
         self.nearest: dict[str, np.ndarray] = {}
 
     def take(self, flips: Flips) -> None:
-        """Process the next rows of the table of flips.
+        """Add the next rows of the table of flips to the statistics.
 
         Raises:
             ValueError: a flip is at a step outside the run, or at an earlier step than a previous flip.
@@ -140,8 +140,8 @@ class Scan:
     def stays(self) -> Stays:
         """Residence times of pairs inside and outside the cutoff.
 
-        The stays before a pair's first flip and after its last flip are incomplete and not counted, so long
-        stays are underrepresented in runs that are not much longer than these stays.
+        Stays before the first flip and after the last flip of a pair are incomplete and not counted, so long
+        stays are underrepresented in short runs.
         """
         self._follow()
         return Stays(inside=self._lengths[1], outside=self._lengths[0])
@@ -164,7 +164,7 @@ class Scan:
         )
 
     def matches(self, series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
-        """Return, for each step, True if the table contains as many flips as the series counted."""
+        """Return, for each step, whether the table has as many flips as were counted during the run."""
         return (self.entered == series["entered"]) & (self.left == series["left"])
 
     def _follow(self) -> None:
@@ -216,9 +216,9 @@ def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
 def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
     """Return the expected number of ambiguous flips (ratio up to 1), for margins spread evenly near zero.
 
-    Margins are spread evenly if atoms move freely through the cutoff distance. The density is taken from the
-    lower quarter of the margins. If many more flips are ambiguous, pairs stay near the cutoff, for example
-    because a neighbor shell of a crystal is at this distance.
+    Margins are spread evenly if atoms move freely through the cutoff distance. The density of margins is
+    taken from the lower quarter of the margins. If many more flips are ambiguous than expected, pairs stay
+    near the cutoff, for example because a neighbor shell of a crystal is at this distance.
     """
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) < 4:
@@ -258,7 +258,7 @@ class Conservation:
         kinetic: Float[np.ndarray, "rows"],
         least: float,
     ) -> Conservation | None:
-        """Compute energy conservation from one value per step; None if values are few or atoms do not move.
+        """Compute energy conservation from one value per step; None for few values or atoms at rest.
 
         The linear trend is removed before the fluctuation is computed, since the drift is reported
         separately. The first half of the run is omitted, because a run that starts from a lattice turns half
@@ -285,7 +285,7 @@ class Conservation:
 
 
 def range_table(label: Callable[[str], str], *tables: Mapping[str, np.ndarray]) -> Table:
-    """Tabulate the ranges of quantities, and the first step at which each narrower format fails to hold them.
+    """Tabulate the ranges of quantities, and the first step at which narrower float formats cannot hold them.
 
     Args:
         label: function that returns the label of a quantity from its name.

@@ -112,7 +112,7 @@ class Browse:
 
     @property
     def spec(self) -> Markup:
-        """Description of the table for the script of the page, as JSON for a script element."""
+        """Description of the table for the script on the page, as JSON for a script element."""
         columns = [
             {
                 "at": at, "kind": "number" if one.kind == "ratio" else one.kind, "digits": one.digits,
@@ -129,5 +129,5 @@ class Browse:
 
 
 def _script_safe(value: Any) -> Markup:
-    """Return JSON that is safe in a script element, which the string "</script>" would otherwise end."""
+    """Return JSON that can be placed in a script element, with "</script>" in strings made harmless."""
     return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))

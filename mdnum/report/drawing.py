@@ -88,7 +88,7 @@ def canvas(draw_into: Callable[[Canvas], None], height: float) -> Canvas:
 
 
 def line(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, label: str = "", **look: object) -> None:
-    """Draw a line; for too many points, draw the mean of groups and a band from smallest to largest value."""
+    """Draw a line; with too many points, draw averages and a band from smallest to largest values."""
     low, middle, high, at = envelope(np.asarray(x), np.asarray(y))
     if len(y) > POINTS:
         axes.fill_between(at, low, high, color=color, alpha=0.3, lw=0)
@@ -98,7 +98,7 @@ def line(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, label: str = "", 
 def envelope(
     x: np.ndarray, y: np.ndarray, most: int = POINTS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return (smallest, mean, largest, position) of at most `most` equally large groups of points."""
+    """Return (smallest, mean, largest, position) for at most `most` equally large groups of points."""
     if len(y) <= most:
         return y, y, y, x
     starts = np.unique(np.linspace(0, len(y), most, endpoint=False).astype(int))
@@ -123,7 +123,7 @@ def legend(axes: Axes) -> None:
 
 
 def notes(plot: Figure | Plot) -> list[str]:
-    """Describe the values that a plot cannot show, in one sentence for each kind."""
+    """Describe the values that a plot cannot show, with a sentence for each kind of value."""
     if isinstance(plot, Figure) or not plot.series:
         return []
     sentences = []
@@ -180,7 +180,7 @@ def _plot(plot: Plot, figure: Canvas) -> None:
 
 
 def _high(curves: list[Line2D], axes: Axes, x: float) -> bool:
-    """Return True if curves pass through the upper part of the axes near x, and none lower down."""
+    """Return True if curves pass through the upper part of the axes near x, and none through the lower."""
     to_axes = axes.transData + axes.transAxes.inverted()
     points = [to_axes.transform(np.asarray(one.get_xydata(), float)) for one in curves]
     at = np.concatenate(points or [np.zeros((0, 2))])
@@ -190,7 +190,7 @@ def _high(curves: list[Line2D], axes: Axes, x: float) -> bool:
 
 
 def _values(plot: Plot, name: str) -> np.ndarray:
-    """Return all finite numbers of a plot along one axis."""
+    """Return all finite numbers that a plot shows along one axis."""
     sources = (*plot.series, *filter(None, [plot.region]))
     values = [np.ravel(getattr(source, name)).astype(float) for source in sources]
     joined = np.concatenate(values or [np.zeros(0)])
@@ -198,7 +198,7 @@ def _values(plot: Plot, name: str) -> np.ndarray:
 
 
 def _base(plot: Plot, name: str) -> float:
-    """Return the number subtracted from axis values that differ only in their last digits; otherwise 0."""
+    """Return a number to subtract from axis values that differ only in their last digits; otherwise 0."""
     values = _values(plot, name)
     span = np.ptp(values) if len(values) else 0.0
     # differences of neighboring floats are exact, so none of them is lost
@@ -218,7 +218,7 @@ def _coincide(one: Series, other: Series) -> bool:
 def _apart(
     marks: tuple[tuple[float, str], ...], base: float, limits: tuple[float, float]
 ) -> list[tuple[float, str]]:
-    """Return marked values with labels; the labels of values that are too close together are joined."""
+    """Return marked values with labels; labels of values too close together are joined into one."""
     kept: list[tuple[float, str]] = []
     near = 0.025 * abs(limits[1] - limits[0])
     for value, word in sorted((value - base, word) for value, word in marks):
@@ -245,7 +245,7 @@ def _scale(axes: Axes, name: str, scale: str, plot: Plot) -> None:
 
 
 def _series(axes: Axes, series: Series, bases: dict[str, float], covered: int) -> None:
-    """Draw a series of points; the line is broader if later series cover it, so that it stays visible."""
+    """Draw a series of points, with a broader line if later series would hide it."""
     x, y = (np.asarray(getattr(series, name), float) - bases[name] for name in "xy")
     # what is infinite, or too large for an axis to have room beyond it, leaves a gap
     there = (np.abs(x) < 1e250) & (np.abs(y) < 1e250)
@@ -286,7 +286,7 @@ def _region(axes: Axes, region: Region) -> None:
 
 
 def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
-    """Return the edges of cells around the given centers, halfway between neighbors on the axis scale."""
+    """Return the edges of cells around given centers, halfway between neighbors on the axis scale."""
     centers = np.log(centers) if log else np.asarray(centers, float)
     half = np.diff(centers) / 2 if len(centers) > 1 else np.array([0.5])
     edges = np.concatenate(
@@ -347,7 +347,7 @@ def thin_line(x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"]) ->
 
 
 def thin_points(x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"]) -> Int[np.ndarray, "kept"]:
-    """Select points to keep: one point in each occupied cell of a fine grid.
+    """Select points of a scatter plot to keep: one point in each occupied cell of a fine grid.
 
     Args:
         x, y: coordinates on the scales of the axes.
@@ -374,7 +374,7 @@ def thin_points(x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"]) 
 
 
 def style() -> AbstractContextManager[None]:
-    """Return a context with the settings for all figures, which replace those in a user's matplotlibrc."""
+    """Return a context with the settings for all figures, in place of the user's matplotlibrc."""
     return mpl.rc_context(
         {
             # any backend will do, and to ask for the one in use imports pyplot
@@ -395,7 +395,7 @@ def style() -> AbstractContextManager[None]:
 
 
 def markup(figure: Canvas, name: str) -> str:
-    """Return a figure as an <svg> element whose colors are given by roles, such as that of a series.
+    """Return a figure as an <svg> element in which colors are named by role, to adapt to the page.
 
     Args:
         name: prefix that makes the ids of the element unique on a page.

@@ -1,8 +1,7 @@
-"""Findings of all commands, with their sentences, and the verdict that summarizes the findings.
+"""Findings of all commands, the sentences of findings, and the verdict that summarizes findings.
 
-The module of a command determines code and values of a finding; a text file next to it has the sentences.
-`mdnum/verbs/__init__.toml` explains the content of such a file, and how the format of a field affects the
-text.
+A command's module determines code and values of a finding; a text file next to it has the sentences.
+`mdnum/verbs/__init__.toml` explains the content of these text files, and the formats of the fields.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _ORDER = ("error", "warning", "info")
 
 @dataclass(frozen=True)
 class Finding:
-    """A result of a calculation that the reader should know about."""
+    """A result that the reader of a report should know about."""
 
     code: str  # stable name, for scripts
     # error: do not use the numbers; warning: look before you do; info: good to know, which changes neither
@@ -94,7 +93,7 @@ class Texts:
         cause: str = "",
         **values: Any,
     ) -> Finding:
-        """Return the finding with the given code, with values inserted into its sentences.
+        """Return the finding with the given code, with values inserted into the sentences of the finding.
 
         Args:
             variants: alternatives to title, text and remedy, and further sentences (see the module).
@@ -122,7 +121,7 @@ class Texts:
         )  # fmt: skip
 
     def __call__(self, name: str, /, **values: Any) -> str:
-        """Return a sentence from the table [sentences], with values inserted into its fields."""
+        """Return a sentence from the table [sentences], with the given values inserted."""
         return fill(self.entries["sentences"][name], {"units": self.units, **values})
 
     def plot(
@@ -184,7 +183,7 @@ def _plain(value: Any) -> Any:
 
 
 def _first(texts: str | Sequence[str], values: Mapping[str, Any]) -> str | None:
-    """Return the first text whose fields all have values, with the values inserted; or None."""
+    """Return the first text for which all fields have values, with the values inserted; or None."""
     several = [texts] if isinstance(texts, str) else texts
     return next((fill(text, values) for text in several if _known(text, values)), None)
 
@@ -198,7 +197,7 @@ def _known(text: str, values: Mapping[str, Any]) -> bool:
 
 
 def fill(text: str, values: Mapping[str, Any]) -> str:
-    """Return a sentence with values inserted into its fields.
+    """Return a sentence with the given values inserted into its fields.
 
     Raises:
         KeyError: a field has no value.
@@ -236,7 +235,7 @@ def conclude(
     best: Tone = "info",
     judged: bool = False,
 ) -> Verdict:
-    """Return the verdict on findings: the most severe finding sets its tone and is named in the headline.
+    """Return a verdict: the most severe finding determines its tone and is named in its headline.
 
     Args:
         found: findings in the order in which they are to be read, regardless of severity.

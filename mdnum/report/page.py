@@ -65,7 +65,7 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
 
 
 def brief(page: Page, verdict: Verdict, path: Path, verb: str) -> str:
-    """Return verdict, key numbers, findings and first figure of a folder's page, as HTML for a notebook."""
+    """Return verdict, key numbers, findings and first figure of a report page, as HTML for a notebook."""
     from mdnum.report import drawing
 
     parts = (part for section in page.sections for part in section.parts)
@@ -86,7 +86,7 @@ _LINKED = (".parquet", ".py", ".json", ".toml", ".extxyz", ".npz", ".traj")
 
 
 def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Finding]]]:
-    """Return the findings not caused by another finding, each with the findings caused by it."""
+    """Return the findings not caused by another finding, each with the findings that it causes."""
     findings = list(findings)
     codes = {finding.code for finding in findings}
     below: dict[str, list[Finding]] = {}
@@ -141,7 +141,7 @@ def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -
 
 
 def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield (name, text) for all entries of nested tables; all plain values of a table are in one line."""
+    """Yield (name, text) for all entries of nested tables; the plain values of a table share one line."""
     for key, item in value.items():
         name = f"{prefix}{key}".replace("_", " ")
         if isinstance(item, Mapping):

@@ -38,7 +38,7 @@ class Table:
 
     @cached_property
     def numeric(self) -> tuple[bool, ...]:
-        """True for each column that contains only numbers, which are then right-aligned."""
+        """For each column, True if it contains only numbers and is therefore right-aligned."""
         columns = [[row[k] for row in self.rows] for k in range(len(self.columns))]
         return tuple(
             any(map(_is_number, values)) and all(value is None or _is_number(value) for value in values)
@@ -79,7 +79,7 @@ def pairs(rows: Sequence[tuple[str, Any]], title: str = "") -> Table:
 
 
 def cell(value: Any) -> str:
-    """Format a value of a table for readers."""
+    """Format a value in a table for readers."""
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool_):
@@ -97,7 +97,7 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Code:
-    """A file or a command for copying, hidden under its title until unfolded."""
+    """A file or a command for copying; on a page it is hidden under its title until unfolded."""
 
     title: str  # what it is
     text: str  # word for word
@@ -129,7 +129,7 @@ def positive(values: np.ndarray) -> np.ndarray:
 def curves(
     x: np.ndarray, lines: Mapping[str, np.ndarray], mark: Mark = "line", log: bool = True
 ) -> tuple[Series, ...]:
-    """Build the series of several lines, with the roles in the order of the lines.
+    """Build a plot series for each of several lines; their roles follow the order of the lines.
 
     Args:
         x: positions shared by all lines.

@@ -49,13 +49,13 @@ def count(value: float | None) -> str:
 
 
 def plain(value: float | None, digits: int = 4) -> str:
-    """Format a number as `number` does, without trailing zeros: for chosen values, not for measured ones."""
+    """Format a number without trailing zeros, for values that were chosen and not measured."""
     text = number(value, digits)
     return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
 
 
 def pair_name(pair: Mapping[str, Any]) -> str:
-    """Return the labels of a pair of atoms, and the potential term that decides, if there is one."""
+    """Return the labels of a pair of atoms, with the potential term of its decision, if there is one."""
     return f"{pair['i']}–{pair['j']}" + (f" ({pair['terms']})" if pair.get("terms") else "")
 
 
@@ -77,7 +77,7 @@ def percent(share: float | None) -> str:
 
 
 def typeset(text: str) -> str:
-    """Typeset numbers in the notation of programs: -1.5e-16 and 2^15 become −1.5 × 10⁻¹⁶ and 2¹⁵."""
+    """Typeset numbers in program notation: -1.5e-16 and 2^15 become −1.5 × 10⁻¹⁶ and 2¹⁵."""
     text = re.sub(r"(?<![\w.])(\d+(?:\.\d+)?)[eE]([+-]?\d+)(?![\w.]*\w)", _as_power, text)
     text = re.sub(r"(?<=\w)(?:\^|\*\*)(-?\d+)", lambda found: found[1].translate(_RAISED), text)
     text = re.sub(r"\bsqrt\((\w+)\)", r"√\1", text)

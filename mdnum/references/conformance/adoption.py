@@ -7,7 +7,7 @@
         pairs = staticmethod(neighbor_list)
         limits = ListLimits(minimum_image=True)
 
-A failed test prints the error and a script with a few atoms that reproduces this error.
+A failed test prints the error, and a script that reproduces the error with a few atoms.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class NeighborListConformance:
         return found.with_options(full=self.full, unit=self.unit, superset=self.superset, limits=self.limits)
 
     def asked(self, tested: PairList, area: str) -> list[Case]:
-        """Return the test cases of one area, such as "rule"."""
+        """Return the test cases of one area of the conformance suite."""
         if area == "large":
             return list(questions.lattices()) if self.large else []
         count = self.cases if area == "random" else 0
@@ -78,7 +78,7 @@ class NeighborListConformance:
 
     @staticmethod
     def _answers(tested: PairList) -> bool:
-        """Return whether the neighbor list returns pairs in the simplest cases within its declared limits."""
+        """Return whether the neighbor list returns any pairs in the simplest test cases."""
         plain = [once("a gas", "few", gas(20, 6.0, 0), 6.0), once("a free gas", "few", gas(20, 3.0, 0))]
         report = examine(tested, asked=questions.as_kept(tested, plain), large=False, shrink=False)
         return not report.asked or bool(report.failed) or report.conforms

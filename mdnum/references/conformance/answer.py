@@ -1,4 +1,4 @@
-"""Convert the pairs returned by a neighbor list, in any supported form, to named arrays.
+"""Convert the pairs returned by a neighbor list to named arrays; several forms are supported.
 
 This file is copied into the scripts that reproduce a failure; it requires only numpy.
 """
@@ -43,7 +43,7 @@ class ListAnswer:
         return len(self.i)
 
     def same(self, other: ListAnswer) -> bool:
-        """Return whether another list of pairs has the same rows in the same order."""
+        """Return whether two lists of pairs have the same rows in the same order."""
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
 
@@ -51,12 +51,12 @@ def read(given: Any) -> ListAnswer:
     """Return the pairs in a neighbor list's return value as a `ListAnswer`.
 
     A neighbor list may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance,
-    vector), or fewer of these arrays. An array with one number per row is a distance, the first array with
-    three integers per row is the shift, and another array with three numbers per row is the vector. A mapping
-    with the keys i, j, shift, distance and vector, or an object with attributes of these names, is also
-    accepted. Single pairs are accepted too: a list of tuples (i, j), or one array with a row (i, j) for each
-    pair. A Python list of lists is always read as arrays, not as pairs, since some such lists would be
-    ambiguous.
+    vector), or i and j with any of the other arrays. The arrays are recognized by shape: one number per row
+    is a distance, the first array with three integers per row is the shift, and another array with three
+    numbers per row is the vector. A mapping with the keys i, j, shift, distance and vector, or an object with
+    attributes of these names, is also accepted. Single pairs are accepted too: a list of tuples (i, j), or
+    one array with a row (i, j) for each pair. A Python list of lists is always read as arrays, not as pairs,
+    since some such lists would be ambiguous.
 
     Raises:
         Malformed: the value has none of these forms.
@@ -79,7 +79,7 @@ def read(given: Any) -> ListAnswer:
 
 
 def parts(given: Any) -> dict[str, Any]:
-    """Return the arrays of a neighbor list's result, named as in `ListAnswer`, with at least i and j.
+    """Return the arrays in the result of a neighbor list, named as in `ListAnswer`, with at least i and j.
 
     Raises:
         Malformed: the value is not a list of pairs.
@@ -101,7 +101,7 @@ def parts(given: Any) -> dict[str, Any]:
 
 
 def _one_by_one(given: Any) -> dict[str, Any]:
-    """Return the arrays i and j from rows that contain pairs (i, j)."""
+    """Return the arrays i and j from rows (i, j)."""
     table = _array(given, "the answer")
     if table.size == 0 and table.ndim:
         table = np.zeros((0, 2), np.int64)

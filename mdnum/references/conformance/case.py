@@ -47,7 +47,7 @@ Length = Annotated[FiniteFloat, Ge(0)]
 
 @dataclass(frozen=True)
 class Still:
-    """Positions of the atoms, with cell and skin, at one call of a neighbor list."""
+    """Positions of the atoms and cell vectors at one call of a neighbor list."""
 
     positions: Rows  # length, shape (atoms, 3)
     cell: Vectors  # lattice vectors as rows, length; rows of axes that do not repeat may hold anything finite
@@ -61,7 +61,7 @@ class Still:
 
 @dataclass(frozen=True)
 class Case:
-    """A test case: atoms in a box at one call or several, and a cutoff."""
+    """A test case: atoms in a box, at one or several calls of a neighbor list, and a cutoff."""
 
     name: str  # what is special, in words
     area: str  # a key of `AREAS`
@@ -90,7 +90,7 @@ class Case:
         return replace(self, stills=self.stills[:steps])
 
     def only(self, atoms: ndarray) -> Case:
-        """Return the test case with only some atoms, in the given order, at every call where these exist."""
+        """Return the test case with only some of the atoms, in the given order."""
         stills = tuple(
             replace(still, positions=still.positions[atoms[atoms < len(still.positions)]])
             for still in self.stills
@@ -132,7 +132,7 @@ def once(
     r_cut: float = 1.0,
     known: PairSet | None = None,
 ) -> Case:
-    """Return a test case with a single call; without a cell, the atoms are not in a box."""
+    """Return a test case with one call of the neighbor list; without a cell, atoms are not in a box."""
     if cell is None:
         cell, pbc = np.zeros((3, 3)), False
     return Case(name, area, (Still(positions, matrix(cell)),), _axes(pbc), float(r_cut), known=known)
@@ -147,7 +147,7 @@ def sequence(
     skin: float = 0.3,
     pbc: bool | Sequence[bool] = True,
 ) -> Case:
-    """Return a test case with successive calls, each given by positions or by (positions, cell)."""
+    """Return a test case with several calls, each with positions or a tuple (positions, cell)."""
     places = (place if isinstance(place, tuple) else (place, cell) for place in path)
     stills = tuple(Still(positions, matrix(box)) for positions, box in places)
     return Case(name, area, stills, _axes(pbc), float(r_cut), float(skin))

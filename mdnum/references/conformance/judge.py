@@ -33,7 +33,7 @@ SILENT = ("CRASHED", "NO_ANSWER", "RAISED")  # those of cases in which nothing c
 
 @dataclass(frozen=True)
 class Truth(PairSet):
-    """Exact pairs at one call in a test case, inside the cutoff and out to a larger distance."""
+    """Exact pairs at one call of a test case, inside the cutoff and out to a larger distance."""
 
     # positions, cell: as the list was given them; rows of axes that do not repeat are zero
     positions: ndarray
@@ -46,16 +46,16 @@ class Truth(PairSet):
     reach: float  # pairs as far as this may be listed, length; the cutoff unless a list holds a skin
 
     def needed(self, unit: float) -> ndarray:
-        """Return a mask of the pairs that a neighbor list with this unit roundoff must contain."""
+        """Return a mask of the exact pairs that a list must contain if computed with this unit roundoff."""
         return self.distance < self.r_cut - unit * self.scale
 
     def allowed(self, unit: float) -> ndarray:
-        """Return a mask of the pairs that a neighbor list with this unit roundoff may contain."""
+        """Return a mask of the exact pairs that a list may contain if computed with this unit roundoff."""
         return self.distance <= self.reach + unit * self.scale
 
 
 def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DOUBLE) -> Truth:
-    """Compute the exact pairs of a test case at one of its calls.
+    """Compute the exact pairs of a test case at one of its neighbor-list calls.
 
     Args:
         reach: largest distance of the pairs, length; the cutoff by default.
@@ -81,7 +81,7 @@ def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DO
 
 
 def conditioning(cell: ndarray, pbc: ndarray) -> float:
-    """Factor (at least 1) by which conversion to fractional coordinates and back amplifies rounding errors.
+    """Factor by which conversion to fractional coordinates and back can amplify rounding errors, at least 1.
 
     Source: Higham, Accuracy and Stability, 2nd ed., section 7.1: the condition number of the periodic lattice
     vectors, each scaled to length 1 because lengths alone have no effect.
@@ -118,7 +118,7 @@ def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tup
 
 @dataclass(frozen=True)
 class Conventions:
-    """Conventions of a neighbor list; no choice among these conventions counts as an error."""
+    """Conventions of a neighbor list, such as the sign of shifts; any choice is accepted as correct."""
 
     full: bool = True  # every pair from both of its atoms (True), or once (False)
     sign: int = 1  # +1 where shifts are added to atom j, -1 where they are added to atom i
@@ -136,7 +136,7 @@ class Failure:
 
     @property
     def kind(self) -> tuple[str, str]:
-        """Error code and exception message; a reduced test case must reproduce both."""
+        """Error code and exception message, which must stay the same when the test case is reduced."""
         text = self.text if self.code in ("RAISED", "CRASHED", "MALFORMED") else ""
         return self.code, without_numbers(text)
 
@@ -147,10 +147,10 @@ def without_numbers(text: str) -> str:
 
 
 def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Return all errors in the pairs from a neighbor list; empty if the list conforms.
+    """Return all errors in the pairs from a neighbor list; an empty list if there are none.
 
-    A pair within rounding error of the cutoff (`Truth.scale` times the list's unit roundoff) may be present
-    or absent, but must be listed consistently from both of its atoms.
+    A pair within rounding error of the cutoff (`Truth.scale` times the unit roundoff) may be present or
+    absent, but both of its atoms must agree.
 
     Args:
         truth: exact pairs, including all distances at which pairs may be listed.
@@ -261,7 +261,7 @@ def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, 
 
 
 def _shift_hint(answer: ListAnswer, truth: Truth, how: Conventions) -> str:
-    """Return a hint, as text, at a shift convention that would explain wrong shifts."""
+    """Return, as text, the shift convention that would explain wrong shifts."""
     assert answer.shift is not None
     if not _compare(answer, truth, replace(how, sign=-how.sign)):
         return "; added to the other atom they are right"
@@ -309,7 +309,7 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """Return the rounding error (`CaseResult.single`) of a result that is correct in float32, else None."""
+    """Return the rounding error of a result that is correct for float32 or better; None for others."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))
@@ -371,7 +371,7 @@ class Failed:
 
     @property
     def worst(self) -> Failure:
-        """The most severe failure of the test case, which is reported."""
+        """The most severe failure in the test case; only this one is reported."""
         return min(self.failures, key=lambda failure: CODES.index(failure.code))
 
     @property
@@ -384,7 +384,7 @@ class Failed:
 class CaseAnswers:
     """Results of all test cases, by number of the test case, and failures reduced to a few atoms.
 
-    When an examination is resumed, the same seed gives the same test cases, so these are not stored.
+    Test cases are not stored, because a resumed examination draws the same test cases from the same seed.
     """
 
     cases: dict[str, CaseResult] = field(default_factory=dict)
@@ -432,7 +432,7 @@ class AreaTally:
 
     @property
     def failed(self) -> int:
-        """Number of test cases with wrong pairs, or with an error instead of pairs."""
+        """Number of test cases with wrong pairs, or with an exception instead of pairs."""
         return sum(self.codes.values())
 
     @property
@@ -512,16 +512,16 @@ class Report:
             tally.why[result.refused[1]] = tally.why.get(result.refused[1], 0) + 1
 
     def reach(self, case: Case) -> float:
-        """Return the largest pair distance (length) allowed in a list with pairs beyond the cutoff.
+        """Return the largest distance (length) of pairs in a list that may include pairs beyond the cutoff.
 
-        Since the list was built, both atoms of a pair may have moved as far as the skin allows.
+        Both atoms of a pair may have moved as far as the skin allows since the neighbor list was built.
         """
         usual = case.r_cut + 2 * case.skin if case.skin else 1.5 * case.r_cut
         own = 0.3 * (self.padding or 1.0)  # asked with a skin of 0.3 cutoffs
         return usual if own < 0.31 else max(usual, (1 + 2 * own) * case.r_cut)
 
     def total(self, count: str) -> int:
-        """Return the sum of one of the counts over all areas of the suite."""
+        """Return the sum of a count over all areas of the conformance suite."""
         return sum(getattr(tally, count) for tally in self.areas.values())
 
     @property

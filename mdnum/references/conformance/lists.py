@@ -19,13 +19,13 @@ from mdnum.registry import Registry
 
 
 class KeptList(Protocol):
-    """A neighbor list that is kept and updated; both methods return pairs in a form that `answer.read` takes.
+    """A neighbor list that is built once and then updated; pairs are returned as `answer.read` accepts them.
 
-    `allocate` builds a new list and may be called again on the same object; `update` receives the current
-    positions. The returned pairs must include every pair within r_cut at the current positions, and may
-    include pairs that are farther apart by less than the skin. If a neighbor list uses its own padding
-    instead of the given skin, an attribute `skin` must contain this padding (length); the attribute is read
-    after each `allocate`.
+    `allocate` builds a new neighbor list and may be called again on the same object; `update` receives the
+    current positions. The returned pairs must include every pair within r_cut at the current positions; they
+    may include pairs that are farther apart by less than the skin. If a neighbor list has its own padding
+    instead of the given skin, its attribute `skin` must contain this padding (length), which is read after
+    each `allocate`.
     """
 
     def allocate(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float, skin: float) -> Any:
@@ -35,7 +35,7 @@ class KeptList(Protocol):
     def update(self, positions: ndarray, cell: ndarray) -> Any:
         """Update the neighbor list to new positions and return its pairs.
 
-        The arguments may be the arrays of the previous call with new contents: store copies of the arguments.
+        The arguments may be the arrays of the previous call with new contents, so store copies.
         """
         ...
 
@@ -73,7 +73,7 @@ class ListLimits:
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
-        """Yield (whether a test case exceeds a limit, the limit as text), the fastest tests first."""
+        """Yield (whether a test case exceeds a limit, name of the limit), fastest tests first."""
         pbc, cells = np.array(case.pbc), [still.cell for still in case.stills]
         least = min(len(still.positions) for still in case.stills)
         yield least < self.atoms, f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"
@@ -139,7 +139,7 @@ class PairList:
 
     @property
     def version(self) -> str | None:
-        """Installed version of the neighbor list's package, or None."""
+        """Installed version of the package of the neighbor list; None if it is not known."""
         return self.package and version(self.package)
 
     @property
@@ -159,7 +159,7 @@ LISTS: Registry[PairList] = Registry("neighbor list", "mdnum.neighbor_lists")
 
 
 def source_of(made: Any) -> str:
-    """Return the source code of a function or class without decorators; empty if not available."""
+    """Return the source code of a function or class without decorators; empty if it is not available."""
     try:
         lines = inspect.getsource(made).splitlines(keepends=True)
     except (OSError, TypeError):
@@ -169,9 +169,9 @@ def source_of(made: Any) -> str:
 
 
 def from_object(made: Any, name: str | None = None, source: str | None = None) -> PairList:
-    """Return a `PairList` for a function, for a class of updatable lists, or for an instance of one.
+    """Return a `PairList` made from a function, from a class of updatable lists, or from an updatable list.
 
-    Declared properties are read from the attributes `full` (bool), `unit` (roundoff), `superset` (bool) and
+    Its properties are read from the attributes `full` (bool), `unit` (roundoff), `superset` (bool) and
     `limits` (`ListLimits`) of the object, if present.
 
     Raises:
@@ -204,7 +204,7 @@ def from_object(made: Any, name: str | None = None, source: str | None = None) -
 
 
 def _check_signatures(made: Any, name: str, kept: bool) -> None:
-    """Raise InputError if a neighbor list cannot be called with the suite's arguments."""
+    """Raise InputError if the signature of a neighbor list does not accept the suite's arguments."""
     is_class = inspect.isclass(made)
     calls: list[tuple[str, Any, tuple[str, ...]]] = []
     if is_class or not kept:

@@ -1,12 +1,12 @@
 """Motion sequences that test updatable neighbor lists with the smallest motions that require a rebuild.
 
-A pair that is just beyond r_cut + padding when the list is built enters the cutoff when its two atoms have
-approached by the padding; the smallest motion that achieves this is along the line between the two atoms. The
-list is rebuilt in time, for any direction and any motion of other atoms, if the rebuild criterion tests
-whether two atoms could have approached by the padding. Each sequence of `motions` therefore brings a pair
-closer by slightly more than the padding: along axes, diagonals and random directions; by moving both atoms or
-one, in any proportion; alone, among atoms at rest, among hundreds of atoms that move little, among others
-with the same motion or a common drift; in one step, slowly, and back and forth.
+A pair just beyond r_cut + padding when the list is built is inside the cutoff after its two atoms have
+approached by the padding; the smallest such motion is along the line between the two atoms. A rebuild
+criterion is sufficient if it tests whether two atoms could have approached by the padding, in any direction
+and whatever other atoms do. Each sequence of `motions` brings a pair closer by slightly more than the
+padding: along axes, diagonals and random directions; by moving both atoms or one, in any proportion; alone,
+among atoms at rest, among hundreds of atoms that move little, or among atoms with the same motion or a common
+drift; in one step, slowly, or back and forth.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def movers() -> Iterator[Case]:
 
 
 def sequences() -> Iterator[Case]:
-    """Yield sequences for a list that is rebuilt at each call, to test that it keeps no internal state."""
+    """Yield sequences for a neighbor list that is built at each call, to test that no state is kept."""
     for case in _reuse():
         yield replace(case, skin=0.0)
 
@@ -58,7 +58,7 @@ def _two(apart: float) -> ndarray:
 
 
 def _beside(apart: float) -> ndarray:
-    """Return positions of two atoms at a given distance along x; the first atom is always at `_MIDDLE`."""
+    """Return positions of two atoms at a given distance along x, with the first atom at `_MIDDLE`."""
     return np.array([_MIDDLE, _MIDDLE + np.array([apart, 0, 0])])
 
 
@@ -166,7 +166,7 @@ def _strain() -> Script:
 
 
 def _narrow() -> Iterator[Case]:
-    """Yield boxes so narrow that several images of a pair, or images of one atom, are inside the cutoff."""
+    """Yield boxes so narrow that several images of a pair, or of an atom itself, are within the cutoff."""
     skewed = np.array([[0.9, 0, 0], [0.5, 0.8, 0], [-0.4, 0.3, 0.85]])
     for word, count, cell, pbc in (
         ("an atom alone, edges of 0.8 cutoffs", 1, 0.8, True),
@@ -205,7 +205,7 @@ def _reuse() -> Iterator[Case]:
 
 
 def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = None) -> Case:
-    """Return a test case that builds a new list at every step, or at every step with a given skin."""
+    """Return a test case that builds a new neighbor list at every step, or where a skin is given."""
     case = sequence(name, "reuse", path, _L, _R, max(filter(None, skins)) if skins else _SKIN)
     starts = zip(case.stills, skins or [None] * len(path), strict=True)
     stills = (replace(still, fresh=skin is not None or not skins, skin=skin) for still, skin in starts)
@@ -213,7 +213,7 @@ def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = Non
 
 
 def motions(padding: float | None = None) -> Iterator[Case]:
-    """Yield sequences of small motions, short sequences first; `Case.motions` counts the motions.
+    """Yield sequences of small motions, short sequences first; `Case.motions` counts these motions.
 
     Args:
         padding: measured or declared padding of the list, in units of the given skin; if None, the given skin
@@ -275,12 +275,12 @@ def _ways() -> list[ndarray]:
 
 
 def _closing(room: float) -> float:
-    """Return the decrease in distance that takes a pair from just beyond the padding into the cutoff."""
+    """Return the decrease in distance that moves a pair from just beyond the padding into the cutoff."""
     return (1 + 2 * HAIR) * room
 
 
 def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
-    """Return pairs at a distance just beyond the padding; the first atoms of all pairs come first."""
+    """Return pairs of atoms just beyond r_cut + padding; the first atoms of all pairs come first."""
     half = (_R + (1 + HAIR) * room) / 2 * way
     return np.vstack([middle - half, middle + half])
 
@@ -288,7 +288,7 @@ def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
 def _walk(
     room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float] = (0.0, 1.0)
 ) -> list[ndarray]:
-    """Return the path of two atoms that approach each other by given fractions of the smallest motion."""
+    """Return a path of two atoms that approach each other by given fractions of the smallest motion."""
     start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
@@ -308,8 +308,8 @@ def _squeezed(room: float, way: ndarray, edge: float, n: int, along: bool) -> li
 def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
     """Return a path on which two of many atoms approach each other; the others rest or move slightly.
 
-    The fraction of the motion made by each of the two atoms depends on `n`. The index of the atom that moves
-    most varies evenly over all indices; its partner's index is random.
+    The fraction of the motion that each of the two atoms makes depends on `n`. The index of the atom that
+    moves most varies evenly over all indices; its partner's index is random.
     """
     rng = np.random.default_rng(170 + n)
     most = int(count * (1.0 - (n + 1) * _GOLDEN % 1.0))
@@ -346,7 +346,7 @@ def _dozen(room: float, way: ndarray, share: float, n: int) -> list[ndarray]:
 
 
 def _in_turn(room: float, ways: list[ndarray]) -> Case:
-    """Return a test case in which 50 atoms (25 pairs) move in turn, to find atoms ignored by a criterion."""
+    """Return a test case in which 50 atoms (25 pairs) move in turn, to find atoms that a list ignores."""
     count = 25
     way = np.array([ways[n % len(ways)] for n in range(count)])
     start = _around(_places(count, 15.0, 0), room, way)
@@ -394,13 +394,13 @@ def _direction(way: ndarray) -> str:
 
 
 def _places(count: int, edge: float, n: int) -> ndarray:
-    """Return positions for pairs, far from one another and in random order."""
+    """Return well-separated positions for pairs of atoms, in random order."""
     side = int(np.ceil(count ** (1 / 3)))
     return edge * np.random.default_rng(200 + n).permutation((grid(side) + 0.5) / side)[:count]
 
 
 def _sequence(name: str, paths: Iterable[list[Any]], cell: float | ndarray, skin: float = _SKIN) -> Case:
-    """Return a test case of successive motions, separated by large moves that make any criterion rebuild."""
+    """Return a test case of successive motions, separated by large moves that force a rebuild."""
     paths = list(paths)
     case = sequence(name, "rule", [still for path in paths for still in path], cell, _R, skin)
     return replace(case, motions=len(paths))

@@ -1,8 +1,8 @@
 """Neighbor searches of libraries, and lookup of any neighbor list by name or `module:function`.
 
-Every function and class in this module imports what it requires and uses nothing else from this module, since
+Every function and class in this module imports what it requires and uses nothing else in the module, since
 its source is copied into scripts that reproduce a failure without mdnum. Each function calls its library as a
-user would and corrects nothing: atoms outside the box, unusual cells and few atoms are passed on unchanged.
+user would, and passes on atoms outside the box, unusual cells and few atoms unchanged.
 """
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalCall=false
@@ -34,7 +34,7 @@ def _declared(name: str) -> dict[str, Any]:
 
 
 def peer(*names: str, helpers: Sequence[Any] = ()) -> Callable[[Any], Any]:
-    """Return a decorator that registers a function or a class of updatable lists in `LISTS` under some names.
+    """Return a decorator that registers a function or a class of neighbor lists in `LISTS` under some names.
 
     Args:
         names: names listed in peers.toml.
@@ -94,7 +94,7 @@ def ase_neighbor_list(positions, cell, pbc, r_cut):
 
 @peer("ase-skin")
 class AseSkinList:
-    """The class ase.neighborlist.NeighborList of ASE, with a skin that each of two atoms may use up."""
+    """The class ase.neighborlist.NeighborList of ASE, with a skin for each of the two atoms of a pair."""
 
     kept = pbc = None
 
@@ -367,7 +367,7 @@ def mdnum_host_list(positions, cell, pbc, r_cut):
 
 
 def known() -> tuple[PairList, ...]:
-    """Return all neighbor lists that have a name, even if their packages are not installed."""
+    """Return all registered neighbor lists, even if their packages are not installed."""
 
     def named(name: str) -> PairList:
         listed = LISTS[name]
@@ -380,7 +380,7 @@ def known() -> tuple[PairList, ...]:
 
 
 def installed() -> tuple[PairList, ...]:
-    """Return the neighbor lists that have a name and whose packages are installed."""
+    """Return the registered neighbor lists whose packages are installed."""
     return tuple(listed for listed in known() if not listed.lacks)
 
 

@@ -48,7 +48,7 @@ def catalog() -> Iterator[Case]:
 
 
 def crowds() -> Iterator[Case]:
-    """Yield test cases with very many neighbors per atom, in isolated clusters and in a dilute gas."""
+    """Yield test cases with very many neighbors per atom, in isolated clusters or in a dilute gas."""
     return (once(name, "crowded", *rest) for name, *rest in _crowds())
 
 
@@ -122,8 +122,7 @@ def _outside() -> Named:
 def _across_walls() -> ndarray:
     """Return pairs along x: one atom just below a multiple of the cutoff, the other almost a cutoff lower.
 
-    If one of these atoms is assigned to the next cell, as after rounding to float32, its partner is two cells
-    away.
+    If an atom is assigned to the next cell, as after rounding to float32, its partner is two cells away.
     """
     hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
     pairs = []
@@ -164,10 +163,10 @@ def _crowds() -> Named:
 
 
 def vast() -> Iterator[Case]:
-    """Yield few atoms in a volume so large that a cell grid exceeds the memory or 32-bit indices.
+    """Yield few atoms in a volume so large that a cell grid needs too much memory or 64-bit indices.
 
-    These test cases are for neighbor lists in a separate process, since allocating such a grid terminates the
-    process.
+    These test cases are for neighbor lists in a separate process, since a list that allocates such a grid may
+    be killed.
     """
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
     yield once("two pairs thousands of cutoffs apart, free", "axes", apart)
@@ -178,7 +177,7 @@ def vast() -> Iterator[Case]:
 def lattice(edge: int, seed: int = 0) -> Case:
     """Return a cubic lattice with vacancies at integer positions; atom order and images are random.
 
-    The neighbors of each atom are on the 26 sites around it, and are found by indices modulo the edge,
+    The neighbors of each atom are on the 26 sites around it; they are found by indices modulo the edge,
     without search or rounding.
 
     Args:
@@ -300,7 +299,7 @@ def cases(draw: Any, most: int = 40) -> Case:
 
 
 def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
-    """Return the largest number of lattice vectors between atoms of a pair inside the cutoff."""
+    """Return how many lattice vectors apart, along each axis, a pair inside the cutoff can be."""
     if not any(pbc):
         return 1
     width = widths(completed(cell, np.array(pbc)))
@@ -310,7 +309,7 @@ def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
 def _positions(
     place: str, count: int, cell: ndarray, pbc: ndarray, r_cut: float, rng: np.random.Generator
 ) -> tuple[ndarray, float]:
-    """Return positions and the cutoff; for atoms "at the cutoff", this is the distance of a pair."""
+    """Return positions and a cutoff; for atoms "at the cutoff", the cutoff is the distance of a pair."""
     full = completed(cell, pbc)
     # free axes have vectors of length 1, which would be no room
     room = np.where(pbc, 1.0, np.maximum(1.0, 3.0 * r_cut / np.linalg.norm(full, axis=1)))
@@ -399,7 +398,7 @@ def lattices() -> Iterator[Case]:
 
 
 def as_kept(tested: PairList, asked: Iterable[Case]) -> Iterator[Case]:
-    """Yield test cases with a single call; for an updatable neighbor list, a skin is added."""
+    """Yield test cases with a single call, with a skin if the neighbor list is an updatable one."""
     for case in asked:
         yield replace(case, skin=0.3 * case.r_cut) if tested.kept else case
 
@@ -449,7 +448,7 @@ def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
 
 
 def _wrapped(still: Still, pbc: ndarray) -> Still:
-    """Return one call of a test case with the atoms wrapped into the box."""
+    """Return the atoms of a test case at one call, wrapped into the box."""
     if not pbc.any() or not len(still.positions):
         return still
     matrix = completed(still.cell, pbc)

@@ -45,7 +45,7 @@ _BORROWED = frozenset({"numpy", "scipy", "numba", "pandas", "torch", "jax", "jax
 
 @dataclass(frozen=True)
 class CallOutcome:
-    """Pairs or error from one call of a neighbor list."""
+    """The pairs or the error from one call of a neighbor list."""
 
     answer: ListAnswer | None = None  # the pairs, or None
     # why there is no answer, or None: it crashed, came too late, raised or returned no pairs
@@ -59,7 +59,7 @@ class CallOutcome:
 
 
 class Session:
-    """Calls of one neighbor list; with `reuse`, the same object is used for all test cases."""
+    """Calls a neighbor list; with `reuse`, the same object of the list is used for all test cases."""
 
     starts, deadline = 0, Deadline()  # of a process; calls in this one have none
 
@@ -69,11 +69,11 @@ class Session:
         self._returned: list[ndarray] = []
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """Return the outcome of every call in a test case, up to the first call that returns no pairs."""
+        """Return the pairs or error of every call in a test case, up to the first call without pairs."""
         return list(self.outcomes(case))
 
     def outcomes(self, case: Case) -> Iterator[CallOutcome]:
-        """Yield the outcome of every call in a test case, up to the first call that returns no pairs."""
+        """Yield the pairs or error of every call in a test case, up to the first call without pairs."""
         if self._made is None or (self.tested.kept and not self.reuse):
             try:
                 self._made = self.tested.make()
@@ -97,7 +97,7 @@ class Session:
                 return
 
     def close(self) -> None:
-        """Release the neighbor list object."""
+        """Release the object of the neighbor list."""
         self._made, self._returned = None, []
 
     def _call(
@@ -156,10 +156,10 @@ def _failed(error: Exception | SystemExit, case: Case, package: str | None) -> C
 
 
 def meant(error: Exception, package: str | None = None) -> bool:
-    """Return whether an exception was raised deliberately for an unsupported input, not by accident.
+    """Return whether an exception was raised deliberately because the input is not supported.
 
     A deliberate exception prevents a calculation with wrong pairs. An accidental exception, such as a
-    ValueError from `min()` of an empty array, only shows that the input was not anticipated.
+    ValueError from `min()` of an empty array, shows that the input was not anticipated.
 
     Args:
         error: the exception, with its traceback.
@@ -245,7 +245,7 @@ def _value(name: ast.expr, place: TracebackType) -> Any:
 class RemoteSession:
     """Calls of one named neighbor list in a separate process.
 
-    A new process is started after a process has ended, since a crash is a finding and must not end the suite.
+    If the process ends, a new one is started, since a crash is a finding and must not end the suite.
     """
 
     most = np.inf  # seconds that an answer may take, where that is less than usual
@@ -260,7 +260,7 @@ class RemoteSession:
         self._from = 0
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """Return the outcome of every call in a test case, up to the first call that returns no pairs.
+        """Return the pairs or error of every call in a test case, up to the first call without pairs.
 
         Raises:
             TimeUp: the deadline passed during the call; the separate process is terminated.
@@ -334,7 +334,7 @@ class RemoteSession:
 
 
 class _Ended(Exception):
-    """Raised when the separate process has ended; `failure` describes the way in which it ended."""
+    """Raised when the separate process has ended; `failure` describes how it ended."""
 
     def __init__(self, failure: Failure):
         super().__init__(failure.text)
@@ -342,7 +342,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Kill a process that does not respond within its time limit, and describe the delay in `late`."""
+    """Kill a process that exceeds its time limit for an answer, and describe the delay in `late`."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):

@@ -73,7 +73,7 @@ def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None)
 
 
 def _only(case: Case, atoms: list[int]) -> Case:
-    """Return the test case with only some atoms; a small test case discards its precomputed pairs."""
+    """Return the test case with only some atoms; precomputed pairs of a small test case are discarded."""
     smaller = case.only(np.array(atoms, int))
     return replace(smaller, known=None) if len(atoms) <= 400 else smaller
 
@@ -148,7 +148,7 @@ def deepest(failures: Failures, failed: Failed) -> Failed:
 
 
 def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline) -> Failed:
-    """Reduce a failure to few atoms and calls, and run its script if possible."""
+    """Reduce a failure to few atoms and calls, and run the script that reproduces it if possible."""
 
     def failures(case: Case) -> Sequence[Failure]:
         with suppress(TimeUp):

@@ -50,7 +50,7 @@ _REFUSALS = 6  # refusals that are examined; a list with more kinds of them has 
 
 
 class Examiner:
-    """Runs test cases on a neighbor list and checks the pairs, after determining the list's conventions.
+    """Determines the conventions of a neighbor list, runs test cases on the list, and checks its pairs.
 
     Args:
         reuse: use one object of the neighbor list for all test cases.
@@ -72,7 +72,7 @@ class Examiner:
             self._find_conventions()
 
     def _find_conventions(self) -> None:
-        """Determine from simple test cases whether the list is full, and the signs of shifts and vectors."""
+        """Determine from simple cases whether pairs are listed twice, and the signs of shifts and vectors."""
         tested, report = self.tested, self.report
         full, sign, toward = tested.full, 1, 1
         triple = once("a triple through a face", "few", [[0.2, 2, 2], [3.8, 2.1, 2], [0.5, 2.4, 2.2]], 4.0)
@@ -103,7 +103,7 @@ class Examiner:
             self._find_padding()
 
     def _find_padding(self) -> None:
-        """Determine whether an updatable list returns the pairs within its skin, and up to which distance.
+        """Determine whether an updatable list returns pairs beyond the cutoff, and up to which distance.
 
         The padding is the declared one, or the distance from the cutoff to the nearest pair missing from the
         list.
@@ -209,7 +209,7 @@ class Examiner:
 
 
 def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
-    """Return the numbers of listed and unlisted pairs exactly at the cutoff, for a case without rounding."""
+    """Return the numbers of listed and unlisted pairs exactly at the cutoff, in a case without rounding."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
         return 0, 0  # on small integers no arithmetic rounds
@@ -224,7 +224,7 @@ def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
 
 
 def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
-    """Return the exact pairs at a call, plus all pairs that were exact at a call since the list was built."""
+    """Return the exact pairs at a call, including those at earlier calls since the list was built."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
@@ -368,7 +368,7 @@ def _keeps_order(examiner: Examiner) -> bool | None:
 
 
 def _too_long(report: Report, case: Case) -> str | None:
-    """Return the reason if a large test case would take too long (judged from the previous one), or None."""
+    """Return a reason if a large test case would take too long (judged from the previous one), or None."""
     if report.large is None:
         return None
     atoms, seconds = report.large
@@ -378,7 +378,7 @@ def _too_long(report: Report, case: Case) -> str | None:
 
 
 def _refusals(examiner: Examiner) -> list[RefusalKind]:
-    """Return each kind of rejected test case, with the variants in which the neighbor list returns pairs.
+    """Return each kind of rejected test case, with variants for which the neighbor list returns pairs.
 
     Each variant of a test case is run in a new process, or with a new object.
     """
@@ -396,9 +396,9 @@ def _refusals(examiner: Examiner) -> list[RefusalKind]:
 
 
 def distinct(failed: Iterable[Failed]) -> list[Failed]:
-    """Return the smallest failure of each kind, since one error causes failures in many test cases.
+    """Return the smallest failure of each kind, since one error can cause failures in many test cases.
 
-    Failures with the same code and equal numbers of atoms, calls and periodic axes are taken for one error;
+    Failures with the same code and equal numbers of atoms, calls and periodic axes are counted as one error;
     exceptions and malformed results are compared by message, ignoring numbers.
     """
 
