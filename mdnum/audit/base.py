@@ -128,7 +128,7 @@ def finding(
     """
     if left := [test for test in cause(code).tests if test not in tests]:
         raise ValueError(
-            f"{code} was reported without the tests that distinguish it from "
+            f"the finding {code} was reported without the tests that distinguish it from "
             f"{', '.join(cause(code).rivals)}: {left}"
         )
     return Observed(code, severity, [one for one in variants if one], values)

@@ -94,7 +94,7 @@ def _of_system(text: str) -> LoadedCalculator:
                 remedy=f"For a class, put a colon before its name: {module}:{last}",
             ) from error
         raise InputError(
-            f"{error.message}; nor is it a class or a Python file",
+            f"{error.message}, and it is not a class or a Python file",
             where=error.where,
             remedy=f"{error.remedy}. {_WAYS}" if error.remedy else _WAYS,
         ) from error

@@ -276,7 +276,7 @@ def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
         if not float(rule.enter) >= float(rule.rule.tol):
             raise InputError(
                 f"enter = {rule.enter} is below tol = {rule.rule.tol}",
-                remedy="Set enter to at least tol: solving starts at residuals above enter, ends below tol",
+                remedy="Set enter to at least tol: a solve starts above enter and ends below tol",
             )
         return
     tol = float(rule.tol)

@@ -252,8 +252,8 @@ def calibrate(
     changes = planted(simulation) if changes is None else changes
     if not any(change.must_fail for change in changes):
         raise InputError(
-            "no planted change has must_fail = True, so the test could not fail",
-            remedy="Add a planted change that must be detected",
+            "no deliberate change has must_fail = True, so the test could not fail",
+            remedy="Add a deliberate change that the test must detect",
         )
     tried = [steps] if steps is not None else _windows(simulation, start)
     nodes = nodes_of(simulation, start or first_state(simulation))
@@ -312,7 +312,7 @@ def choose(windows: Sequence[Window], name: str) -> Window:
         if not one.ok
     )
     raise InputError(
-        f"the planted changes cannot be distinguished from rounding errors after {steps} steps (step "
+        f"the deliberate changes cannot be distinguished from rounding errors after {steps} steps (step "
         f"{best.step}: {missed})",
         where=name,
         remedy=(

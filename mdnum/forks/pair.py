@@ -179,7 +179,7 @@ def counterfactuals(
     most = repeats_asked(repeats, runs, reason or "such runs are disabled")
     if back and not runs:
         raise InputError(
-            f"A is run with B's decisions only if B is also run with A's decisions, but it is not: "
+            f"A can be run with B's decisions only if B is run with A's decisions, which is not done: "
             f"{reason or 'such runs are disabled'}",
             remedy="Omit the option `back`",
         )

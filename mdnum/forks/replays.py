@@ -162,7 +162,7 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
     named = re.fullmatch(r"(\d+)\s*[-–]\s*(\d+)(?::(\d+)\.\.(\d+))?", text.strip())
     if named is None:
         raise InputError(
-            f"{text!r} names no decision", where="pin", remedy="Write fork, 3-75 or 3-75:600..700"
+            f"{text!r} does not name a decision", where="pin", remedy="Write fork, 3-75 or 3-75:600..700"
         )
     pair = int(named[1]), int(named[2])
     _check_pair(pair, atoms)
@@ -251,7 +251,7 @@ def minimal_cause(
     """
     split = fork.dates.split
     if fork.dates.fork is None or split is None or fork.decision is None:
-        raise InputError("the runs did not split", remedy="Run longer, or with a smaller split tolerance")
+        raise InputError("the runs did not split", remedy="Use more steps or a smaller split tolerance")
     check_pins(fork)
     atoms = fork.twin.a.size
     # pairs that differ before the split, in the order in which they first do

@@ -123,7 +123,7 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
         out += below or [parameters.resolve(simulation, word, known)]
     if not out:
         raise InputError(
-            "no parameter to differentiate with respect to", remedy=f"Choose from {', '.join(known)}"
+            "no parameter was given for the derivative", remedy=f"Choose from {', '.join(known)}"
         )
     return tuple(dict.fromkeys(out))
 

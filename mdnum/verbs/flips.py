@@ -336,7 +336,7 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
             if kinds[0] not in _STRUCTURES and len(open_trajectory(names[0]).sample()) > 1:
                 return
         raise InputError(
-            f"two paths mean two trajectories to compare, but {Path(names[0]).name} looks like the "
+            f"two paths are compared as trajectories, but {Path(names[0]).name} looks like the "
             f"topology of {Path(names[1]).name}",
             remedy=f"Write mdnum flips {second} -s {first}",
         )

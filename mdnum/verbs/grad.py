@@ -137,9 +137,7 @@ def _problem(
     loss = parse(of, simulation, last)
     if not names:
         remedy = f"Add --wrt NAME,NAME. The parameters are {', '.join(parameters.names(simulation))}"
-        raise InputError(
-            "no parameter to differentiate with respect to", where=simulation.name, remedy=remedy
-        )
+        raise InputError("no parameter was given for the derivative", where=simulation.name, remedy=remedy)
     if (problem := Problem(simulation, loss, last)).parts:
         raise loss.wrong(*NOT_REAL)
     return problem, parameters.resolve(simulation, names)
@@ -381,7 +379,7 @@ def _ball_system(
     known = ball.parameters(made.spec.contact.kind)
     unknown = [name for name in names if name not in known]
     if unknown or not (names or made.spec.gradient.of):
-        seen = f"no parameter {unknown[0]!r}" if unknown else "no parameter to differentiate with respect to"
+        seen = f"no parameter {unknown[0]!r}" if unknown else "no parameter was given for the derivative"
         raise InputError(
             seen, where=made.name, remedy=f"Add --wrt NAME,NAME. The parameters are {', '.join(known)}"
         )

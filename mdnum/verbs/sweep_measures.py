@@ -38,7 +38,7 @@ def _date(run: Sample, argument: str, name: str) -> Value:
     found = _pair(run, argument)
     step = getattr(found.dates, name)
     if step is None:
-        raise InputError(f"the runs do not {name} within {found.steps} steps", remedy="Run longer")
+        raise InputError(f"the runs do not {name} within {found.steps} steps", remedy="Use more steps")
     return Value(float(step * found.twin.a.timestep))
 
 
@@ -57,7 +57,7 @@ def separation(run: Sample, argument: str) -> Value:
     found = _pair(run, argument)
     grown = found.growth["B"]
     if not grown.plain:
-        raise InputError("the separation does not grow exponentially", remedy="Run longer")
+        raise InputError("the separation does not grow exponentially", remedy="Use more steps")
     return Value(float(grown.rate / found.twin.a.timestep))
 
 
@@ -72,7 +72,7 @@ def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
         raise InputError(f"{argument!r} is not of the form {_LOSS}", remedy=remedy)
     name, *others = parameters.resolve(simulation, [parameter])
     if others or np.ndim(parameters.value(simulation, name)):
-        raise InputError(f"{parameter} names several numbers", remedy="Name one of them")
+        raise InputError(f"{parameter} has several values", remedy="Give the name of one value")
     return parse(word, simulation, steps), name
 
 
@@ -105,9 +105,9 @@ def horizon(run: Sample, argument: str) -> Value:
     if found.trust is None:
         raise InputError(found.failed["trust"])
     if found.trust.verdict == "trusted":
-        raise InputError("the gradient is trusted to the end of the run", remedy="Run longer")
+        raise InputError("the gradient is trusted to the end of the run", remedy="Use more steps")
     if found.trust.verdict != "limited":
-        raise InputError(f"the horizon is undecided without a test of {', '.join(found.trust.unknown)}")
+        raise InputError(f"the horizon is undecided; not tested: {', '.join(found.trust.unknown)}")
     return Value(float(found.trust.horizon * run.simulation.integrator.timestep))
 
 

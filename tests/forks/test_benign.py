@@ -140,7 +140,7 @@ def test_what_cannot_be_judged_is_refused(hot):
         ("members = 5: too few", lambda: calibrate(hot, members=5)),
         ("steps = 0", lambda: calibrate(hot, steps=0)),
         ("tries = 0", lambda: calibrate(hot, tries=0)),
-        ("planted change", lambda: calibrate(hot, steps=100, changes=harmless)),
+        ("deliberate change", lambda: calibrate(hot, steps=100, changes=harmless)),
     ):
         with pytest.raises(InputError, match=message):
             call()
