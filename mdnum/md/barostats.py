@@ -96,7 +96,7 @@ def acted(x: Vector, a: Rate, *, fused: bool = False) -> Vector:
 
 
 class Barostat(Integrator):
-    """Base class of both barostats, with their common options.
+    """Base class of barostats, with the options common to all barostats.
 
     Attributes:
         kT: energy. pressure: energy/length³. relaxation, pressure_relaxation: internal time.
@@ -169,8 +169,8 @@ class MTK(Barostat):
     J. Phys. A 39, 5629 (2006), eq. 38 ff. A step applies the thermostat chains of box and atoms, the kick of
     the box by its excess pressure, the kick of the atoms, the drift in the changing box, and the same
     operators in reverse order. The inertia of the box is (N_f + 3) k_B T τ_p² (a third of this value for a
-    full box). The box has one degree of freedom, or six if it is full. The drift at box rate a is exact: x' =
-    x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
+    full box). An isotropic box has one degree of freedom, a full box six. The drift at box rate a is exact:
+    x' = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,

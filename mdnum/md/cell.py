@@ -96,10 +96,10 @@ class Cell(eqx.Module):
         return volume if volume > 0 else float("nan")
 
     def reach(self, positions: Float[np.ndarray, "atoms 3"]) -> Reach:
-        """Return magnitudes of the terms that are summed in displacements, as needed for rounding bounds.
+        """Return the magnitudes of coordinates and lattice vectors in displacements, for rounding bounds.
 
-        Along periodic axes, these magnitudes follow from the box. Along nonperiodic axes, the magnitudes
-        allow for motion of the atoms to twice their present distances.
+        Magnitudes along periodic axes follow from the box. Magnitudes along nonperiodic axes allow for motion
+        of the atoms to twice their present distances.
 
         Args:
             positions: initial positions of the atoms, length.
@@ -137,7 +137,7 @@ class Cell(eqx.Module):
     def deformation(self, now: Cell):
         """Return the deformation F from this box to another, shape (3, 3): new lattice rows = old rows @ F.
 
-        Directions along nonperiodic axes do not change. For equal lattice vectors, F is exactly the identity.
+        Directions along nonperiodic axes stay the same. If the boxes are equal, F is exactly the identity.
         """
         return np.eye(3) + self.inverse @ (now.matrix - self.matrix)
 
@@ -278,8 +278,8 @@ def wrap_positions(
     """Wrap positions, which may be far outside the box; return positions and the images that contained them.
 
     Error: the first pass subtracts n lattice vectors at once and rounds n*L; a second pass wraps positions
-    that are still outside due to this rounding. A coordinate may equal L after L is added to a tiny negative
-    number.
+    that are still outside due to this rounding. A wrapped coordinate may equal the edge length L after L is
+    added to a tiny negative number.
     """
     wrapped = np.array(positions, np.float64, copy=True)
     images = np.zeros(wrapped.shape, np.int64)
@@ -314,9 +314,9 @@ def strain_loss(reference: Cell, now: Cell, r_list):
     at most the skin. The function works on the host and inside jit.
 
     The bound uses sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|, where S is the symmetric part of F,
-    t a third of the trace of F, and |.| the Frobenius norm. No matrix decomposition is needed. The bound is
-    exact if the box keeps its shape; otherwise its error is at most 0.41 |S - t| plus the square of a
-    rotation.
+    t a third of the trace of F, and |.| the Frobenius norm. The bound requires no matrix decomposition. The
+    bound is exact if the box keeps its shape; otherwise its error is at most 0.41 |S - t| plus the square of
+    the rotation angle.
 
     Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
     """

@@ -1,7 +1,7 @@
 """Cutoffs: formulas that truncate, shift or switch a pair potential u(r) at the cutoff radius r_cut.
 
 Every cutoff maps the value u and slope w = du/d(r²) of the bare potential to the value and slope of the cut
-potential, for pairs inside the cutoff. The module `decide` determines the pairs inside.
+potential, for pairs inside the cutoff. The module `decide` determines which pairs are inside.
 
 A cutoff is a class with a formula `cut`, a name and a smoothness. All other parts of the package find the
 class by its name in `CUTOFFS`. A class may also define the independent implementation `reference` and the
@@ -75,7 +75,7 @@ class Cutoff(ABC):
 
     @property
     def continuous(self) -> Cutoff:
-        """Cutoff with the same forces and a continuous energy."""
+        """The same cutoff with a shifted, continuous energy; the forces are unchanged."""
         return self if self.smoothness >= 0 else Level(self)
 
     def reference(
@@ -138,12 +138,12 @@ _ORDERS = len(_DERIVATIVES) - 1
 def check(cutoff: type[Cutoff] | Cutoff) -> None:
     """Check that a cutoff's slope is the derivative of its energy, and its smoothness is as declared.
 
-    The test uses u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. Derivatives of the energy with respect
-    to r² (nested jvp) are computed at a distance of 2⁻⁴⁶ from r_cut and on both sides of the onset, up to one
-    order above the declared smoothness. At this highest order, the derivative must jump for at least one of
-    the two potentials. An energy difference above 1e-9 u(r_cut) counts as a jump, and so does a difference of
-    derivative k above 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k. Jumps at other distances and jumps of
-    derivatives beyond the sixth are not detected.
+    The test potentials are u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. Derivatives of the energy with
+    respect to r² (nested jvp) are computed at a distance of 2⁻⁴⁶ from r_cut and on both sides of the onset,
+    up to one order above the declared smoothness. The derivative one order above the declared smoothness must
+    jump for at least one potential. An energy difference above 1e-9 u(r_cut) counts as a jump, and so does a
+    difference of derivative k above 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k. Jumps at other distances and
+    jumps of derivatives beyond the sixth are not detected.
 
     Raises:
         ValueError: the test fails; the message contains the quantity and the distance.

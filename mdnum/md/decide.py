@@ -76,7 +76,7 @@ class PairDecider:
 
     @property
     def exact_thresholds(self) -> tuple[float, ...]:
-        """Thresholds by pair type in double precision, to which thresholds of other dtypes are rounded."""
+        """Thresholds by pair type in double precision; thresholds in other dtypes are rounded from these."""
         return tuple(threshold.value for threshold in replace(self, dtype="float64").thresholds)
 
     @cached_property
@@ -133,7 +133,7 @@ class PairDecider:
         return root(r2) if self.space == "r" else r2
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
-        """Return the compared quantity (r or r²) on the host, from components in the decision's dtype."""
+        """Return r or r², as compared in decisions, on the host; displacements have the decision's dtype."""
         r2 = dx * dx + dy * dy + dz * dz
         return np.sqrt(r2) if self.space == "r" else r2
 
@@ -294,7 +294,7 @@ class Changes(NamedTuple):
         return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(3, np.int64))
 
     def emptied(self) -> Changes:
-        """Return the same buffers, emptied."""
+        """Return the same buffers after removal of all changes."""
         return self._replace(count=jnp.zeros_like(self.count))
 
     @property

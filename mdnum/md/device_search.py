@@ -2,8 +2,8 @@
 
 An atom is compared with the atoms in neighboring bins, in the same order as in `md.host_search`, so that both
 searches build the same table from the same bins. A search copies two numbers to the host: the largest number
-of atoms in a bin, and the largest number of neighbors. The extent of the atoms along nonperiodic axes is
-copied, too.
+of atoms in a bin, and the largest number of neighbors. Extents of the atoms along nonperiodic axes are also
+copied to the host.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class Setfl:
 
 
 def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
-    """Read a setfl table with all digits, whatever the line breaks between numbers.
+    """Read a setfl table with all digits; line breaks between numbers are ignored.
 
     The reader of jax-md rounds all numbers to float32, which causes errors of 4e-4 eV/Å in the forces of
     copper.

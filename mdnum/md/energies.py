@@ -1,4 +1,4 @@
-"""User-defined energies over a neighbor list, and a common way to call functions of different conventions.
+"""User-defined energies over a neighbor list, called in a uniform way for any calling convention.
 
 Functions written for jax-md differ in the order of the arguments, the form of the box, real or fractional
 positions, neighbor lists with or without images, and the return value. The signature determines the order of
@@ -69,7 +69,7 @@ class Convention:
 
 @dataclass(frozen=True)
 class Call:
-    """An energy function of any convention, called with (parameters, positions, neighbor, cell)."""
+    """An energy function of any calling convention, called with (parameters, positions, neighbor, cell)."""
 
     function: Callable[..., Any]
     how: Convention

@@ -165,9 +165,9 @@ def _depth(model: CutPotential) -> float:
 class FixedPointDecider(PairDecider):
     """Decision whether a pair is inside the cutoff, by comparison of two integers.
 
-    The squared distance is an integer in units of the squared spacing. Each convention is converted to `r2 <
-    limit` with an integer limit. A margin is the difference to a threshold half a unit below the limit, so
-    that margins are never zero and have no rounding error.
+    The squared distance is an integer in units of the squared spacing. Every comparison is converted to the
+    form `r2 < limit` with an integer limit. A margin is the difference to a threshold half a unit below the
+    limit, so that margins are never zero and have no rounding error.
     """
 
     spacing: float = 1.0  # of positions, length
@@ -435,7 +435,7 @@ class FixedPointJudge(SlotJudge):
         return jnp.full(self.atoms, jnp.iinfo(jnp.int64).max, jnp.int64)
 
     def group(self, j, types):
-        """Return displacement, squared distance, decision and limit for neighbors j, in spacing units."""
+        """Return displacement, squared distance, decision and limit for neighbors j, in grid spacings."""
         d = displacements(self.components, self.cell, j)
         edge = float(2**REACH_BITS)
         # what is further away than any listed pair is outside; its square might not fit
@@ -493,7 +493,7 @@ class FixedPointForce(PairForce):
 
     @property
     def law(self) -> Guarded:
-        """The cut potential, evaluated with the same bits by every compiler."""
+        """The potential with its cutoff, in arithmetic that gives the same bits with every compiler."""
         return Guarded(self.model, self.zero, reproducible)
 
     def judge(self, positions: Float[Array, "3 atoms"]) -> FixedPointJudge:

@@ -99,7 +99,7 @@ class Integrator(eqx.Module):
     """Base class of integrators, which update positions and velocities between force evaluations.
 
     All fields except keyword-only fields are keys in a system file. Fields with units are declared by
-    `quantity`. Values of static fields are not converted.
+    `quantity`. Values of static fields are not converted between units.
 
     Example:
         >>> class NoseHoover(mdnum.Integrator): ...  # examples/thermostat.py is a whole one

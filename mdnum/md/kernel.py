@@ -484,7 +484,7 @@ def _divide_once(
     powers: dict[str, tuple[str, int]],
     block: str,
 ) -> None:
-    """Replace quotients by powers of the same number by products with its inverse; see `_written`.
+    """Replace divisions by powers of a number with multiplications by powers of its inverse.
 
     Args:
         block: name of the block to which the lines belong; names of inverse powers contain it.

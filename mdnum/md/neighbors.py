@@ -34,7 +34,7 @@ class RebuildRule:
     def first_allowed(self) -> int:
         """Smallest age, in steps, at which a neighbor list can be rebuilt.
 
-        LAMMPS calls a rebuild at this age dangerous, since it may have been necessary earlier."""
+        LAMMPS calls a rebuild at this smallest age dangerous, since it may have been necessary earlier."""
         return max(self.every, self.delay)
 
     @property
@@ -143,7 +143,7 @@ class HostBuilder:
 
 @dataclass(frozen=True)
 class JaxMdBuilder:
-    """List builder with jax-md's partition.neighbor_list, used in a way that avoids its pitfalls."""
+    """List builder with jax-md's partition.neighbor_list and workarounds for its known problems."""
 
     name: str = "jax-md"
 

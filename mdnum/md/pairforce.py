@@ -253,7 +253,7 @@ class PairForce(eqx.Module):
 
 
 class ChannelForce(PairForce):
-    """Forces of several terms with different cutoff radii, evaluated one after the other over one list.
+    """Forces of terms with different cutoff radii, evaluated one after the other over one neighbor list.
 
     The decisions of all terms are concatenated along the first axis.
     """

@@ -85,7 +85,7 @@ class PairPotential(eqx.Module):
         return self
 
     def split(self) -> tuple[Any, Any]:
-        """Return one copy with only per-pair-type parameters and one with only shared parameters."""
+        """Return two copies: one with per-pair-type parameters only, and one with shared parameters only."""
         return self, jax.tree.map(lambda _: None, self)
 
     @property
@@ -322,7 +322,7 @@ class SumPotential(PairPotential):
 
 
 class Together(Cutoff):
-    """Cutoffs of terms with a common pair decision; onsets, energies and slopes are tuples, by term."""
+    """Cutoffs of several terms with a common decision; onsets, energies and slopes are tuples, by term."""
 
     def __init__(self, ends: tuple[Cutoff, ...]):
         self.ends = ends
@@ -370,7 +370,7 @@ class CutPotential(eqx.Module):
 
     @property
     def parts(self) -> tuple[CutPotential, ...]:
-        """Channels of decisions; a single potential is its own channel."""
+        """Channels, one for each cutoff radius; a `CutPotential` has a single channel, itself."""
         return (self,)
 
     @property
@@ -487,7 +487,7 @@ class Channels(eqx.Module):
         return np.stack([np.asarray(block_diag(*one)) for one in sides])
 
     def astype(self, dtype) -> Channels:
-        """Return the sum with parameters as jax arrays of the given dtype."""
+        """Return a copy with all parameters as jax arrays of the given dtype."""
         return Channels(tuple(part.astype(dtype) for part in self.parts))
 
 

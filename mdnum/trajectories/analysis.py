@@ -139,7 +139,7 @@ class NeighborFlips(AnalysisBase):
 
     @classmethod
     def get_supported_backends(cls) -> tuple[str, ...]:
-        """Return the names of the backends to which frames can be distributed."""
+        """Return the names of the MDAnalysis backends to which frames can be distributed."""
         return ("serial", "multiprocessing", "dask")
 
     def __init__(

@@ -1,7 +1,7 @@
 """Detection of impossible collective motions of all atoms, caused by file damage that leaves finite numbers.
 
 A counter overflow gives every atom the same value of one coordinate, and a misread offset shifts all atoms.
-Planar systems, linear systems, drift and wrapping are not reported.
+Planar systems, linear systems, drift and wrapping are not reported as damage.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Collective:
         return None
 
     def left(self, x: Float[np.ndarray, "some 3"], atoms: int) -> str:
-        """Describe coordinates that all atoms shared in earlier frames and suddenly lost; "" if none."""
+        """Describe coordinates that were equal for all atoms but suddenly differ; "" if there are none."""
         last, was, level = self.last, self.level, (x == x[0]).all(axis=0)
         self.level = level if was is None else was & level
         if last is None or was is None or atoms <= _FEW or not was.any() or np.any(self.level):
@@ -108,7 +108,7 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
 
 
 def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
-    """Return (fraction of the atoms that have the most frequent coordinate value, its axis, the value).
+    """Return (fraction of the atoms with the most frequent coordinate value, axis of the coordinate, value).
 
     The fraction of the second most frequent value is subtracted; in a crystal, both values are equally
     frequent.
@@ -124,7 +124,7 @@ def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
 
 
 def _shift(before: np.ndarray, now: np.ndarray, far: float) -> float:
-    """Return the length of the displacement common to all atoms; 0 if it is small or not common to all."""
+    """Return the length of the displacement common to all atoms; 0 if small or if atoms move differently."""
     moved = now - before
     if len(now) < 2 or not far or np.abs(moved).max() <= far / (2 * _SUDDEN):
         return 0.0

@@ -162,7 +162,7 @@ class Pass:
 
     @property
     def odd(self) -> dict[str, Any] | None:
-        """Inconsistency of displacements with velocities and times, or None; see `separation.odd_flight`."""
+        """Inconsistency between displacements, velocities and times, or None; see `separation.odd_flight`."""
         return odd_flight(self.flights)
 
 
@@ -339,7 +339,7 @@ class ComparedSide:
     bound: float = 0.0  # how far a margin can be off
 
     def step(self, frame: Frame) -> FlipTable:
-        """Process the next frame, and return its flips."""
+        """Process the next frame of this trajectory; return the flips since the previous frame."""
         self.distance_bound = self.resolution.bound(frame)
         self.box_bound = self.resolution.bound(frame, np.zeros(0, np.int64))
         # a margin among the nearest is the difference of two distances
@@ -489,7 +489,7 @@ def _apart(
     """Return (separation, the separation that file resolution can explain), both without a common shift.
 
     A common shift is removed only if it explains nearly all of the separation. Such a shift arises from
-    different origins of the files, or from center-of-mass motion removed in one file.
+    different origins of two files, or from center-of-mass motion removed in one file.
     """
     now = separation(a, b, atoms)
     allowed = sum(side.position_bound(now.periods) for side in sides)

@@ -66,7 +66,7 @@ class Box:
         return np.flatnonzero(self.pbc & ~vectors)
 
     def plain(self) -> dict[str, Any]:
-        """Return the box as plain Python values."""
+        """Return lattice vectors and periodicity as plain Python values."""
         return {"matrix": np.asarray(self.matrix, float).tolist(), "pbc": np.asarray(self.pbc, bool).tolist()}
 
 
@@ -202,7 +202,7 @@ def far_out(
 ) -> tuple[int, int, str] | None:
     """Return the most distant atom if its distance is impossibly large; arguments as in `FrameCheck`.
 
-    The system size is also estimated from positions one frame earlier, since this frame may be damaged.
+    The system size is also estimated from positions one frame earlier, since a frame may be damaged.
 
     Returns:
         (the atom, the number of impossibly distant atoms, the reason in words), or None.

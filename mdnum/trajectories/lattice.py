@@ -7,8 +7,8 @@ depend on the search algorithm that found the pair.
 
 For a search, the reduced box is divided into bins. Coordinates along a nonperiodic direction are folded onto
 a limited number of bins, so that a distant atom does not enlarge the grid. For each bin, the atoms of all
-bins within reach are gathered at their nearby images (several per atom in a small box). Every atom of the bin
-is then compared with all gathered atoms.
+bins within reach are gathered at their nearby images (several per atom in a small box). Every atom of a bin
+is then compared with all atoms gathered for this bin.
 """
 
 from __future__ import annotations
@@ -467,7 +467,7 @@ def _most_around(bins, reach, start):
 # candidate, and the loop its vector instructions.
 @njit(inline="never")
 def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
-    """Compute squared distances from x to near[:, first:last]; list and count those up to `largest`."""
+    """Compute squared distances from x to near[:, first:last]; list and count atoms up to `largest`."""
     near0, near1, near2 = near[0, first:last], near[1, first:last], near[2, first:last]
     for k in range(near0.shape[0]):
         y0, y1, y2 = near0[k] - x0, near1[k] - x1, near2[k] - x2

@@ -1,8 +1,8 @@
 """Pairs inside a cutoff that are missing from the neighbor list of a program, and for how long.
 
 A neighbor list may be incomplete because the skin was exceeded, a buffer overflowed, or images are not
-supported. In each case, the program omits the interactions of the missing pairs inside the cutoff. Missing
-pairs whose distance equals the cutoff within its error bound are not counted.
+supported. A program with an incomplete list omits the interactions of the missing pairs inside the cutoff.
+Missing pairs whose distance equals the cutoff within its error bound are not counted.
 """
 
 from __future__ import annotations
@@ -273,7 +273,7 @@ class ListCheck:
         return bool((distance <= self._radii[self._kinds[i], self._kinds[j]] + placed.rounding).any())
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
-        """Return table rows of pairs that were missing until a frame; by default, all pairs still missing."""
+        """Return table rows of pairs missing from the list until a frame; by default, all still missing."""
         names = ("i", "j", "rank", "missing", "begin", "number", "deepest", "end")
         held = sorted((self._open if stays is None else stays).items())
         rows = [(*key, *told, at) for key, told in held if told[-1] > bound]

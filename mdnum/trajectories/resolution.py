@@ -77,7 +77,7 @@ class Resolution:
         bound; a margin among nearest neighbors (a difference of two distances) has twice this bound. If
         `atoms` are given, the bound is valid for distances between these atoms.
 
-        Error: valid for pairs across one period of the box; each further period adds the error of the box.
+        Error: the bound holds for pairs across one period of the box; each further period adds the box error.
         """
         if atoms is not None or not np.isfinite(frame.furthest):
             x = frame.positions if atoms is None else frame.positions[atoms]

@@ -255,7 +255,7 @@ def nearest(
 def _choose(
     rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
 ):  # fmt: skip
-    """Sort rows by (square, index), keep the nearest atoms; return (written, close, smallest, lacking)."""
+    """Sort the neighbors in each row, keep the nearest; return (written, close, smallest, lacking)."""
     written, close, smallest, short = 0, 0, np.inf, 0
     for i in range(rows.first.shape[0]):
         if not centers[i]:

@@ -334,7 +334,7 @@ class Residues(Sums):
 
     @classmethod
     def of(cls, history: History, classes: Classes) -> Residues:
-        """Count flips by the groups of both atoms."""
+        """Count flips by the groups to which both atoms of a pair belong."""
         first, second, flips = classes.of[history.i], classes.of[history.j], history.flips
         own, count = first == second, len(classes.names)
         between = (np.bincount(one[~own], flips[~own], count) for one in (first, second))

@@ -175,7 +175,7 @@ def tiles_of(
 ) -> Tiles | None:
     """Build tiles that are valid at two successive frames, with the decisions of the first frame.
 
-    The result is None if atoms move too far, or the box is too narrow. `pairs` is the approximate number of
+    No tiles are built if atoms move too far, or the box is too narrow. `pairs` is the approximate number of
     pairs inside; the memory of discarded tiles, `spare`, is reused.
     """
     radius, lattice, x = who.radius, before.lattice, before.positions
@@ -314,7 +314,7 @@ def _halved(x, order):
 
 @njit
 def _nodes(boxes, runs):
-    """Return a tree of bounding boxes: of each run of clusters, of its two halves, and so on.
+    """Return a tree of bounding boxes: of each run of clusters, of both halves of a run, and so on.
 
     The first half of the clusters of node n is node n + 1; the second half is node n + 2 c, where c is the
     number of clusters in the first half.
@@ -384,7 +384,7 @@ def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
 def _follow(before, now, order, home, vectors, change, inverse, periodic, center, columns):
     """Write unwrapped coordinates; return the two largest squared displacements and the sum of all squares.
 
-    The lattice vectors removed from each atom are counted in `home`.
+    The numbers of lattice vectors removed from each atom are stored in `home`.
     """
     most, second, total = 0.0, 0.0, 0.0
     for at in range(order.shape[0]):
