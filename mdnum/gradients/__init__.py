@@ -1,7 +1,7 @@
-"""Gradients of long simulations, with estimates of the number of steps for which they can be trusted.
+"""Gradients of long simulations, with an estimate of the number of steps up to which each can be trusted.
 
-A simulation is differentiated at its recorded states and decisions; the contribution of the flips is a
-separate term. Each gradient method is a `Method`; each quantity that can be differentiated is a `Loss`.
+A simulation is differentiated at its recorded states and decisions; changes of decisions (flips) contribute a
+separate term. Each gradient method is a `Method`; each differentiable quantity is a `Loss`.
 """
 
 from mdnum.gradients.differentiate import differentiable, value_and_grad

@@ -1,12 +1,12 @@
 """Reverse-mode derivatives of a simulation at its recorded states and decisions.
 
-With jax.value_and_grad, the compiled forward pass rounds differently from an ordinary run and, after some
-thousand steps, makes other decisions. Here, the run is made first, by the same program as every other run.
+With jax.value_and_grad, the forward pass rounds differently from an ordinary run, and after some thousand
+steps makes other decisions. Here, the run is made first, by the same program as every other run.
 
 A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
-times that vector. For a pair potential this product is a tangent evaluation, pair by pair, gathered like the
-forces: no scatter is needed. For any other energy, the product is one tangent evaluation of the gradient of
-the energy. No tape of operations is kept.
+times that vector. For a pair potential this product is a sum over neighbors, like the forces, and requires no
+scatter operation. For any other energy, the product is one tangent evaluation of the gradient of the energy.
+The operations of a step need not be stored.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ALL = frozenset((MODEL, SCALE, FORCE, WEIGHT))
 
 
 class ForceCotangents(NamedTuple):
-    """Cotangents of the inputs of one evaluation of forces."""
+    """Cotangents (derivatives of the loss) with respect to the inputs of one evaluation of forces."""
 
     x: Float[Array, "3 atoms"]  # on the positions
     model: Any  # on the parameters, a pytree of arrays like theirs; zeros where it was not asked for
@@ -116,8 +116,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return reduce(add, (d[a] * turned[a] for a in range(3))), turned
 
     def through(r2, along, inside, types, weights):
-        """Return a function for energy and slope (of r², slot parameters and shared parameters), the values
-        of the slot parameters including those at the cutoff, and the cotangents of energy and slope.
+        """Return a function that computes energy and slope of each slot (from r², slot parameters and shared
+        parameters), the values of the slot parameters, and the cotangents of energy and slope.
         """
         # each slot has parameters of its own, so that no sum over slots stands inside the loop
         slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
@@ -131,8 +131,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return ended, slots, onto
 
     def with_shared(r2, along, inside, types, weights):
-        """Compute slopes, and cotangents of r², of each slot's parameters and of shared parameters. For a
-        neural network, one reverse pass for all cotangents is cheaper than two.
+        """Compute the slope of each slot, and cotangents of r², of slot parameters and of shared parameters.
+        For a neural network, one reverse pass for all cotangents is cheaper than two.
         """
         ended, slots, onto = through(r2, along, inside, types, weights)
 
@@ -152,8 +152,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
     def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
-        """Return the terms of each neighbor slot for positions, forces, scale and wanted parameters (in this
-        order), and the terms of a block of slots for the parameters that all pairs share.
+        """Return, for each neighbor slot, the terms of positions, forces, scale and wanted parameters (in
+        this order), and for a block of slots, the terms of parameters that all pairs share.
         """
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
@@ -220,7 +220,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
 
 def _differences(cell, own, other):
-    """Return a pair's differences of positions and vectors, products of weights, and second weights."""
+    """Return, for a pair, differences of positions and vectors, products of weights, and the weights of j."""
     d = [b - a for a, b in zip(own[:6], other[:6], strict=True)]
     products = (a * b for a, b in zip(own[6:], other[6:], strict=True))
     return [*cell.minimum_image(*d[:3]), *d[3:], *products, *other[6:]]
@@ -302,11 +302,12 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
 
 
 class AdjointCarry(NamedTuple):
-    """Cotangents that the reverse pass carries from step to step.
+    """Cotangents that a reverse pass propagates from each step to the step before.
 
-    A trace contains these cotangents at every step, without the origin. Row k of a trace belongs to the state
-    (x, half-kicked v) at the beginning of step first + k, before the crossings that lead to this state are
-    transposed. Atoms are in the order of the neighbor list. Unused rows at the end are undefined.
+    A trace is an `AdjointCarry` with the cotangents at every step, without those of the first frame. Row k of
+    a trace belongs to the state (x, half-kicked v) at the beginning of step first + k, without the
+    contribution of the cutoff crossings that lead to this state. Atoms are in the order of the neighbor list.
+    Unused rows at the end of a trace are undefined.
     """
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
@@ -364,7 +365,7 @@ def reverse(
 
 
 class StretchReversal:
-    """State of a reverse pass, which goes through a recorded run from last to first step; see `reverse`.
+    """State of a reverse pass through a recorded run, from the last step to the first; see `reverse`.
 
     Attributes:
         carry: the cotangents at the current step, atoms in the user's order. guard: radial speed below which
@@ -402,7 +403,7 @@ class StretchReversal:
         )
 
     def arguments(self, stretch: TapeStretch) -> tuple[Any, ...]:
-        """Return the arguments of the function `transposed` for a stretch of steps."""
+        """Return the arguments of the function `transposed` for a stretch of steps with one neighbor list."""
         simulation, order = self.tape.simulation, stretch.table.order
         self.met = None if self.guard is None else crossings(simulation, stretch, self.guard)
         tape, tables = self.tape, simulation.tables(stretch.table)
@@ -450,10 +451,10 @@ def transposed(
 ):
     """Propagate cotangents backward through a stretch of steps with one neighbor list.
 
-    Returns the cotangents before the stretch, the weights of its crossings, and the cotangents of every step.
-    JAX transposes the part of a step between two force evaluations. For a linear `KickDrift` integrator this
-    derivative does not depend on the forces, so the recorded steps need not contain forces; `pull_back`
-    computes forces that derivatives with respect to the integrator's parameters need.
+    Returns cotangents at the beginning of the stretch, weights of its crossings, and cotangents of every
+    step. JAX transposes the part of a step between two force evaluations. For a linear `KickDrift` integrator
+    this derivative does not depend on the forces, so forces need not be recorded. For derivatives with
+    respect to the integrator's parameters, `pull_back` computes the forces.
     """
     loss, origin, around, onto_total, pace = looking
     order, moves = tables.order, integrator.moves_cell
@@ -476,7 +477,7 @@ def transposed(
         return end.x, end.kicked, ahead, end.cell.matrix, end.v
 
     def look(row):
-        """Return the cotangents of one frame and of the first frame, from those of the loss's sums."""
+        """Return cotangents of one frame and of the first frame, given the cotangents of the loss's sums."""
 
         def seen_at(x, v, potential, virial, origin, timestep, *box):
             here = (in_box(around, *box) if box else around)._replace(timestep=timestep)

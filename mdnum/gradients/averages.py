@@ -1,10 +1,10 @@
 """Derivatives of averages over states, from the frames of one run; the dynamics are not differentiated.
 
 The derivative of an average with respect to a parameter has up to three contributions. First, the observable
-in each frame changes at fixed positions. Second, if the observable jumps when a pair enters the cutoff, it
-changes with the cutoff radius by the jump times the density of pairs at the cutoff. Derivatives at fixed
-decisions lack this contribution. Third, with a thermostat, the statistical weight exp(-U/kT) of each frame
-changes.
+in each frame changes at fixed positions. Second, if the observable jumps when a pair enters the cutoff, the
+average changes with the cutoff radius by the jump times the density of pairs at the cutoff. Derivatives at
+fixed decisions lack this contribution. Third, with a thermostat, the statistical weight exp(-U/kT) of each
+frame changes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ WIDTHS = 5
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a run that a loss uses: terms of the loss, energies, and derivatives of each frame."""
+    """Frames of a run that a loss uses, with the loss, the energies and the derivatives of each frame."""
 
     step: Int[np.ndarray, "frames"]  # of each
     x: Float[np.ndarray, "frames 3 atoms"]  # wrapped positions, user's order, length
@@ -57,12 +57,12 @@ class Frames:
 
 
 def known(name: str) -> bool:
-    """Return whether loss or energy of a single frame, at fixed positions, can depend on the parameter."""
+    """Return whether the energy of a frame can depend on the parameter at fixed positions."""
     return name.startswith(("potential.", "cutoff.")) or name == "box.scale"
 
 
 def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], None] | None = None) -> Frames:
-    """Evaluate the loss in each frame of a recorded run, with derivatives with respect to parameters.
+    """Evaluate the loss and its derivatives with respect to parameters in each frame of a recorded run.
 
     Args:
         tape: the run, of a pair potential.
@@ -208,10 +208,10 @@ def density(
 ) -> Density:
     """Estimate the weighted sum over frames of the pair density at the cutoff, delta(r_cut - r_ij).
 
-    The delta function is replaced by a parabolic kernel of finite width. The bias is even in the width;
-    extrapolation from three widths, each half of the previous width, removes the second and fourth orders.
-    The result is from the widest three kernels that agree with all narrower sets of three kernels within
-    twice the standard error of the difference.
+    The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
+    of the width; extrapolation from three widths, each half of the previous width, removes the second and
+    fourth powers. Of all extrapolations, the result is the one from the widest kernels that agrees with all
+    from narrower kernels within twice the standard error of the difference.
 
     Args:
         weights: one per frame and pair type. reach: the largest width, length.
@@ -285,7 +285,7 @@ class BoundaryTerm(Method):
         return self.result(tape.value, gradient, details={"frames": len(seen), **details})
 
     def terms(self, simulation: Simulation, seen: Frames, names: Sequence[str], progress=None):
-        """Return the contribution of each frame to each derivative, and details such as errors."""
+        """Return the contribution of each frame to each derivative, and a dictionary with errors."""
         energy, force = simulation.jumps()
         radii = np.asarray(simulation.decider.r_cut)
         # what a pair that enters adds to the loss of each frame
@@ -323,8 +323,8 @@ class Reweighting(Method):
     weights, which is minus the covariance of the loss and the derivative of the energy, divided by kT.
 
     Error: statistical; `details` contains a standard error from block averages. With few independent frames
-    the error is large, and its estimate covers only the variation within this run. Source: S. Thaler, J.
-    Zavadlav, Nature Communications 12, 6884 (2021).
+    this error is large, and it covers only the variation within this run. Source: Thaler and Zavadlav, Nature
+    Communications 12, 6884 (2021).
     """
 
     at_states: BoundaryTerm = field(default_factory=BoundaryTerm)  # the explicit part

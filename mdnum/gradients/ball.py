@@ -1,4 +1,4 @@
-"""Gradient methods for a simulated ball. A program with decisions has a different derivative per method.
+"""Gradient methods for a simulated bouncing ball, which differ in how they treat contact decisions.
 
 The methods in this module differentiate the operations that ran (unrolled), the program with all decisions
 fixed (frozen), or the loss averaged over random parameters (randomized). Methods that replace the contact by
@@ -44,7 +44,7 @@ class BallMethod(Method):
     """
 
     def known(self, problem: BallProblem, names: Sequence[str]) -> tuple[str, ...]:
-        """Return the names of parameters unchanged; raise an error for an unknown name."""
+        """Return the names of parameters unchanged; raise an error if a name is unknown."""
         problem.values(names)
         return tuple(names)
 
@@ -69,7 +69,7 @@ for _name, _class in {
 
 @result
 class BallGradients:
-    """Derivatives of one loss by several methods, and reasons why other methods do not apply."""
+    """Derivatives of one loss by several methods, and the reasons why other methods do not apply."""
 
     gradients: tuple[Gradient, ...]  # of the methods that apply, in the order asked for
     refused: Mapping[str, str]  # why another does not, by its name
@@ -105,7 +105,7 @@ def compare(
 
 
 class Dependence(NamedTuple):
-    """Whether a path of operations leads from a parameter to the loss, and whether it was executed."""
+    """Whether the program uses a parameter for the loss, and whether these operations were executed."""
 
     written: bool
     used: bool
@@ -282,8 +282,8 @@ class ThroughIterations(BallMethod):
 class Frozen(BallMethod):
     """Gradient method: derivative of the program with decisions and iteration counts fixed to a recorded run.
 
-    The program with fixed decisions has no branches, so finite differences converge; in float64 they are
-    computed as a check.
+    The program with fixed decisions has no branches. Finite differences therefore converge, and are computed
+    in float64 as a check.
     """
 
     name = "frozen"
@@ -320,9 +320,9 @@ def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
 class RandomizedSmoothing(BallMethod):
     """Gradient method: derivative of E[loss(parameters + width * noise)], estimated from values of the loss.
 
-    The estimate includes the effect of jumps (changes of iteration counts and contacts). Each noise sample is
-    used with both signs, so that a constant in the loss does not add to the variance. The same seed gives the
-    same result, bit for bit.
+    The estimate includes the effect of jumps of the loss, where iteration counts or contacts change. Each
+    noise sample is used with both signs, so that a constant in the loss does not add to the variance. The
+    same seed gives the same result, bit for bit.
     """
 
     # standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0)
@@ -345,7 +345,7 @@ class RandomizedSmoothing(BallMethod):
 
         Error: the standard error, plus a bias of order width² due to the average over noise.
 
-        Source: Nesterov and Spokoiny (2017), with antithetic samples.
+        Source: method of Nesterov and Spokoiny (2017), with antithetic samples.
         """
         if not self.width > 0 or self.samples < 2:
             raise InputError(

@@ -37,7 +37,7 @@ _NARROW = 1e-6
 
 
 def _moving(x: Any) -> Any:
-    """Return x minus its constant value: a zero whose derivative is that of x."""
+    """Return zero with the derivative of x, by subtracting from x its value as a constant."""
     return x - lax.stop_gradient(x)
 
 
@@ -45,9 +45,9 @@ class FixedPointRule(eqx.Module):
     """Derivative rule for the contact projection: the derivative of the fixed point of its iteration.
 
     For a ball in contact, the iteration y ← G(y) = y + gain max(0, -y) approaches the fixed point y = 0 from
-    below. At y = 0, dG/dy is discontinuous. The value for y < 0 is used, because the iteration comes from
-    there (like the active set of a complementarity problem). The implicit function theorem, (1 - dG/dy) dy =
-    dG/dgain dgain, gives gain dy = -y dgain for each ball.
+    below. At y = 0, dG/dy is discontinuous. The derivative for y < 0 is used, because the iteration
+    approaches from there (as with the active set of a complementarity problem). The implicit function
+    theorem, (1 - dG/dy) dy = dG/dgain dgain, gives gain dy = -y dgain for each ball.
     """
 
     # added to 1 - dG/dy; moves the answer by about regularization / gain, relative
@@ -58,7 +58,7 @@ class FixedPointRule(eqx.Module):
     def attach(
         self, y: Float[Array, "balls"], gain: Float[Array, "balls"], contact: Bool[Array, "balls"]
     ) -> Float[Array, "balls"]:
-        """Return the heights y unchanged, but with the derivative of the fixed point.
+        """Return the heights y unchanged, but with the derivative of the fixed point of the projection.
 
         Args:
             y: heights where the iteration stopped.
@@ -82,7 +82,7 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """Gradient method: derivative of the fixed point of the projection, by the implicit function theorem.
 
-    The loss uses the iterations that ran. The derivative uses their limit, the floor, independent of k. The
+    The loss uses the iterations that ran. The derivative uses the limit of the iterations (the floor). The
     method `unrolled` gives a nonzero derivative with respect to k, an artifact of the solver's tolerance.
     """
 
@@ -153,7 +153,7 @@ class SoftImpact(eqx.Module):
     slow: Any  # in velocity, of the passage, m/s
 
     def acceleration(self, y, v, free, contact, r):
-        """Return the acceleration by gravity, control and the spring; the contact decision is not used."""
+        """Return the acceleration due to gravity, control and spring, without using the contact decision."""
         depth = self.eps * jax.nn.softplus(-y / self.eps)
         share = self.restitution**2
         return free + self.k * depth * (share + (1 - share) * jax.nn.sigmoid(-v / self.slow))
@@ -313,7 +313,7 @@ class _SaltatingReset:
     """Contact that resets the velocity at the end of a step, with the derivative of continuous motion."""
 
     def move(self, motion: Motion) -> Moved:
-        """Compute one step with a contact; its derivative is that of the flight and of the saltation."""
+        """Compute one step with a contact; its derivative is that of the flight and the saltation matrix."""
         made = super().move(motion)  # type: ignore[misc]
         height, v = motion.integrator.fly(motion.y, motion.v, motion.free, motion.rounding)
         arrived, nothing, bounce = lax.stop_gradient(v), jnp.zeros_like(v), self.restitution.astype(v.dtype)  # type: ignore[attr-defined]

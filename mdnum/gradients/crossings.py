@@ -2,9 +2,9 @@
 
 A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the momentum of the
 pair differs after the crossing. Derivatives of a program's steps lack this effect, however short the time
-step is. The contribution is the saltation term of mdnum.numerics, with the cutoff sphere as threshold, in
-reverse mode. A loss that contains the potential energy or the virial also jumps at a crossing: if its frames
-are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
+step is. The contribution is computed in reverse mode with the saltation matrix of mdnum.numerics, for the
+cutoff sphere as threshold. A loss that contains the potential energy or the virial also jumps at a crossing:
+if its frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
 
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
 dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.
@@ -128,11 +128,11 @@ class Crossings:
         return MetRows(Met(*map(padded, columns)), spans, np.arange(most))
 
     def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
-        """Return values without the padding of each step, one entry per crossing."""
+        """Return an array without the padding of each step, with one entry per crossing."""
         return values[np.arange(values.shape[1]) < self.spans(len(values))[:, 1:]]
 
     def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
-        """Return the crossings with their weights, as computed by the reverse pass."""
+        """Return a copy of the crossings with the weights that a reverse pass computed."""
         return replace(self, weight=self.gathered(weights))
 
 
@@ -163,8 +163,8 @@ def onto_crossings(
         d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
         d(W) = (f r_cut n ⊗ n) dr/s        on the integrator's use of the virial tensor W
 
-    so the cotangent of dr is f/s n · (v̄_j/m_j - v̄_i/m_i) + f r_cut/s n · S n, where S is the cotangent of
-    the virial in a step, divided by the time step.
+    so that the cotangent of dr is f/s n · (v̄_j/m_j - v̄_i/m_i) + f r_cut/s n · S n, where v̄ is the
+    cotangent of the velocities, and S that of the virial tensor in a step, divided by the time step.
 
     Args:
         met: the crossings between the previous step and this one.
@@ -325,7 +325,7 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
         return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)
 
     def apart(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return minimum-image displacements of pairs, and their differences from wrapped displacements."""
+        """Return minimum-image displacements of pairs, and the lattice shifts to wrapped displacements."""
         start, end = positions(rows, i).astype(np.float64), positions(rows, j).astype(np.float64)
         inverse = inverses[rows + 1]
         if stretch.cell.size:

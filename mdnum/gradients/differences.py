@@ -3,9 +3,9 @@
 A replica is the same system with different initial velocities and, with a thermostat, different noise.
 Replicas have different neighbor lists and are therefore run one after another on each device.
 
-When a parameter changes, cutoff crossings move to other steps. If the force jumps, the loss jumps at each
-such parameter value; between these values its slope is the derivative of the steps. The event-aware gradient
-is the slope over many jumps. A finite difference for comparison must therefore span many jumps.
+When a parameter changes, cutoff crossings move to other steps. If the force jumps, the loss then jumps too;
+between such parameter values the slope of the loss is the derivative of the steps. The event-aware gradient
+is the slope across many jumps, so a finite difference for comparison must span many jumps.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class Differentiated(NamedTuple):
 def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
     """Differentiate f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
-    Steps decrease by factors of 1.4, and the extrapolation with the smallest estimated error is returned,
-    which is a compromise between truncation errors of large steps and noise of small steps.
+    Steps decrease by factors of 1.4, and the extrapolation with the smallest estimated error is returned.
+    This choice balances truncation errors of large steps against noise of small steps.
 
     Args:
         f: function of one number. x: point. step: the largest step. levels: number of steps.
@@ -393,7 +393,7 @@ class Ensemble(Method):
         return replace(made, description=f"the mean over replicas of {self.method.description}")
 
     def _horizons(self, problem: Problem) -> list[int]:
-        """Return horizons in steps, shortest first; horizons at which the loss uses no frame are omitted."""
+        """Return numbers of steps (horizons), shortest first, for which the loss uses at least one frame."""
         found = []
         for k in reversed(range(self.halvings + 1)):
             steps = problem.steps >> k
@@ -407,7 +407,7 @@ class Ensemble(Method):
 
 
 def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
-    """Yield the gradient of each problem, in order; problems are distributed over all devices."""
+    """Yield the gradient of each problem, in order; the problems are distributed over all devices."""
     devices = jax.local_devices()
     if len(devices) < 2:
         yield from (method(one, names) for one in problems)
@@ -422,7 +422,7 @@ def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
 
 
 def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
-    """Return the first horizon from which the standard error is at least the mean; None if never."""
+    """Return the number of steps from which the standard error exceeds the mean; None if it never does."""
     mine = [row for row in rows if row["name"] == name]
     kept = [k for k, row in enumerate(mine) if row["error"] < row["mean"]]
     after = max(kept, default=-1) + 1
@@ -433,9 +433,9 @@ def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
 class SmoothedDifferences(Method):
     """Gradient method: mean over replicas of central differences with steps that span many flips.
 
-    Both runs of a difference use the same random numbers. Two successive steps, h and h/2, are extrapolated
-    to zero. The result is from the widest pair of steps that agrees with all narrower pairs within twice the
-    standard error of the difference, because single events cause more noise at narrower steps.
+    The two runs of a difference use the same random numbers. Differences with steps h and h/2 are
+    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with those from
+    all narrower steps within twice the standard error: narrower steps have more noise from single flips.
     """
 
     relative: float = 0.002  # the widest step as a share of the parameter
@@ -482,7 +482,7 @@ class SmoothedDifferences(Method):
 
 
 def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable[[], None]):
-    """Return, for each start, the loss at given parameter values and the set of crossings (step, i, j)."""
+    """Return, for each initial state, the loss at given parameter values and the crossings (step, i, j)."""
     found = []
     for start in starts:
         made, met = start.at(values), set()

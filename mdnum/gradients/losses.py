@@ -1,9 +1,9 @@
 """Losses of a trajectory, evaluated frame by frame, so that the trajectory need not be stored.
 
-A loss computes observations from a frame and the first frame, sums observations over frames, and computes a
-number from the sums. Averages, correlations with the start and histograms have this form, and their
-derivatives need only one frame at a time. Each loss of the command line is a class in this module with a
-name, a label and a unit.
+A loss computes observations from each frame (and the first frame), sums the observations over frames, and
+computes a number from these sums. Averages, correlations with the start and histograms have this form, and
+their derivatives need only one frame at a time. Each loss of the command line is a class in this module with
+a name, a label and a unit.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ class MeanPotential(Loss):
 
 
 class MeanTemperature(Loss):
-    """Kinetic temperature 2 K / (3 N kB), averaged over frames, K (or the units' temperature)."""
+    """Kinetic temperature 2 K / (3 N kB), averaged over frames, kelvin (or reduced units of temperature)."""
 
     name, label, unit = "temperature", "kinetic temperature, averaged over steps", "{temperature}"
     of_single_frames = True
@@ -225,7 +225,7 @@ class MeanVolume(Loss):
 
 
 class MeanDensity(MeanVolume):
-    """Mass of all atoms over the volume, averaged over frames, mass/length³."""
+    """Mass density (mass of all atoms divided by the volume), averaged over frames, mass/length³."""
 
     name, label, unit = "density", "mass over volume, averaged over steps", "{mass}/{length}³"
 
@@ -237,9 +237,9 @@ class EinsteinDiffusion(Loss):
     """Diffusion constant from the slope of the mean squared displacement, length² per unit of time.
 
     The mean squared displacement since step 0 is fitted by a straight line, and D is a sixth of its slope.
-    Motion is ballistic at first: set `first` to a step after the ballistic regime.
+    Motion is ballistic in the beginning: set `first` to a step after the ballistic regime.
 
-    Source: M. P. Allen, D. J. Tildesley, Computer Simulation of Liquids (2017), section 2.7.
+    Source: Allen and Tildesley, Computer Simulation of Liquids (2017), section 2.7.
     """
 
     name, unit = "diffusion-einstein", "{length}²/{time}"
@@ -271,7 +271,7 @@ class GreenKuboDiffusion(Loss):
     integral is computed by the trapezoidal rule with a spacing of `every` steps.
 
     Error: of order (every × timestep)² times the slope of the autocorrelation at `until`.
-    Source: as for `EinsteinDiffusion`.
+    Source: the source given for `EinsteinDiffusion`.
     """
 
     name, unit = "diffusion-green-kubo", "{length}²/{time}"
@@ -309,10 +309,10 @@ class RadialDistribution(Loss):
     """Loss computed from the radial distribution function g(r), averaged over frames.
 
     Each distance is distributed over the four nearest bins with cubic B-spline weights, so that g(r) has two
-    continuous derivatives with respect to positions. For each frame, the time is of order atoms² and the
-    memory of order atoms.
+    continuous derivatives with respect to positions. For N atoms, the computing time of each frame is of
+    order N² and the memory of order N.
 
-    Source: J. P. Hansen, I. R. McDonald, Theory of Simple Liquids (2013), section 2.5.
+    Source: Hansen and McDonald, Theory of Simple Liquids (2013), section 2.5.
     """
 
     name, label = "rdf", "mean squared difference of g(r) from 1"
@@ -353,7 +353,7 @@ class RadialDistribution(Loss):
         return (jnp.arange(self.bins, dtype=jnp.float64) + 0.5) * self.width
 
     def reason_unavailable(self, around: LossContext) -> str | None:
-        """Return the reason why g(r) is not defined for a box (nearest images, volume), or None."""
+        """Return the reason why g(r) is not defined (no volume, or a box that is too small), or None."""
         if why := _bulk(around):
             return why
         half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2
@@ -416,7 +416,7 @@ def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Ar
 
 
 def _bulk(around: LossContext) -> str | None:
-    """Return a message if the system is not periodic in all directions (no volume); otherwise None."""
+    """Return a message if a system that is not periodic in all directions has no volume; otherwise None."""
     return None if float(around.volume) > 0 else "the box has no volume: it is not periodic everywhere"
 
 

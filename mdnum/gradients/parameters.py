@@ -172,7 +172,7 @@ def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.n
 
 
 def moved(simulation: Simulation, still: Direction, column: ParameterEntry) -> Direction:
-    """Return derivatives of all inputs of a simulation with respect to one number, with others fixed."""
+    """Return derivatives of all inputs of a simulation with respect to one entry of a parameter."""
     entry = parameters.entry(simulation, column.name)
     unit_entry = np.zeros(np.shape(value(simulation, entry.whole)))
     unit_entry[(*entry.index, *column.index)] = 1 / entry.factor
@@ -188,7 +188,7 @@ def moved(simulation: Simulation, still: Direction, column: ParameterEntry) -> D
 
 @dataclass(frozen=True)
 class ParameterEntry:
-    """One number to differentiate by: a scalar parameter, or one entry of an array parameter."""
+    """One number to differentiate with respect to: a scalar parameter, or one entry of an array parameter."""
 
     name: str  # full name of the parameter
     index: tuple[int, ...] = ()  # which of its entries; empty for a scalar
@@ -198,7 +198,7 @@ class ParameterEntry:
 
 
 def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterEntry, ...]:
-    """Return all entries of the given parameters, in order."""
+    """Return all entries (single numbers) of the given parameters, in order."""
     return tuple(
         ParameterEntry(name, tuple(int(k) for k in index))
         for name in names
@@ -217,7 +217,7 @@ def gathered(
 
 
 def directions(simulation: Simulation, columns: Sequence[ParameterEntry]) -> Direction:
-    """Return derivatives of all inputs of a simulation with respect to each number (first axis)."""
+    """Return derivatives of all inputs of a simulation with respect to each entry (along the first axis)."""
     nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
     still = Direction(
         nothing,

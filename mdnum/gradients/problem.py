@@ -82,7 +82,7 @@ class Problem:
             object.__setattr__(self, "parts", tuple(replace(self, loss=one) for one in parts))
 
     def at(self, values: Values) -> Problem:
-        """Return the problem with other values of parameters."""
+        """Return a copy of the problem with other values of parameters."""
         return replace(self, simulation=parameters.with_values(self.simulation, values)) if values else self
 
     def value(self, values: Values | None = None) -> Any:
@@ -260,7 +260,7 @@ def scalars_only(problem: Problem, names: Sequence[str]) -> str | None:
 
 
 def in_phase(progress: Progress | None, phase: str) -> Callable[[int, int], None] | None:
-    """Return a progress callback for steps, which adds the name of the phase."""
+    """Return a progress callback called as (step, steps), which adds the name of the phase."""
     if progress is None:
         return None
     return lambda step, steps: progress(step, steps, phase)

@@ -138,7 +138,7 @@ class Symmetric(Method):
         return self.of(problem, made)
 
     def of(self, problem: Problem, made: ReversePass) -> Gradient:
-        """Return the gradient from a completed reverse pass."""
+        """Create a `Gradient` from the result of a reverse pass."""
         tape = made.tape
         details = {"stretches": len(tape), "run again": tape.replayed, "bytes kept": tape.held}
         notes = independent(problem, made.gradient, saltation=False)
@@ -171,7 +171,7 @@ class EventAware(Method):
         return self.of(problem, made)
 
     def of(self, problem: Problem, made: ReversePass) -> Gradient:
-        """Return the gradient from a completed reverse pass."""
+        """Create a `Gradient` from the result of a reverse pass."""
         notes = independent(problem, made.gradient, saltation=True)
         unseen = any(made.tape.jumps_unseen)
         if unseen:
@@ -320,7 +320,7 @@ def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
 
 
 def joined(crossings: Sequence[Crossings], name: str, *, ledger: bool = False) -> np.ndarray:
-    """Concatenate one column of the crossings, or of their table of flips, over stretches of steps."""
+    """Concatenate one column of the crossings (or of their flips) of several stretches of steps."""
     return np.concatenate([getattr(one.ledger if ledger else one, name) for one in crossings])
 
 

@@ -74,8 +74,8 @@ def tangents(
 ) -> Iterator[StretchTangents]:
     """Yield tangents with respect to named parameters along a recorded run, for each stretch of steps.
 
-    If saltation is False, the contribution of the flips to a derivative is the sum over all crossings of
-    weight times (dr_cut - dr), with the weights from an event-aware reverse pass.
+    If saltation is False, the contribution of flips to a derivative is the sum over crossings of weight times
+    (dr_cut - dr), where an event-aware reverse pass gives the weights.
 
     Args:
         tape: the run; recorded with flips if crossings are needed. names: full names of parameters.
@@ -187,7 +187,7 @@ def _stretch(
         return jax.tree.map(jnp.add, total, seen)
 
     def push(row, told, see, span, carry: TangentCarry, along: Direction):
-        """Propagate the tangent with respect to one number through one step."""
+        """Propagate the tangent with respect to one parameter entry through one step."""
         number, x, v = row[0], row[1], row[2]
         dx, dv = carry.x, carry.v
         half, first = (0.5 * integrator.timestep).astype(dtype), number == 0

@@ -67,7 +67,7 @@ class TapeStretch:
         return sum(array.nbytes for array in jax.tree.leaves(kept))
 
     def cut(self, room: int | None = None) -> TapeStretch:
-        """Return a copy with arrays for `room` steps, by default for the number of recorded steps."""
+        """Return a copy whose arrays have `room` rows, by default one row for each recorded step."""
 
         def copied(rows: np.ndarray) -> np.ndarray:
             kept = np.zeros((room or self.rows, *rows.shape[1:]), rows.dtype)
@@ -84,12 +84,12 @@ class TapeStretch:
 
     @property
     def steps(self) -> Int[np.ndarray, "room"]:
-        """Step number of each row of the recorded arrays."""
+        """Step number that belongs to each row of the recorded arrays."""
         return self.first + np.arange(len(self.x))
 
     @property
     def columns(self):
-        """Columns step, x, v, images, potential, virial and cell (for a loss), and inputs of each step."""
+        """Arrays of step, x, v, images, potential, virial and cell, and the recorded inputs of each step."""
         return (self.steps, *(getattr(self, name) for name in ("x", "v", "images", *_COLUMNS[4:])))
 
     def cell_of(self, row: int, cell: Cell) -> Cell:
@@ -222,9 +222,9 @@ class RunTape:
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
-        """Derivatives of the loss with respect to energy and virial of a frame, if these quantities jump at
-        flips and the loss uses single frames: such jumps of the loss have no derivative. Both derivatives are
-        0 for equally spaced frames, for which gradients include the jumps.
+        """Derivatives of the loss with respect to energy and virial of a frame, for a loss of single frames
+        whose energy or virial jumps at flips: these jumps of the loss are not included in gradients. For
+        equally spaced frames, gradients include the jumps, and both numbers are 0.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0
@@ -365,7 +365,7 @@ def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.nda
 
 
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:
-    """Convert a recorded step to a frame with unwrapped positions and atoms in the user's order."""
+    """Convert a recorded step to a `LossFrame` with unwrapped positions, atoms in the user's order."""
     step, x, v, images, potential, virial = row[:6]
     whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(x.dtype)
     return LossFrame(step, unsorted(whole, order), unsorted(v, order), potential, virial)

@@ -1,9 +1,9 @@
 """Reverse-mode differentiation by JAX through all operations of the steps, like `jax.grad` of the run.
 
-A chunk is a scan over a fixed number of steps with one neighbor list; the number limits the memory of reverse
-mode. When the list expires, the remaining steps of the chunk do nothing, and the host builds the next list at
-the current positions. States between chunks are stored. If they are too many, every second state is dropped,
-and the steps between stored states are run again.
+A chunk is a scan over a fixed number of steps with one neighbor list. This number limits the memory that
+reverse mode needs. When the list expires, the remaining steps of the chunk do nothing, and the host builds
+the next list at the current positions. States between chunks are stored. If there are too many of these
+states, every second state is dropped, and the steps between stored states are run again.
 
 The forward pass of the differentiated program may round differently from an ordinary run, and therefore make
 other decisions; the gradient then belongs to another trajectory. For this reason, state and decisions of
@@ -45,7 +45,7 @@ _CHUNK_BYTES, _PER_SLOT = 2**28, 256
 
 
 class Inputs(NamedTuple):
-    """All inputs with respect to which a run can be differentiated."""
+    """All inputs of a simulation with respect to which a loss can be differentiated."""
 
     model: Any  # the quantities of the force
     numbers: Any  # those of the integrator
@@ -216,7 +216,7 @@ class Snapshot(NamedTuple):
 
 
 class ChunkedProgram:
-    """A simulation with a loss, run in chunks of steps, each of which JAX can differentiate."""
+    """A simulation with a loss, run in chunks of steps; JAX can differentiate each chunk."""
 
     def __init__(self, problem: Problem):
         simulation = problem.simulation

@@ -25,7 +25,7 @@ _ENDS = {
 
 @dataclass(frozen=True)
 class EndComparison:
-    """Result of comparing a value of an axis, or a whole setting, with the converged end of the axis."""
+    """Comparison of the results of a value (of a varied choice) or of a setting with converged results."""
 
     value: Any
     by_measure: Mapping[str, Within]
@@ -39,7 +39,7 @@ class EndComparison:
 
     @property
     def inside(self) -> bool | None:
-        """True if all measures are within their tolerances; None if the errors are too large to decide."""
+        """True if all measures are within their tolerances; None if errors are too large for a decision."""
         each = [one.inside for one in self.by_measure.values()]
         return False if False in each else None if None in each else True
 
@@ -51,7 +51,7 @@ class EndComparison:
 
 @dataclass(frozen=True)
 class Advice:
-    """Recommended value of one axis (one varied choice), with the comparisons that lead to it.
+    """Recommended value of one axis (a varied choice), with the comparisons that lead to this value.
 
     Attributes:
         key: key of the axis. end: the value that is regarded as converged; None if there is none.
@@ -72,7 +72,7 @@ class Advice:
 
 
 def end_of(key: str, values: Sequence[Any], given: Mapping[str, str] = {}) -> Any:
-    """Return the value of an axis that is regarded as converged; None if the axis has no such value."""
+    """Return the value of an axis (a varied choice) that is regarded as converged; None if there is none."""
     word = given.get(key, _ENDS.get(key) or _ENDS.get(key.rpartition(".")[2], ""))
     if word == "largest":
         return max(values, key=_size)
@@ -92,7 +92,7 @@ def advise(
     tolerances: Mapping[str, float],
     given: Mapping[str, str] = {},
 ) -> Advice | None:
-    """Return the recommended value of an axis; None without a converged end or without tolerances.
+    """Return the recommended value of an axis (a varied choice); None if nothing can be recommended.
 
     Args:
         values: values of the axis.
@@ -125,7 +125,7 @@ def compared_with_end(
     tolerances: Mapping[str, float],
     comparisons: int,
 ) -> EndComparison:
-    """Compare the results of a value, or of a setting, with those of the converged end.
+    """Compare the results of a value, or of a whole setting, with the converged results.
 
     Args:
         key: its label in `found`. found, tolerances: as for `advise`. comparisons: their number.

@@ -175,7 +175,7 @@ def _labels(plan: Plan, axis: Axis) -> dict[str, Setting]:
 
 
 def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[str, ...], Raw]:
-    """Return the change of each measure for each value of each axis, relative to the system's own value."""
+    """Return the change of each measure for each value of each choice, relative to the system's own value."""
     found = {}
     for axis in plan.axes:
         each = _along(means, results, _labels(plan, axis), plan.origin, plan.names)
@@ -184,7 +184,7 @@ def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[
 
 
 def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
-    """Return the change of each measure from one end of each axis to the other (space-filling design)."""
+    """Return the change of each measure between the ends of each choice's range, from a linear fit."""
     choices, ends = {one.setting: one.point.choices for one in plan.points}, {}
 
     def share(axis: Axis, value: Any) -> float:
@@ -230,7 +230,7 @@ def _advice(
     compared: Mapping[tuple[str, ...], Difference],
     results: _Results,
 ) -> list[dict[str, Any]]:
-    """Return the recommended value of each axis; for an axis in `FREE`, the value with the fastest runs."""
+    """Return the recommended value of each choice; for a choice in `FREE`, the value of the fastest runs."""
     physical = {measure.name for measure in plan.measures if measure.physical}
     moving = {(key, value) for (name, key, value), one in compared.items() if one.moves and name in physical}
     rows = []
@@ -262,7 +262,7 @@ def _advice(
 
 
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return two settings: with all recommended values, and with all converged ends; empty if they are equal.
+    """Return two settings: all recommended values, and all converged values; empty if the two are equal.
 
     Each choice was varied alone; runs with these two settings show the combined effect of all choices.
     """
@@ -289,7 +289,7 @@ def _together(
     means: Means, results: _Results, joint: Sequence[Setting],
     tolerances: Mapping[str, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return whether results with all recommended values agree with converged results within tolerances."""
+    """Compare the results with all recommended values combined with those with all converged values."""
     setting, end = joint
     found = _along(means, results, {"": setting}, end, list(tolerances))
     one = compared_with_end(setting, "", found, tolerances, len(tolerances))
@@ -301,7 +301,7 @@ def _together(
 
 
 def _fastest(plan: Plan, axis: Axis, moving: set[tuple[str, str]], results: _Results) -> dict[str, Any]:
-    """Return the value of an axis with the fastest runs that lose no pairs and do not change results."""
+    """Return the value of a choice with the fastest runs that lose no pairs and do not change results."""
     rows = []
     for value, setting in plan.along(axis):
         speeds, lost = np.array(results.speeds.get(setting, [(np.nan, 0)])).T

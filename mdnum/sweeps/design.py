@@ -38,11 +38,11 @@ class Axis:
 
     @property
     def ordered(self) -> bool:
-        """True if the values of the axis are numbers."""
+        """True if all values of this choice are numbers."""
         return all(isinstance(one, int | float) and not isinstance(one, bool) for one in self.values)
 
     def settings(self, value: Any, world: str = "md") -> dict[str, Any]:
-        """Return the keys of the system file that a value of this axis sets, with their values."""
+        """Return the keys of the system file that a value of this choice changes, with new values."""
         if self.key == "precision" and isinstance(value, str):
             return {f"precision.{role}": value for role in _ROLES[world]}
         return {self.key: value}
@@ -57,7 +57,7 @@ class Point:
 
 
 def parse(text: str) -> Axis:
-    """Return the axis that a text describes: KEY=LOW:HIGH:STEP, KEY=VALUE,VALUE,… or "precision".
+    """Parse the description of a varied choice, such as KEY=LOW:HIGH:STEP or KEY=VALUE,VALUE,….
 
     Raises:
         InputError: the text has a different form, or contains repeated values.
@@ -77,7 +77,7 @@ def parse(text: str) -> Axis:
 
 
 def checked(axis: Axis) -> Axis:
-    """Return the axis unchanged; raise an error if its values are invalid.
+    """Return an axis (a varied choice) unchanged; raise an error if its values are invalid.
 
     Raises:
         InputError: there are no values, a value is not finite, or values are repeated.
@@ -111,7 +111,7 @@ def _range(text: str, low: Any, high: Any, step: Any) -> tuple[Any, ...]:
 
 
 def with_base(axis: Axis, base: Any) -> Axis:
-    """Return the axis with the base value included, in ascending order if the values are numbers."""
+    """Return an axis with the base value added to its values; values that are numbers are sorted."""
     same = [one for one in axis.values if one == base and type(one) is not bool]
     values = axis.values if same else (base, *axis.values)
     made = Axis(axis.key, values)
@@ -156,7 +156,7 @@ def points(
 
 
 def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
-    """Return settings from a scrambled Sobol sequence between the ends of each axis."""
+    """Return settings from a scrambled Sobol sequence between the ends of each axis (varied choice)."""
     from scipy.stats import qmc
 
     if samples < 2 or samples & (samples - 1):
@@ -178,5 +178,5 @@ def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
 
 
 def label(value: Any) -> str:
-    """Format a value of a choice for tables and keys."""
+    """Format a value of a varied choice as text for tables."""
     return f"{value:.6g}" if isinstance(value, float) else str(value)

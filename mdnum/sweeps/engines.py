@@ -1,4 +1,4 @@
-"""Execution of a sweep's tasks by any `concurrent.futures.Executor`; by default processes on all cores.
+"""Execution of a sweep's tasks by a `concurrent.futures.Executor`; by default in processes on all cores.
 
 An engine (executor) only starts processes. Whether a point was computed is determined from the folder of the
 point, not from the engine. A worker process that dies therefore loses only its current point.
@@ -84,7 +84,7 @@ def _answered(
 
 
 class _Engine:
-    """Executor of tasks, with functions to replace a broken executor and to close it."""
+    """An executor of tasks, which can be replaced when broken, and closed at the end."""
 
     def __init__(
         self, make: Callable[[], Executor], width: int, threads: int,
@@ -111,7 +111,7 @@ class _Engine:
 
 
 def _local(workers: int | None) -> _Engine:
-    """Return an engine of local processes; they do not import the main script, which needs no guard."""
+    """Return an engine that starts local processes, which do not import the main script of the user."""
     from loky import get_reusable_executor  # noqa: F401 (its pool starts processes by fork and exec)
     from loky.backend.context import get_context
     from loky.process_executor import ProcessPoolExecutor
@@ -212,7 +212,7 @@ def _ends_with(parent: int) -> dict[str, Any]:
 
 @contextmanager
 def opened(on: str | Executor | None, workers: int | None) -> Iterator[_Engine]:
-    """Context manager: make an engine from None (local), a dask address, a TOML file or an executor.
+    """Context manager: make an engine from None (local processes), a dask address, a file or an executor.
 
     Raises:
         InputError: the engine is unknown, or its package is not installed.
@@ -313,7 +313,7 @@ def computed(
 
 
 def _error(future: Future[Any]) -> BaseException | None:
-    """Return the exception of a finished future, or None if the future has a result."""
+    """Return the exception of a finished future; None if the future has a result."""
     try:
         return future.exception()
     except CancelledError as cancelled:

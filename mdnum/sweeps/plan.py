@@ -80,7 +80,7 @@ class Plan:
 
     @property
     def wanted(self) -> dict[str, str]:
-        """Digest of the source files of each measure, by name; digests are stored with the points."""
+        """Digest of the source files of each measure, by the measure's name, as stored with results."""
         return {measure.name: measure.digest for measure in self.measures}
 
     @property
@@ -89,11 +89,11 @@ class Plan:
         return self.setting(self.base)
 
     def setting(self, choices: Mapping[str, Any]) -> Setting:
-        """Return a setting as labels: the formatted value of each axis."""
+        """Return a setting as a tuple of labels, which are the formatted values of all varied choices."""
         return tuple(label(choices[axis.key]) for axis in self.axes)
 
     def along(self, axis: Axis) -> Iterator[tuple[Any, Setting]]:
-        """Yield (value, setting) for each value of an axis; other choices keep their base values."""
+        """Yield (value, setting) for each value of one choice; other choices keep their base values."""
         for value in axis.values:
             yield value, self.setting({**self.base, axis.key: value})
 
@@ -220,7 +220,7 @@ def _axes(over: Any) -> list[Axis]:
 
 
 def _own_value(axis: Axis, own: Mapping[str, Any], loaded: Any, system: Any, overrides: Any) -> Any:
-    """Return the value of an axis in the system file (for a default, the first value of the axis)."""
+    """Return the value of a choice in the system file (if it is not there, the first value of the sweep)."""
     from mdnum.systems import BallSystem, load
     from mdnum.systems.parameters import names, number, resolve
 

@@ -11,7 +11,7 @@
 The address of a point is defined as in signac: the MD5 hash of the state point as JSON. A point is computed
 in a temporary folder, and a single rename moves the folder to the address; a killed process therefore leaves
 no partial result there. To claim a point, a process creates a claim file, which only one process can do
-(O_EXCL). If this process ends without a result, another process creates a claim with the next number.
+(O_EXCL). If the claiming process ends without a result, another process creates a claim with the next number.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def code() -> str:
 
 
 def digest(places: Sequence[str]) -> str:
-    """Return a digest of source files.
+    """Return a digest (hash) of the names and contents of source files.
 
     Args:
         places: patterns of files of mdnum, or absolute paths.
@@ -259,7 +259,7 @@ def write_result(folder: Path, found: Mapping[str, Any]) -> None:
 
 
 def me() -> dict[str, Any]:
-    """Return the data that identify this process in its claim files."""
+    """Return the data that identify this process in claim files: host, boot, process ID and start time."""
     pid = os.getpid()
     return {"host": socket.gethostname(), "boot": boot(), "pid": pid, "since": born(pid), "at": time.time()}
 

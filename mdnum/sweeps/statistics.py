@@ -1,9 +1,9 @@
 """Means over random seeds, and differences between settings, each with its statistical error.
 
-Each run gives a mean and, from its autocorrelation, an error of this mean. The scatter of the means of
-several seeds estimates the same variance. The errors from autocorrelation have many degrees of freedom, but
-are too small if a mode relaxes more slowly than the length of a run. These errors are therefore multiplied by
-one factor, which is determined from the scatter of all seeds of all settings.
+For each run, the mean of a quantity has an error, estimated from its autocorrelation. The scatter of the
+means of several seeds estimates the same variance. The errors from autocorrelation have many degrees of
+freedom, but are too small if a mode relaxes more slowly than the length of a run. These errors are therefore
+multiplied by one factor, which is determined from the scatter of all seeds of all settings.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
     """Return the mean of one measure at each setting, over runs that differ only in their random seed.
 
     The error of a mean follows from the errors of its runs, multiplied by the ratio of the scatter between
-    seeds to these errors. The ratio is one number for all settings of a measure; more settings make it more
-    precise. If the resulting error has fewer degrees of freedom than the scatter between the seeds of the
+    seeds to these errors. The ratio is one number for all settings of a measure; with more settings, its
+    error decreases. If this error has fewer degrees of freedom than the scatter between the seeds of the
     setting, the scatter is used instead.
 
     Args:
@@ -113,7 +113,7 @@ class Difference:
 
     @property
     def moves(self) -> bool | None:
-        """True if the choice changes the result significantly; None if the error is unknown."""
+        """True if the choice changes the measure significantly; None if the error is unknown."""
         return None if np.isnan(self.chance) else bool(self.chance < ALPHA)
 
     @property
@@ -200,7 +200,7 @@ def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Diff
 
 
 def effects(places: Float[np.ndarray, "points axes"], values: Float[np.ndarray, "points"]) -> list[Any]:
-    """Return the change of a measure from end to end of each axis, by a linear fit to all points.
+    """Return the change of a measure between the ends of each axis, from a linear fit to all points.
 
     Args:
         places: position of each point along each axis, from 0 to 1.

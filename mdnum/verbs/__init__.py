@@ -1,4 +1,4 @@
-"""Commands of mdnum (called verbs), one module each; they are also functions of the package `mdnum`.
+"""Commands of mdnum (called verbs). Each verb has its own module and a function in the package `mdnum`.
 
 Each verb is declared in its module (see `mdnum.verbs.frame`) and in the text file of the same name;
 `__init__.toml` explains the tables in text files. Commands and kinds of folders are listed in no other file.
@@ -22,7 +22,7 @@ from mdnum.registry import Registry
 
 
 def _check(module: Any) -> None:
-    """Raise an error if a module of another package lacks something that the module's text file declares."""
+    """Raise an error if a verb of another package lacks functions that its text file declares."""
     from mdnum.store import Layout
 
     texts, name = beside(module.__file__), module.__name__
@@ -80,16 +80,16 @@ def assigned(text: str, example: str) -> tuple[str, str]:
 
 
 def declared(name: str) -> Mapping[str, Any]:
-    """Return the content of the text file that belongs to an entry of `VERBS`.
+    """Return the content of the text file of a verb, given by its name in `VERBS`.
 
     Raises:
-        InputError: the package that adds the entry to `VERBS` has no text file.
+        InputError: the package that defines the verb has no text file.
     """
     return beside(_file(name))
 
 
 def home(kind: str) -> str:
-    """Return the name of the verb, an entry of `VERBS`, whose text file declares a kind of folder.
+    """Return the name of the verb whose text file declares the given kind of output folder.
 
     Raises:
         InputError: no installed verb declares the kind.

@@ -2,7 +2,7 @@
 
 The checks of `mdnum.audit.checks.CHECKS` run in order, and each result is saved in the folder at once. If an
 audit is interrupted, the completed results are in the folder, and the remaining checks can be run later. A
-check returns codes and values; audit.toml contains the sentences for these codes.
+check returns codes of findings with values; audit.toml contains the sentences for these codes.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _ask_all(
     report: bool,
     progress: Progress | None,
 ) -> Outcome:
-    """Run the remaining checks, save the result of each check, and write summary and report of the folder."""
+    """Run the remaining checks, save the result of each check, and write the summary and the report."""
     from mdnum.audit.subject import CalculatorSubject
     from mdnum.audit.thresholds import find_thresholds
     from mdnum.deadline import interrupting
@@ -222,7 +222,7 @@ def answer_of(
 ) -> CheckResult:
     """Run a check and return its result; if the calculator fails, the result contains a finding about it.
 
-    If the calculator gave two different results for the same input, a finding is added (once in an audit).
+    If the calculator gave different results for the same input, a finding is added, once per audit.
     """
     named: dict[str, Any] = {"name": check.name, "title": check.title}
     rest = f"the rest of {check.name}"
@@ -243,7 +243,7 @@ def answer_of(
 
 
 def _keep_evidence(folder: RunFolder, loaded: LoadedCalculator, check: AuditCheck) -> None:
-    """Write structures that reproduce a finding bit for bit, and a script that needs no mdnum to do so."""
+    """Write structures, exact to the last bit, and a script to reproduce a finding without mdnum."""
     from mdnum.audit.record import STRUCTURES, script
 
     _write_structures(folder, check.structures)
@@ -383,7 +383,7 @@ def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _named(value: Any, given: units.Units) -> Any:
-    """Return the values of a check after replacing placeholders by the names of units."""
+    """Return the results of a check, with placeholders for units replaced by the names of units."""
     if isinstance(value, units.Measured):
         return value.to("", vars(given))
     if isinstance(value, str):
@@ -411,7 +411,7 @@ def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]
 
 
 def _finding(one: Observed, section: str, cause: str, texts: Texts = TEXTS) -> Finding:
-    """Return a finding with its sentences; a check of another package provides its own sentences."""
+    """Return a finding with its sentences, from audit.toml or from the package that defines the check."""
     if one.code not in TEXTS.entries:
         given = {name: str(one.values.get(name, "")) for name in ("title", "text", "remedy")}
         return Finding(one.code, one.severity, **given, values=one.values, section=section, cause=cause)
@@ -437,7 +437,7 @@ class AuditView(View):
 
 
 def _judge(view: AuditView) -> Verdict:
-    """Return findings, errors first, and a headline: is the calculator safe to run and to differentiate?"""
+    """Return the verdict: is the calculator safe to run, and safe to differentiate? Errors come first."""
     state = view.state
     given, titles, more = units.get(state.units), {}, conclusion.concluded(state.shown)
     texts, observed = Texts(__file__, given), []
@@ -459,7 +459,7 @@ def _judge(view: AuditView) -> Verdict:
 
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
-    """Return the headline of an audit: both conclusions, missing checks, and the most severe finding."""
+    """Return the headline of an audit: two conclusions, missing checks, and the most severe finding."""
     shown, early = state.shown, conclusion.to_come(state.shown, state.checks)
     said, begun = conclusion.answers(shown, state.checks), {one.name for one in shown}
     name = TEXTS("on", name=state.name, formula=state.atoms.get_chemical_formula())

@@ -143,7 +143,7 @@ def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun,
 def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return loss, derivatives, closed form and variants for the summary, and a table of separations."""
+    """Return summary entries on the loss, its derivatives and variants, and a table of separations."""
     from mdnum.ball.rollout import first_difference
     from mdnum.verbs import ball_record
 
@@ -199,7 +199,7 @@ def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dic
 
 
 def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
-    """Return the loss, as computed by a method that differentiates the unchanged program, if there is one."""
+    """Return the loss of the run, from a gradient method that keeps the program unchanged, if possible."""
     same = ("unrolled", "frozen", "event-aware")
     known = [made["value"] for made in gradient if made["method"] in same and not made["refused"]]
     return known[0] if known else problem.value()

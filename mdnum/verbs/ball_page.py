@@ -27,7 +27,7 @@ class BallView(View):
 
     @property
     def applied(self) -> list[Mapping[str, Any]]:
-        """Derivatives by each method that is applicable."""
+        """Derivatives of the loss, from each gradient method that is applicable."""
         return [made for made in self.summary["gradient"] if not made["refused"]]
 
     @property
@@ -42,7 +42,7 @@ class BallView(View):
 
     @property
     def ended(self) -> dict[str, int]:
-        """Number of solves for each reason why the solver stopped."""
+        """Number of times that the solver stopped, by reason (tolerance reached, cap reached, ...)."""
         return {word: n for word, n in self.summary["ended"].items() if n and word != "none"}
 
     @property
@@ -56,7 +56,7 @@ class BallView(View):
         return int(series["step"][np.argmax(series["reason"].astype(str) == reason)])
 
     def time(self, step: np.ndarray) -> np.ndarray:
-        """Return the times of given steps, s."""
+        """Return the times of the given steps, in seconds."""
         return np.interp(step, self.table("steps")["step"], self.table("steps")["time"])
 
     @cached_property
@@ -146,7 +146,7 @@ def _nearest(view: BallView) -> Iterator[Plot]:
 
 
 def _ranges(view: BallView) -> Iterator[Any]:
-    """Yield a table of each quantity's range of magnitudes, and the first steps outside narrower formats."""
+    """Yield a table of smallest and largest magnitudes, and of steps at which narrower formats fail."""
     table = range_table(lambda name: TEXTS(f"range_{name}"), view.table("steps"))
     if table.rows:
         yield table

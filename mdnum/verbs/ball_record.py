@@ -1,4 +1,4 @@
-"""Content of the folder of a ball's run: tables of decisions, a summary, and errors from the closed form."""
+"""Content of the folder of a ball's run: tables of decisions, summary, and deviations from closed forms."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
     """Return a table with one row per stop decision of the solver, for all steps that required a solve.
 
-    All decisions are included if all balls stop together and the histories of residuals were kept; otherwise,
-    only the last two decisions of each solve are included.
+    All decisions are included if one solver handles all balls and histories of residuals were kept;
+    otherwise, only the last two decisions of each solve are included.
     """
     rule = rule_of(run)
     if rule is None:
@@ -182,7 +182,7 @@ def compared(
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Return the step and the decision at which a variant diverges, and the changes of its gradient.
+    """Return the step and the decision at which a variant diverges from the run, and its gradient.
 
     Args:
         found: the difference between the two runs.
@@ -284,7 +284,7 @@ def solved(run: BallRun) -> np.ndarray:
 
 
 def ambiguous_flips(run: BallRun) -> np.ndarray:
-    """True for contact flips whose step may depend on rounding (flips with a bound of zero are exact)."""
+    """True for contact flips that are within their rounding bound, unless this bound is zero."""
     return run.contacts.ambiguous & (run.contacts.bound > 0)
 
 

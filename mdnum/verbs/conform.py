@@ -1,4 +1,4 @@
-"""`mdnum conform`: the conformance suite, which tests whether a neighbor list contains the right pairs."""
+"""`mdnum conform`: a conformance suite, which tests whether a neighbor list contains the right pairs."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Options:
     limits: tuple[str, ...] = ()
 
     def declared(self, tested: PairList) -> PairList:
-        """Return a neighbor list with the properties that its user declares.
+        """Return a neighbor list with the declared properties: precision, convention and limits.
 
         Raises:
             InputError: an invalid precision, limit or number of cases.
@@ -76,7 +76,7 @@ class Options:
 
 @dataclass
 class Examination(CaseAnswers):
-    """State of an examination, stored in answers.json so that an interrupted examination can be resumed."""
+    """State of an examination (a test of a neighbor list), stored in answers.json for resumption."""
 
     word: str = field(kw_only=True)  # what names the list; empty where it has no name
     tested: tuple[str, str | None] = field(kw_only=True)  # name and version of the list
@@ -241,7 +241,7 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
 
 
 def _script(code: str) -> str:
-    """Return the suffix of the name of a script that reproduces a failure with the given code."""
+    """Return the end of the file name of the script that reproduces failures with the given code."""
     return f"{code.lower().replace('_', '-')}.py"
 
 
@@ -267,7 +267,7 @@ def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
 
 
 def summary_of(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
-    """Return summary.json of an examination without the verdict; `scripts`: one file name per failure."""
+    """Return the content of an examination's summary.json; `scripts` are file names, one per failure."""
     tested = found.tested
     own = ("superset", "found_out", "keeps_order", "shifts", "aliased", "questions", "left", "breadth",
            "running", "padding", "asked", "wrong", "conforms", "seconds")  # fmt: skip
@@ -329,7 +329,7 @@ def _total(summary: Mapping[str, Any], name: str) -> int:
 
 
 def judge(view: View) -> Verdict:
-    """Return the headline, evidence and findings of a neighbor list's examination, from its folder alone."""
+    """Return the verdict on a neighbor list: headline, evidence and findings, from the folder alone."""
     summary = view.summary
     asked, wrong, left = summary["asked"], summary["wrong"], summary["left"]
     silent = {code.lower(): _cases(summary, code) for code in SILENT}
@@ -382,7 +382,7 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield one finding per failure code; each finding names another finding that may be its cause."""
+    """Yield one finding per failure code, with the code of another failure that may be its cause."""
     by_code: dict[str, list[Mapping[str, Any]]] = {}
     for row in summary["failures"]:
         by_code.setdefault(row["code"], []).append(row)
@@ -414,7 +414,7 @@ def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
-    """Yield findings on properties of the neighbor list that are not errors, such as its precision."""
+    """Yield findings on properties of the neighbor list that are not errors, such as single precision."""
     ties = summary["ties"]
     if ties["counted"] and ties["not_counted"]:
         yield TEXTS.finding("TIES", **ties)

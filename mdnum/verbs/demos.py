@@ -1,7 +1,7 @@
 """`mdnum ball --demo` as a function: short demonstrations of numerical effects, each with tested claims.
 
 A demonstration is a script `NN_its_name.py` in the folder `demos` next to the shipped systems. The first line
-of the script states the subject, and its function `run()` returns a `Demo`.
+of the script states the subject; the function `run()` of the script returns a `Demo`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LISTED = 16
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of a demonstration, with the result of the test of this statement."""
+    """A claim of a demonstration, with expected value, observed value, and result of the test."""
 
     what: str  # the statement, in words
     seen: Any  # the number or word that was found
@@ -65,7 +65,7 @@ class Demo:
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
-    """Return a table with a title, for a demonstration."""
+    """Return a table with the given title, columns and rows."""
     return Table(tuple(columns), rows, title)
 
 
@@ -84,7 +84,7 @@ def demonstrate(name: str, **keep: Unpack[Keep]) -> Outcome:
         the outcome with numbers, checks and curves; `result` is the list of `Demo`.
 
     Raises:
-        InputError: there is no demonstration of that name.
+        InputError: no demonstration has this name.
     """
     # an unknown name is refused before anything runs
     asked = names() if name == "all" else [_known(name)]
@@ -119,7 +119,7 @@ def names() -> list[str]:
 
 
 def about(name: str) -> str:
-    """Return the first line of a demonstration's file, read without importing the file (and jax)."""
+    """Return the first line of a demonstration's file without importing the file (which imports jax)."""
     text = ast.get_docstring(ast.parse(_files()[_known(name)].read_text(encoding="utf-8")))
     return (text or "").partition("\n")[0].rstrip(".")
 
@@ -128,7 +128,7 @@ def load(name: str) -> Callable[[], Demo]:
     """Return the function that runs a demonstration.
 
     Raises:
-        InputError: there is no demonstration of that name.
+        InputError: no demonstration has this name.
     """
     path = _files()[_known(name)]
     spec = importlib.util.spec_from_file_location(f"mdnum_demo_{path.stem}", path)
@@ -167,7 +167,7 @@ def _document(name: str, demo: Demo) -> dict[str, Any]:
 
 
 def _plots(document: Mapping[str, Any], curves: Mapping[str, np.ndarray]) -> Iterator[Plot]:
-    """Yield the plots that a demonstration declared, with names for their files."""
+    """Yield the plots of a demonstration, each with a name for its file."""
     mine = curves["part"].astype(str) == document["name"]
     for stored in document["plots"]:
         here = mine & (curves["curve"].astype(str) == stored["name"])
@@ -210,7 +210,7 @@ def judge(view: View) -> Verdict:
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Return a page with each demonstration's result and first figure, then answer, numbers and the rest."""
+    """Return the report page of one or several demonstrations: results, figures, numbers and checks."""
     demos, curves = _demos(view), view.table("curves")
     sections: list[Section] = []
     for demo in demos:
@@ -239,12 +239,12 @@ def _demos(view: View) -> Sequence[Mapping[str, Any]]:
 
 
 def _heading(demo: Mapping[str, Any], demos: Sequence[Any]) -> str:
-    """Return the heading of a demonstration's section; on a page of its own, its title is already shown."""
+    """Return the heading of a demonstration's section on a page of one or of several demonstrations."""
     return demo["title"] if len(demos) > 1 else TEXTS("detail")
 
 
 def _result(demo: Mapping[str, Any]) -> str:
-    """Return the result of a demonstration, typeset."""
+    """Return the sentence on a demonstration's result, with typeset numbers and symbols."""
     return typeset(demo["result"] or demo["answer"])
 
 

@@ -365,7 +365,7 @@ def _with_other_box(
 
 
 def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
-    """True if reading stopped at an incomplete frame at the end of the file (as far as its end is known)."""
+    """True if reading stopped at an incomplete frame that is probably the last frame of the file."""
     from mdnum.reading import UnreadableFrame
 
     if not isinstance(error, UnreadableFrame):
@@ -401,7 +401,7 @@ def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str
 
 
 def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
-    """Find missing frames from the times; None unless all intervals are multiples of the usual interval."""
+    """Find missing frames from gaps in time; None if intervals are not multiples of the usual interval."""
     steps = np.diff(times)
     usual = float(np.median(steps)) if len(steps) else 0.0
     ratio = steps / usual if usual > 0 else np.ones_like(steps)
@@ -419,7 +419,7 @@ def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
-    """Yield the flips of a rule as histories of pairs, in parts: (number of the part, parts, history).
+    """Yield (part, number of parts, history): the flips of one neighbor rule, pair by pair, in parts.
 
     The table of flips is ordered by frame and may be larger than memory. Each part contains all flips of some
     of the pairs. The table is read once for each group of parts that fit into memory together.
@@ -464,7 +464,7 @@ def _rule_told(
     motion: FrameMotion | None,
     log: Progress,
 ) -> dict[str, Any]:
-    """Return statistics of all flips of one rule, computed pair by pair, and write tables to the folder."""
+    """Return statistics of the flips of one neighbor rule, and write tables to the output folder."""
     from mdnum.trajectories.residues import Occupancy, contacts_over_time
     from mdnum.trajectories.statistics import Labels, Statistics
 
@@ -584,7 +584,7 @@ def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:
-    """Swap the two classes of atoms in a row if only the swapped order matches the two selections."""
+    """Swap the two classes of atoms in a table row if only the swapped order matches the selections."""
     if groups[0] is None or groups[1] is None:
         return row
     first, second = ({classes.names[at] for at in np.unique(classes.of[group])} for group in groups)

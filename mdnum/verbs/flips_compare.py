@@ -131,13 +131,13 @@ class ComparisonView(FlipsView):
 
     @property
     def largest(self) -> tuple[str, str]:
-        """Largest separation of an atom in any frame, and the part of it that rounding explains."""
+        """Largest separation of an atom in any frame, and the separation that rounding explains there."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
 
     def frame(self, at: int | None) -> str:
-        """Format a frame number: its index in the comparison and, if different, its numbers in both files."""
+        """Format the index of a frame in the comparison and, if different, its numbers in the files."""
         if at is None:
             return "no frame"
         a, b = (int(self.table("apart")[f"number_{one}"][at]) for one in "ab")
@@ -149,7 +149,7 @@ class ComparisonView(FlipsView):
 
     @property
     def shift(self) -> dict[str, Any]:
-        """Common displacement of all atoms: size and vector at its first frame, smallest and largest size."""
+        """Common displacement of all atoms between the trajectories: its vector, and range of its size."""
         table, at = self.table("apart"), self.summary["shift"]
         vectors = np.stack([table[f"shift_{one}"] for one in "xyz"], axis=1)
         sizes = np.sqrt((vectors**2).sum(axis=1))
@@ -396,7 +396,7 @@ def _first_pairs(view: ComparisonView) -> Iterator[Table]:
 def _plot(
     view: ComparisonView, name: str, lines: Mapping[str, tuple[np.ndarray, Any]], unit: str = ""
 ) -> Plot:
-    """Return a figure of quantities along the frames, each with a role; reference lines are dashed."""
+    """Return a figure of quantities versus time or frame number; reference lines are dashed."""
     table, summary = view.table("apart"), view.summary
     timed = summary["timed"] and bool(np.all(np.diff(table["time"]) > 0))
     x = table["time"] if timed else table["frame"]

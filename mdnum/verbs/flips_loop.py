@@ -53,7 +53,7 @@ def _lists_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, 
 
 
 def _energy_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, Any] | None:
-    """Return statistics of the recorded energy, and the fraction of its variance that flips explain."""
+    """Return statistics of the recorded energy, such as the fraction of its variance due to flips."""
     energy = loop["energy"]
     if len(energy) < 4 or not np.isfinite(energy).all():
         return None

@@ -113,7 +113,7 @@ def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
 
 
 def _of_rules(view: FlipsView) -> Iterator[Finding]:
-    """Yield one finding per code, with the sentences on all rules and a single explanation."""
+    """Yield one finding per code, which joins the sentences on all neighbor rules."""
     by_code: dict[str, list[Finding]] = {}
     for place, one in enumerate(view.summary["rules"]):
         for code, variants, values in _limits(view, place, one):
@@ -129,7 +129,7 @@ def _of_rules(view: FlipsView) -> Iterator[Finding]:
 
 
 def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
-    """Yield the limitations of one rule's flips as (code of a finding, variants of its text, values)."""
+    """Yield codes of findings on limitations of one neighbor rule's flips, with text variants and values."""
     if len(wrong := _disagreeing(view, place)):
         yield "EVENT_ALGEBRA", (), {"first": int(wrong[0]) + 1, "frames": len(wrong)}
     flips, frames = one["flips"], view.summary["frames"]
@@ -514,7 +514,7 @@ def _lasting(view: FlipsView, place: int) -> Table | None:
 def _maps(
     view: FlipsView, pairs: Mapping[str, np.ndarray], moments: Mapping[str, np.ndarray], x: np.ndarray
 ) -> Iterator[tuple[str, tuple[str, ...], tuple[str, ...], Region]]:
-    """Yield two maps with names and axis labels: the contact matrix, and contacts per residue over time."""
+    """Yield the contact matrix, and a map of contacts per residue over time, each with axis labels."""
     index, first = np.unique(moments["index"], return_index=True)
     if not len(index):
         return

@@ -40,13 +40,13 @@ def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
 
 
 def stem(trajectory: Trajectory) -> str:
-    """Return the stem of the output folder's name: that of the trajectory file, or the name of its run."""
+    """Return the default stem of the output folder's name, from the name of the trajectory or its run."""
     name = trajectory.path.name.split(".")[0]
     return trajectory.path.resolve().parent.name if name == "trajectory" else name
 
 
 def name_of(trajectory: Trajectory) -> str:
-    """Return the name of a trajectory for a page: its file name, or the folder of the mdnum run."""
+    """Return the name of a trajectory for a page: the file name, or the name of the mdnum run's folder."""
     own = trajectory.path.name == "trajectory.traj"
     name = trajectory.path.resolve().parent.name if own else trajectory.path.name
     return f"{name}@{trajectory.slice_words}" if trajectory.slice_words else name
@@ -86,7 +86,7 @@ def as_python(in_memory: bool) -> Iterator[None]:
 
 
 def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = False) -> dict[str, Any]:
-    """Return the entries of summary.json on whether all frames were read, and on the error if not."""
+    """Return summary entries on whether all frames were read, and on the error otherwise."""
     told = None if stopped is None else str(stopped)
     return {
         "stopped": in_python(told) if told and in_memory else told,
@@ -160,12 +160,12 @@ class FlipsView(View):
 
     @property
     def one(self) -> str:
-        """The kind of object of which neighbors are counted: "a residue" or "an atom"."""
+        """The object whose neighbors are counted: "a residue" or "an atom"."""
         return "a residue" if self.by_residue else "an atom"
 
     @property
     def unit(self) -> str:
-        """Unit of length."""
+        """Unit of length of the trajectory."""
         return self.summary["length"]
 
     @property
@@ -179,7 +179,7 @@ class FlipsView(View):
         return f"{text} {unit}{'s' if unit == 'step' and text not in ('1', '1.00', '1.0') else ''}"
 
     def duration(self, frames: float | None, digits: int = 3, beyond: str = "longer than seen") -> str:
-        """Format a number of frames, as a time if the file has times."""
+        """Format a number of frames as a duration: a time if the frames have times."""
         if frames is None:
             return beyond
         if self.timed:
@@ -204,7 +204,7 @@ class FlipsView(View):
         return bound * (life[name] is not None) + self.duration(life[name])
 
     def rate(self, per_frame: float | None) -> str:
-        """Format a rate per frame, as a rate per time if the file has times; a dash if there is no rate."""
+        """Format a rate per frame, or per time if frames have times; None becomes a dash."""
         if per_frame is None:
             return "–"
         if self.timed:
@@ -235,7 +235,7 @@ class FlipsView(View):
         return f"{text}, repeating along {listed(axes)}"
 
     def repeated(self, repeats: Mapping[str, Any] | None, file: str = "") -> Iterator[Finding]:
-        """Yield a finding if frames repeat earlier frames; `file` names the file in a comparison of two."""
+        """Yield findings on frames that repeat earlier frames; `file` is the file's name in a comparison."""
         again = repeats.get("again", ()) if repeats else ()
         if again and repeats and repeats["dropped"]:
             total = sum(one["frames"] for one in again)

@@ -1,4 +1,4 @@
-"""`mdnum fork`: the step at which two runs that differ in one choice diverge, and the cause.
+"""`mdnum fork`: the step at which two runs that differ in one numerical choice diverge, and the cause.
 
 For molecular dynamics and for a ball, `fork` varies one numerical choice and `fork_screen` each choice in
 turn; `fork_folders` compares or replays two finished runs. `fork_benign` compares ensembles of runs.
@@ -53,7 +53,7 @@ def fork(
     pin: str | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system twice, with a difference in one choice, and find the step and the cause of divergence.
+    """Run a system twice with one numerical difference, and find the step and the cause of divergence.
 
     Example:
         >>> mdnum.fork("argon/crystal-108", "precision.force=float32", steps=500)
@@ -135,7 +135,7 @@ def fork_screen(
 ) -> Outcome:
     """Run a system once per choice, and rank the choices by the step at which decisions first differ.
 
-    For a choice that matters, use `fork`: it also runs B with the decisions of A (a counterfactual).
+    For a choice that matters, `fork` also runs the second run with decisions of the first.
 
     Example:
         >>> mdnum.fork_screen("argon/crystal-108", steps=200)
@@ -173,7 +173,7 @@ def fork_screen(
 def fork_folders(
     a: str | Path, b: str | Path, *, replay: bool = False, objects: Sequence[Simulation] = (), **asked: Any
 ) -> Outcome:
-    """Compare two finished runs (molecular dynamics or a ball): their settings, and where they diverge.
+    """Compare two finished runs (molecular dynamics or a ball): settings, and the step of divergence.
 
     Example:
         >>> mdnum.fork_folders("runs/liquid-864", "runs/liquid-864-2")
@@ -318,7 +318,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """Draw one line per choice; marks show the steps of the first different bit, fork and split."""
+    """Draw one line per choice, with marks at the first different bit, at the fork and at the split."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (

@@ -89,7 +89,7 @@ def fork_certify(
 
 
 def _ranking(answer: Answer) -> list[dict[str, Any]]:
-    """Return the ranking of precisions for the summary; write it and the separations as tables."""
+    """Return the ranking of precisions for the summary; add tables of the ranking and of separations."""
     ranking, rows, table = answer.result.ranking, [], []
     for row in ranking:
         decision, growth, separation = row.decision, row.growth, row.separation
@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """Yield a sentence for each run with another precision in one role: steps gained or lost."""
+    """Yield a sentence for each run with another precision in a single role, on steps gained or lost."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip
@@ -266,7 +266,7 @@ def fork_processes(
     which: Sequence[Variant] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system as several programs (jitted, eager, batched, in a gradient, XLA flags); find which agree.
+    """Run a system in several ways (jitted, eager, batched, in a gradient, XLA flags), and compare results.
 
     Example:
         >>> mdnum.fork_processes("argon/crystal-108", steps=100)
@@ -327,7 +327,7 @@ def _cause(code: str, names: Sequence[str] = (), program: str = "", **values: An
 
 
 def judge_processes(view: View) -> Verdict:
-    """Return the verdict: how many different trajectories do the program variants of one system compute?"""
+    """Return the verdict: how many different trajectories do the variants of one program compute?"""
     s = view.summary
     seeds = [row["first_bit"] for row in s["variants"] if row["first_bit"] is not None]
     ran, clusters = len(s["variants"]) - len(s["failed_variants"]), len(s["clusters"])

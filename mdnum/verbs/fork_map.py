@@ -1,4 +1,4 @@
-"""`mdnum fork map`: parameter values at which decisions change; `fork forecast`: which change first."""
+"""`mdnum fork map`: parameter values at which decisions change. `mdnum fork forecast`: first changes."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def fork_map(
     confirm: bool = True,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find the values of a parameter at which the decisions of a run change, to adjacent floats.
+    """Find the values of a parameter at which decisions of a run change, each between two adjacent floats.
 
     Example:
         >>> mdnum.fork_map("argon/crystal-108", "cutoff.radius", 1.58, 1.59, steps=100)
@@ -177,7 +177,7 @@ def _row(edge: Boundary) -> dict[str, Any]:
 
 
 def judge_map(view: View) -> Verdict:
-    """Return the verdict on a map: number of boundaries along the parameter, jumps of the loss, certainty."""
+    """Return the verdict on a map: parameter values at which decisions change, and jumps of the loss."""
     s = view.summary
     edges, left, failed = s["boundaries"], s["unresolved"], s["failed_runs"]
     all_failed = bool(failed) and failed == s["evaluations"]

@@ -43,7 +43,7 @@ _ARROW = 0.5
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Return the report page of a pair of runs."""
+    """Return the report page of two runs that differ in one choice."""
     s = view.summary
     return view.page(f"{view.name}: {s['choice']}", str(s["difference"]), TEXTS.keys(**_numbers(view)), [
         Section("Separation", list(_separation(view))),
@@ -183,7 +183,7 @@ def _around(view: View) -> Iterator[Any]:
 
 
 def _atoms(view: View, figure: Canvas) -> None:
-    """Draw the atoms of A and of B in two panels; the pair lies in the plane, a circle shows the cutoff."""
+    """Draw the atoms of A and of B in two panels; the pair lies in the plane, and a circle is the cutoff."""
     d, table = view.summary["decision"], view.table("neighborhood")
     x, moved = (
         np.stack([table[k] for k in names], axis=1) for names in (("x", "y", "z"), ("dx", "dy", "dz"))
@@ -222,7 +222,7 @@ def _atoms(view: View, figure: Canvas) -> None:
 
 
 def _two_by_two(view: View) -> Iterator[Any]:
-    """Yield the two-by-two table (arithmetic and decisions): split of each run, effect of each factor."""
+    """Yield the two-by-two table: steps of the split for each arithmetic with the decisions of each run."""
     s, unit = view.summary, view.units.length
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for cell in s["table"]:
@@ -297,7 +297,7 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
 
 
 def _certain(view: View) -> Iterator[Any]:
-    """Yield tables and a figure on the steps up to which rounding could not have changed a decision."""
+    """Yield tables and a figure on the steps up to which rounding cannot have changed a decision."""
     s, rows = view.summary, []
     for name, step in (s.get("certified_horizon") or {}).items():
         ambiguous, first = s["ambiguous"][name], s["ambiguous_first"][name]

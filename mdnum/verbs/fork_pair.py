@@ -56,7 +56,7 @@ class PairQuestion:
 
 
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
-    """Return the given last step or, if none is given, the system's own, limited to `most`.
+    """Return the given last step; if none is given, return the system's own last step, at most `most`.
 
     Raises:
         InputError: steps is below 1.
@@ -159,7 +159,7 @@ def followed(
 
 
 def _numbers(made: Fork) -> dict[str, Any]:
-    """Return summary entries for any pair: steps of divergence, verdict, growth, two-by-two table."""
+    """Return summary entries of any pair of runs: steps of divergence, verdict, growth of separation."""
     step, verdict, growth = made.twin.a.timestep, made.verdict, made.growth["B"]
     dates = {"first_bit": made.dates.first_bit, "fork": made.dates.fork, "split": made.dates.split}
     free, imposed, overridden = (
@@ -204,7 +204,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
 
 
 def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
-    """Return the strain between the boxes of A and B: at the end, at its largest, at fork and split."""
+    """Return the strain between the boxes of A and B at the end, at its maximum, and at the divergence."""
     if "strain" not in made.series:
         return {}
     strain, free = made.series["strain"], made.series["B"]
@@ -391,7 +391,7 @@ def _exponent(made: Fork) -> dict[str, Any]:
 
 
 def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
-    """Run B with one or more decisions of A imposed; return the result, or why this is impossible."""
+    """Run B with one or more decisions of A imposed; return the result, or why the run is impossible."""
     from mdnum.forks.replays import parse_pin, pinned
 
     try:
@@ -408,7 +408,7 @@ def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
 
 
 def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
-    """Return the smallest set of decisions to override to prevent a split, or why none was found."""
+    """Return the smallest set of decisions that must be overridden to keep the runs together, if found."""
     from mdnum.forks.replays import disagreements, minimal_cause
 
     try:

@@ -36,7 +36,7 @@ def subject(s: Mapping[str, Any]) -> str:
 
 
 def of_pair(flip: Mapping[str, Any]) -> str:
-    """Return the label of a stored flip's pair (with its energy term, if there are several) or ball."""
+    """Return the label of the pair (with the energy term, if there are several) or the ball of a flip."""
     i, *j = flip["subject"]
     return pair_name({"i": i, "j": j[0], "terms": flip["terms"]}) if j else str(i)
 
@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """Return a phrase on how many pairs (the first and its repeats) split later if decisions are imposed."""
+    """Return a phrase on how many repeats agree that runs split later if decisions are imposed."""
     said = ""
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -114,7 +114,7 @@ def decided(decision: Mapping[str, Any]) -> str:
 
 
 def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the decisions of A and B at the fork, and which of the two runs decided yes and which no."""
+    """Return the decisions of A and B where they first differ, and which run decided yes and which no."""
     yes = "A" if decision["decided"]["A"] > decision["decided"]["B"] else "B"
     return {"yes": yes, "no": "B" if yes == "A" else "A", "a": decision["decided"]["A"],
             "b": decision["decided"]["B"]}  # fmt: skip
@@ -158,13 +158,13 @@ def _findings(view: View) -> Iterator[Finding]:
 
 
 def must_hold(row: Mapping[str, Any]) -> Finding:
-    """Return the finding for a choice that changed bits although it should not change any."""
+    """Return the finding on a choice that changed results although it should not change any bit."""
     values: dict[str, Any] = {name: row.get(name) for name in ("choice", "difference", "first_bit", "fork")}
     return TEXTS.finding("MUST_HOLD_FORKED", *["fork"] * (row.get("fork") is not None), **values)
 
 
 def judge_screen(view: View) -> Verdict:
-    """Return the verdict on all choices: the first to fork, and choices that should change no bit but did."""
+    """Return the verdict on all choices: the first to change a decision, and unexpected changes of bits."""
     rows, found = view.summary["ranking"], []
     broken = [row for row in rows if row["must_hold"] and row["first_bit"] is not None]
     forked = [row for row in rows if row["fork"] is not None]

@@ -1,13 +1,13 @@
-"""Functions common to all verbs (commands): make an output folder, fill it, judge and show its content.
+"""Functions common to all verbs (commands), which make, fill, judge and show an output folder.
 
 The module of a verb contains its function (options → output folder), `judge` (view of the folder → findings
-and a headline) and `page` (view → sections). Its sentences are in a text file with the name of the module.
-The module declares the verb once:
+and a headline) and `page` (view → sections). The sentences of findings and pages are in a text file with the
+name of the module. The module declares the verb once:
 
     KINDS = {"flips": Verb(judge, page)}
 
-where "flips" is the kind of its folders, declared in the text file under [kinds.flips] (see `mdnum.verbs`).
-The functions judge and page read results only from the folder, so a page can be written again later.
+where "flips" is the kind of output folder, declared in the text file under [kinds.flips]. The functions judge
+and page read results only from the folder, so a page can be written again later.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class View:
         return self._tables[name]
 
     def kept(self, codes: Mapping[str, Any]) -> list[Finding]:
-        """Return the findings in summary.json whose codes are not in `codes`; the verb cannot derive them."""
+        """Return the stored findings whose codes are not in `codes`: findings of other modules."""
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
 
@@ -108,7 +108,7 @@ class View:
 
 @dataclass(frozen=True)
 class Verb:
-    """Functions of a verb that judge and show its kind of output folder."""
+    """Functions that judge and show one kind of output folder."""
 
     judge: Callable[[Any], Verdict]  # findings and headline, from the folder alone
     page: Callable[[Any, Verdict], Page]  # everything else that is shown
@@ -128,7 +128,7 @@ class Interrupted(KeyboardInterrupt):
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether control-C was pressed; a second press raises KeyboardInterrupt.
 
-    Python delivers signals only to the main thread: in other threads the function always returns False.
+    Python delivers signals only to the main thread. In other threads, the function always returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -155,7 +155,7 @@ def end_on_sigterm(stack: ExitStack) -> None:
 
 
 class Keep(TypedDict, total=False):
-    """Keyword arguments that all functions of `mdnum` that run a system have in common."""
+    """Keyword arguments common to all functions of `mdnum` that run a system."""
 
     # the new folder; default runs/<verb>-<name>-<n>; "{content}" in it becomes a digest of what is asked, and
     # a folder of that name which is finished is read
@@ -386,7 +386,7 @@ def finish(
 
 
 def read(folder: str | Path) -> Outcome:
-    """Return the outcome of an output folder of any kind; its results are judged again, without writing.
+    """Return the outcome stored in an output folder; results are judged again, but nothing is written.
 
     Example:
         >>> mdnum.read("runs/argon-crystal-108-1").table("flips")
@@ -398,7 +398,7 @@ def read(folder: str | Path) -> Outcome:
 
 
 def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **counts: Any) -> None:
-    """Report the phase and the current step to the progress function, if there is one."""
+    """Call the progress function, if there is one, with the phase and the current step."""
     if progress is not None:
         progress(step, steps, {"phase": phase, **counts})
 
@@ -421,7 +421,7 @@ def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, An
 
 
 def words(texts: Sequence[str] | str) -> tuple[str, ...]:
-    """Return words without repeats from one text or several texts; each text may be a list with commas."""
+    """Return the distinct words of a text, or of several texts, separated by commas."""
     texts = (texts,) if isinstance(texts, str) else texts
     return tuple(dict.fromkeys(word.strip() for text in texts for word in text.split(",") if word.strip()))
 

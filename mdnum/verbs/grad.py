@@ -146,7 +146,7 @@ def _problem(
 def plan(
     problem: Problem, names: Sequence[str], asked: Sequence[str] | None, replicas: int = 0
 ) -> tuple[list[Method], list[dict[str, str]]]:
-    """Return the gradient methods to run, and the omitted methods with reasons and options to add them.
+    """Return the gradient methods to run, and omitted methods, each with a reason and an option to add it.
 
     Args:
         asked: names of methods; None for the fast ones.
@@ -179,7 +179,7 @@ def plan(
 
 
 def _too_long(method: Method, problem: Problem, names: int) -> str:
-    """Return the reason why a method is too slow to be run by default; "" if it is fast enough."""
+    """Return the reason why a gradient method is too slow to be run by default, or ""."""
     runs = getattr(method, "runs", 0) * names + 1
     if runs * problem.simulation.atoms * problem.steps <= AFFORDABLE or runs == 1:
         return ""
@@ -187,7 +187,7 @@ def _too_long(method: Method, problem: Problem, names: int) -> str:
 
 
 def _over(method: Any, replicas: int, horizons: bool = True) -> Method:
-    """Return a method with another number of starts; a method without averages over starts is unchanged."""
+    """Return a method with the given number of initial states, if the method averages over these."""
     if not replicas or not hasattr(method, "replicas"):
         return method
     changed = replace(method, replicas=replace(method.replicas, count=replicas))
@@ -233,7 +233,7 @@ def _diagnosed(
 
 
 def _brief(part: Any) -> Any:
-    """Return one part of a diagnosis as plain values, without its tables."""
+    """Return one result of a gradient diagnosis as plain values, without tables."""
     return part and plain({name: value for name, value in vars(part).items() if name not in _ROWS})
 
 
@@ -290,7 +290,7 @@ def _not_run(
     asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
     further: Sequence[str], half_step: bool,
 ) -> list[dict[str, str]]:  # fmt: skip
-    """Return a list of what was not computed, each with the reason and the option that adds it."""
+    """Return a list of results that were not computed, each with a reason and an option to add it."""
     from mdnum.gradients.diagnose.trust import no_half_step
 
     own, rows = problem.simulation.steps, []

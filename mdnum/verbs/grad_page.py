@@ -31,7 +31,7 @@ _GROWN = {"forward bounded, gradient not": "growing", "forward not bounded": "un
 
 
 def by(summary: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
-    """Return the stored result of a method; the closed form, if it is the reference, counts as a method."""
+    """Return the stored result of a gradient method, or of the closed form if this is the reference."""
     if summary.get("exact") and method == summary["reference"]:
         exact = {"gradient": summary["exact"], "details": {}, "error": {}}
         return {"method": method, "description": TEXTS("exact"), **exact}
@@ -48,12 +48,12 @@ def magnitude(value: Any, missing: float | None = None) -> float:
 
 
 def digits_of(summary: Mapping[str, Any], name: str) -> int | None:
-    """Return the number of valid digits: those unchanged at half the time step; None if not examined."""
+    """Return the number of digits of a derivative that are unchanged at half the time step, if known."""
     return ((summary.get("trust") or {}).get("digits") or {}).get(name)
 
 
 def digits_note(summary: Mapping[str, Any], name: str) -> str:
-    """Return a note if a derivative has no valid digits, or if their number is unknown; otherwise ""."""
+    """Return a note if a derivative has no valid digit, or an unknown number of valid digits; else ""."""
     known = digits_of(summary, name)
     if summary.get("trust") and known is None:
         return TEXTS("digits_unknown")
@@ -111,7 +111,7 @@ def closeness(row: Mapping[str, Any]) -> str:
 
 
 def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
-    """Return the sentence on one limit of the steps for which the gradient can be trusted."""
+    """Return the sentence on one limit on the number of steps for which a gradient can be trusted."""
     code = f"{limit['what']}_{limit['code']}".replace(" ", "_")
     values = {"horizon": limit["horizon"], **limit["values"]}
     first = values.get("first")
@@ -120,7 +120,7 @@ def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
 
 
 def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, Any]]:
-    """Group parameters with the same judgment on trust; the key is empty if all have the same judgment."""
+    """Group parameters with the same judgment on trust; the key is empty if all judgments are the same."""
     trust = summary.get("trust")
     if not trust:
         return {}
@@ -135,7 +135,7 @@ def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, 
 
 
 def trust_sentence(summary: Mapping[str, Any], names: tuple[str, ...], one: Mapping[str, Any]) -> str:
-    """Return the sentence on whether derivatives by the named parameters can be trusted."""
+    """Return the sentence on whether derivatives with respect to named parameters can be trusted."""
     free = [limit["what"] for limit in one["limits"] if limit["horizon"] is not None and not limit["reached"]]
     values = {"steps": summary["steps"], "horizon": one["horizon"], "limit": one["limited_by"]}
     text = TEXTS(f"trust_{one['verdict']}", free=", ".join(free) or "nothing", **values)

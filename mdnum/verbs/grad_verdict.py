@@ -145,7 +145,7 @@ def _of_trust(view: View) -> Iterator[Finding]:
 
 
 def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the variants of the finding on unexamined limits; each variant adds a remedy to its text."""
+    """Yield the remedies for limits that were not examined, as names of variants of a finding."""
     unseen = {one["what"] for one in trust["limits"] if one["horizon"] is None}
     aware = by(view.summary, "event-aware") is not None
     if any(one["what"] == "half the time step" for one in view.summary["left_out"]):
@@ -199,7 +199,7 @@ def _of_flips(view: View) -> Iterator[Finding]:
 
 
 def _of_the_motion(view: View) -> Iterator[Finding]:
-    """Yield a finding on methods that disagree with the derivative of the exact motion, if known."""
+    """Yield a finding on methods that disagree with the exact derivative, if this is known."""
     rows = view.summary["comparisons"] if view.summary.get("exact") else ()
     off = [row for row in rows if row["relative"] is None or row["relative"] > _CLOSE]
     methods: dict[str, list[str]] = {}

@@ -52,7 +52,7 @@ class Outcome:
 
     @property
     def folder(self) -> Path:
-        """Path of the folder, the same as `path`."""
+        """Path of the output folder; the same as the attribute `path`."""
         return self.path
 
     @property
@@ -89,7 +89,7 @@ class Outcome:
         """Draw a figure of the page as a new pyplot figure; `name` is that of its file in figures/.
 
         Returns:
-            the axes, or the first of several; `.figure.axes` are all of them.
+            the matplotlib axes, or the first axes if there are several; `.figure.axes` lists all axes.
 
         Raises:
             InputError: no figure has this name (the message lists all figures).

@@ -29,8 +29,8 @@ _OUTERMOST = threading.Lock()
 def reported(progress: Wanted) -> Iterator[Progress | None]:
     """Context manager: yield the function that receives reports of progress, or None.
 
-    If `wanted` is a function, it is used. None gives a bar, except in a command called by another command and
-    in the workers of a pool; True always gives a bar, False gives no bar.
+    If `progress` is a function, this function is used. None gives a bar, except in a command called by
+    another command and in the workers of a pool; True always gives a bar, False gives no bar.
     """
     from multiprocessing import parent_process
 
@@ -108,7 +108,7 @@ class ProgressBar:
 
 
 def _drawn(stream: TextIO) -> Any:
-    """Start and return a progress bar, which is shown until it is stopped."""
+    """Start and return a progress bar, which is shown until its method `stop` is called."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 

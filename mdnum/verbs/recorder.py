@@ -34,9 +34,9 @@ _NONE = {name: np.zeros(0, np.int64) for name in ("rule", "i", "j", "rank", "ent
 class Recorder:
     """Recorder of flips, and of pairs that are missing from the neighbor list, for any simulation loop.
 
-    The results are those of `mdnum.flips` for a file with the same frames. Decisions (pair inside or outside
-    the cutoff) are computed from the positions in float64. Decisions that are uncertain because the positions
-    are in float32 are marked.
+    The results are the same as those of `mdnum.flips` for a file with these frames. Decisions (pair inside or
+    outside the cutoff) are computed from the positions in float64. Decisions that are uncertain because the
+    positions are in float32 are marked.
 
     Example:
         >>> with mdnum.Recorder(8.5, box=box, fractional=True, out="runs/mine") as rec:
@@ -189,7 +189,7 @@ class Recorder:
 
     @property
     def outcome(self) -> Outcome:
-        """Close the recorder and return the outcome, of the same kind as from `mdnum.flips`."""
+        """The outcome of the recording, like that of `mdnum.flips`; the recorder is closed."""
         return self.close()
 
     def __enter__(self) -> Recorder:
@@ -239,7 +239,7 @@ class Recorder:
         return compare_folders(self.outcome.path, other.outcome.path)
 
     def _advance(self) -> None:
-        """Examine all recorded frames that were not yet examined, and write rows to the folder."""
+        """Examine all recorded frames that were not yet examined, and write table rows at intervals."""
         try:
             if self._one is None:
                 self._one = self._stack.enter_context(examining(self._source, self._rules, **self._how))

@@ -51,12 +51,12 @@ class RunView(View):
 
     @property
     def epochs(self) -> Mapping[str, np.ndarray]:
-        """Table with one row for each neighbor list that was built during the run."""
+        """Table with one row for each neighbor list of the run."""
         return self.table("epochs")
 
     @cached_property
     def flips(self) -> analysis.Scan:
-        """Statistics of all flips; the table of flips is read in batches, as it may be larger than memory."""
+        """Statistics of all flips; the table of flips is read in batches because of its size."""
         flips = analysis.Scan(len(self.series["step"]), TABLE_ROWS)
         known = self.folder.table("flips", rows=1).column_names
         columns = [*_COLUMNS, *(name for name in ("terms",) if name in known)]
@@ -84,17 +84,17 @@ class RunView(View):
 
     @property
     def own_end(self) -> list[str]:
-        """Variant of a remedy: "own" if the potential, not the system file, sets the cutoff."""
+        """Variant of a remedy's text: "own" if the potential, not the system file, sets the cutoff."""
         return [] if self.cutoff_key else ["own"]
 
     @cached_property
     def thermal(self) -> float:
-        """k_B T at the run's mean temperature, energy."""
+        """k_B T at the mean temperature of the run, in units of energy."""
         return self.units.k_B * float(np.mean(self.series["temperature"]))
 
     @property
     def jump(self) -> float:
-        """Energy of a pair at the cutoff, 0 if the potential ends at zero."""
+        """Energy of a pair at the cutoff distance; 0 if the potential is zero there."""
         return float(self.cutoff.get("energy_jump") or 0.0)
 
     @property
@@ -152,7 +152,7 @@ class RunView(View):
         return Measured(left, self.units.energy, self.summary.get("energy_budget_tolerance"))
 
     def total(self, key: str, column: str | None = None) -> int:
-        """Return a count from the summary, or from the table of neighbor lists if a run was killed."""
+        """Return a count from the summary, or from the table of neighbor lists if there is no summary."""
         return int(self.summary.get(key) or self.epochs[column or key].sum())
 
     def step(self, row: int | np.integer) -> int:
@@ -189,7 +189,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
 
 
 def draw_first(run: RunView) -> None:
-    """Draw the figures without single flips early, in parallel with other work."""
+    """Draw the figures that need no table of flips, in parallel with other work."""
     from mdnum.report import drawing
 
     for part in (*_energy(run), next(_flips_per_step(run)), *_lists(run)):
@@ -213,7 +213,7 @@ def _numbers(run: RunView) -> dict[str, Any]:
 
 
 def _what(run: RunView) -> list[tuple[str, str]]:
-    """Return table rows on the system that was run; settings that the system file lacks are omitted."""
+    """Return table rows on the simulated system; settings that the system file lacks are omitted."""
     units, system, time = run.units, run.system, run.series["time"]
     lengths: dict[str, str] = dict.fromkeys(("radius", "onset", "skin"), units.length)
 
@@ -310,7 +310,7 @@ def _energy(run: RunView) -> Iterator[Any]:
 
 
 def _pressure(run: RunView, parts: Mapping[str, Any]) -> Iterator[Any]:
-    """Yield the contributions to the pressure, including those of jumps at the cutoff and of the tail."""
+    """Yield contributions to the pressure, including those of force jumps at the cutoff and of the tail."""
     units = run.units
     rows = TEXTS.rows("pressure", **vars(units), **parts)
     terms = [
@@ -454,7 +454,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
 
 
 def _ranges(run: RunView) -> Iterator[Any]:
-    """Yield a table of each quantity's range of magnitudes, and the first steps outside narrower formats."""
+    """Yield a table of smallest and largest magnitudes, and of steps at which narrower formats fail."""
     examined, series, units = run.table("ranges"), run.series, vars(run.units)
     sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
     sums["step"] = series["step"]

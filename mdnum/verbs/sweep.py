@@ -54,7 +54,7 @@ def sweep(
     keep_runs: bool = False,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find which choices change which results, and the cheapest setting that is accurate enough.
+    """Find the numerical choices that change results, and the cheapest setting that is accurate enough.
 
     Each point (a run with one setting and one seed) is stored on disk. If a sweep was stopped, or is repeated
     with more values, seeds or measures, only the missing points are computed.
@@ -247,7 +247,7 @@ def _compute(
 def _after_a_loss(
     place: Workspace, one: Task, wanted: Mapping[str, Planned], error: BaseException, counts: dict[str, Any]
 ) -> list[list[Planned]]:
-    """Handle a task whose process died several times: mark its current point as failed; return the others."""
+    """Handle a task whose process died repeatedly: mark the current point as failed; return the others."""
     from mdnum.sweeps.points import write_result
 
     again = []

@@ -24,7 +24,7 @@ def _twin(simulation: Any, steps: int, argument: str) -> Any:
 
 
 def _pair(run: Sample, argument: str) -> Any:
-    """Run a system twice; by default the starts differ by one ulp of one coordinate; find the divergence."""
+    """Run a system twice until the runs diverge; by default one initial coordinate differs by one ulp."""
     from mdnum.forks import fork
 
     if ("fork", argument) not in run.made:

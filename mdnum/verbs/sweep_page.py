@@ -25,7 +25,7 @@ _INSIDE = {True: "yes", False: "no", None: "not decided"}
 
 
 def _shown(view: View, name: str) -> str:
-    """Shorten the path in a measure's name as far as the name remains different from other names."""
+    """Shorten the path in the name of a measure as far as the name remains unique."""
     parts, others = Path(name).parts, [one["name"] for one in view.summary["measures"] if one["name"] != name]
     ends = ["/".join(parts[-k:]) for k in range(1, len(parts))] if ".py:" in name else []
     return next((end for end in ends if not any(one.endswith(f"/{end}") for one in others)), name)
@@ -48,7 +48,7 @@ def _moved(view: View) -> dict[str, list[str]]:
 
 
 def judge(view: View) -> Verdict:
-    """Return the verdict on a sweep: which choices change which results, and recommended values."""
+    """Return the verdict on a sweep: choices that change results, and recommended values."""
     s = view.summary
     moved = _moved(view)
     said = [TEXTS("moves", key=key, measures=listed(names)) for key, names in moved.items() if names]
@@ -122,7 +122,7 @@ def _advised(view: View, advice: Mapping[str, Any]) -> str:
 
 
 def _further_seeds(view: View, factor: float) -> int:
-    """Return the number of seeds to add so that the number of seeds grows by the given factor."""
+    """Return how many random seeds to add so that their number grows by the given factor."""
     return int(np.ceil(len(view.summary["seeds"]) * (factor - 1)))
 
 
@@ -178,13 +178,13 @@ def _sections(view: View) -> Iterator[Section]:
 def _most(
     rows: Sequence[Any], columns: Mapping[str, str], stored: str, bad: Callable[[Any], Any] | None = None
 ) -> list[Any]:
-    """Return a table of the first rows; if there are more rows, add a note on the file with all rows."""
+    """Return a table of the first rows, preceded by a note on the file with all rows if there are more."""
     more = [TEXTS("more_rows", shown=_ROWS, all=len(rows), stored=stored)] if len(rows) > _ROWS else []
     return [*more, table_of(rows[:_ROWS], columns, bad=bad)]
 
 
 def _several(words: Sequence[str], separator: str = ", ") -> str:
-    """Join words; of many words, join only the first three and the last, and give the number of words."""
+    """Join words; if there are many, show the first three, the last, and the number of words."""
     if len(words) <= _VALUES:
         return separator.join(words)
     return TEXTS("many_values", first=separator.join(words[:3]), last=words[-1], n=len(words))
@@ -207,7 +207,7 @@ def _differences(view: View) -> list[Any]:
 
 
 def _with_error(row: Mapping[str, Any]) -> str:
-    """Format a value and its error; the value is rounded to the digits that the error leaves valid."""
+    """Format a value and its error; the value is rounded to the digits that are valid given the error."""
     value, error = row["value"], row["error"]
     if not error:
         return number(value, 5)
@@ -245,7 +245,7 @@ def _settings(view: View) -> list[Any]:
 
 
 def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
-    """Yield a figure of each measure versus one choice, with errors; other choices keep their base values."""
+    """Yield figures of each measure versus the values of one choice, with other choices at base values."""
     s, values = view.summary, axis["values"]
     if not all(isinstance(one, int | float) for one in values):
         return

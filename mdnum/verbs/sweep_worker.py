@@ -37,7 +37,7 @@ class Task:
 
 
 def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> bool:
-    """True if a stored result contains all requested measures, or failed for a reason that will persist."""
+    """True if a stored result is complete, or if its computation failed for a permanent reason."""
     if result is None:
         return False
     if result["status"] == "failed":
@@ -47,7 +47,7 @@ def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> boo
 
 
 def _missing(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> list[str]:
-    """Return the measures that a stored result lacks, or that were computed by different source code."""
+    """Return the requested measures that a stored result lacks or that other source code computed."""
     stored = {} if result is None else result["measures"]
     return [name for name, at in measures.items() if stored.get(name, {}).get("digest") != at]
 

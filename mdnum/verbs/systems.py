@@ -49,9 +49,9 @@ def copy(system: str, target: Path | None = None) -> Reply:
 
 
 def _size_in(file: Path) -> dict[str, Any]:
-    """Return the number of atoms or balls and the description in a shipped system file, without checks.
+    """Read the number of atoms or balls and the description from a shipped system file, without checks.
 
-    To check and build all systems for a list, jax and ASE would have to be imported, which takes seconds.
+    Building all systems for a list would require importing jax and ASE, which takes seconds.
     """
     table = tomllib.loads(file.read_text(encoding="utf-8"))
     about, start, structure = table["about"], table.get("start", {}), table.get("structure", {})

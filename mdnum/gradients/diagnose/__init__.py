@@ -1,8 +1,8 @@
 """Diagnosis of a simulation's gradient: how far the gradient can be trusted, and what contributes to it.
 
-Gradient methods compute different quantities: the derivative of the steps that ran, the derivative of the
-flow including the times of flips, the slope of the loss between runs at shifted parameters, the slope of an
-average, or the derivative of another program. The function `agreement` gives the reason for each difference.
+Gradient methods compute different quantities: the derivative of the steps, the derivative of the flow with
+the times of flips, the slope of the loss between shifted runs, the slope of an average, or the derivative of
+another program. The function `agreement` gives the reason for each difference between two gradients.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ def _meaning(
     name: str, one: Gradient, reference: Gradient, size: float, relative: float, rounding: float,
     grown: float, jumps: bool,
 ) -> tuple[str, dict[str, float] | None]:  # fmt: skip
-    """Return the reason why two derivatives differ, and supporting numbers (None: the rounding bound)."""
+    """Return the reason why two derivatives differ, and numbers that support it (None: a rounding bound)."""
     kinds = {one.kind: one, reference.kind: reference}
     if not np.isfinite(relative):
         return "unexplained", {}

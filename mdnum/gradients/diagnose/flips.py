@@ -1,4 +1,4 @@
-"""Contribution of each flip to a gradient, and jumps of a gradient where decisions change.
+"""Contribution of each flip to a gradient, and jumps of a gradient at parameter values where flips change.
 
 The contribution of a crossing is a product of two factors. The first factor, from a reverse pass, is the
 derivative of the loss with respect to the cutoff of this crossing alone; it includes the effect of all later
@@ -7,7 +7,7 @@ pair. The contributions of all flips therefore sum exactly to the total contribu
 
 A decision boundary is a value of a parameter at which the decision on a pair changes, between two adjacent
 floats. Between two boundaries all runs make the same decisions, and loss and gradient are smooth functions of
-the parameter. The gradients on both sides of a boundary show how useful an optimizer step across it is.
+the parameter. The two gradients at a boundary show whether an optimizer step across the boundary is useful.
 """
 
 from __future__ import annotations
@@ -172,8 +172,8 @@ def edges(
 ) -> DecisionEdges:
     """Find the nearest decision boundaries below and above a parameter's value, with gradients on both sides.
 
-    Tangents predict the parameter shift at which a decision first changes. Runs near this value are then
-    compared, until two adjacent floats with different decisions are found.
+    Tangents predict the parameter shift at which a decision first changes. Near this shift, runs are compared
+    until two adjacent floats with different decisions are found.
 
     Args:
         problem: of a pair potential. name: a parameter of one entry.

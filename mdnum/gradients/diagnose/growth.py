@@ -1,4 +1,4 @@
-"""Growth of a gradient with the number of steps, its range in a narrow type, and growth of perturbations.
+"""Growth of a gradient and of perturbations with the number of steps, and overflow in narrow formats.
 
 The cotangent of the state h steps before the end is the gradient of a run of h steps (horizon h) from this
 state. One reverse pass over T steps therefore gives a gradient for every horizon up to T, each with a
@@ -141,7 +141,7 @@ class GrowthWatch:
 
 
 def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
-    """Classify a run by an entry of WORDS: from growth of the gradient and outliers of the rms speed."""
+    """Classify a run, by an entry of WORDS, from the growth of its gradient and outliers of the rms speed."""
     usual = float(np.median(speed))
     if usual > 0 and not (np.isfinite(speed).all() and speed.max() <= _WILD * usual):
         return WORDS[2]
@@ -157,7 +157,7 @@ def growth(
         InputError: a parameter does not exist, or flips were requested without a pair potential.
         NumericalError: the run blew up.
 
-    Error: the error of the reverse pass. Horizons below T belong to later starts of the same run.
+    Error: that of the reverse pass. A horizon below T belongs to a later start on the same trajectory.
     """
     names = parameters.resolve(problem.simulation, names)
     watch = GrowthWatch(problem.simulation, names, problem.steps)
@@ -219,7 +219,7 @@ class ScalingWatch:
             table["largest"][step] = np.inf
 
     def result(self) -> Scaling:
-        """Return the counts without scale and with the best scale of the loss, a power of two."""
+        """Return counts of overflow and underflow, without scale and with the best scale of the loss."""
         form = self.format
         largest = float(self.table["largest"].max())
         there = self.exponents.sum(axis=1, dtype=np.int64)
@@ -340,7 +340,7 @@ class Jacobian:
 
 
 def _orthonormal(block):
-    """Return the QR factors of a block of vectors, with no negative number on the diagonal of R."""
+    """Return the QR factors of a block of vectors, with the signs chosen so that the diagonal of R is ≥ 0."""
     q, r = np.linalg.qr(block)
     signs = np.where(np.diag(r) < 0, -1.0, 1.0)
     return q * signs, signs[:, None] * r
@@ -460,7 +460,7 @@ def _defect(start, there: TangentImage, back: TangentImage) -> float:
 
 
 def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return logarithms of the singular values, left vectors and right vectors of a map on a block."""
+    """Return logarithms of singular values, left and right singular vectors of a Jacobian on a block."""
     diagonal = image.stretches[-1]
     if diagonal.max() - diagonal.min() > _RANGE:
         # rounding has eaten the small ones in the product; the block is aligned, so its diagonal has them

@@ -78,7 +78,7 @@ class Turns:
 
     @property
     def gap(self) -> Float[np.ndarray, "turns"]:
-        """Distance to the cutoff in the run with shorter steps; negative if the pair is beyond the cutoff."""
+        """Distance to the cutoff in a run with shorter time steps; negative if the pair passed the cutoff."""
         return self.table["gap"] + self.table["side"] * self.table["finer"]
 
     @property
@@ -95,14 +95,14 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """True if the cutoff is within the uncertainty, or was passed only between two steps."""
+        """True if the distance is within its uncertainty of the cutoff, or passed it between two steps."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """Magnitude of the possible contribution of the two crossings at each turning point. If the cutoff is
-        within the uncertainty, the pair is assumed to pass the cutoff by 1 % of the uncertainty; otherwise
-        the value is the change of the contribution with shorter steps.
+        """Magnitude of the possible contribution of the two crossings at each turning point. If the distance
+        is within its uncertainty of the cutoff, the pair is assumed to pass the cutoff by 1 % of the
+        uncertainty; otherwise the value is the change of the contribution with shorter time steps.
         """
         bend, reach = self.table["bend"], self.reach
 
@@ -140,7 +140,7 @@ class Turns:
 
 @dataclass
 class Near:
-    """Collector of turning points, their weights, and shifts in other runs, during passes through a run."""
+    """Collector of turning points of pair distances, with weights, tangents and shifts in other runs."""
 
     simulation: Simulation
     pace: Pace  # how often the loss looks
@@ -157,7 +157,7 @@ class Near:
         return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
 
     def reverse(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Find turning points in a stretch of steps, and compute their weights from cotangents."""
+        """Find turning points in a stretch of steps, and compute the weight of each from cotangents."""
         if not self.jumps:
             return
         simulation = self.simulation
@@ -207,7 +207,7 @@ class Near:
         found["moved"] = np.asarray(along.r_cut).T[found["kind"]] - dr
 
     def compared(self, stretch: TapeStretch, per: int) -> None:
-        """Compare distances at turning points with another run, which has `per` steps for each step."""
+        """Compare distances at turning points with another run, which takes `per` steps for each step."""
         cell, place = HostCell(self.simulation.cell), stretch.table.place
         for found in self._found.values():
             for earlier, name in ((1, "before"), (0, "after")):

@@ -208,7 +208,7 @@ def first_difference(a: Horizons, b: Horizons) -> int | None:
 
 @dataclass(frozen=True)
 class Limit:
-    """One of the limits on the number of steps for which a gradient can be trusted."""
+    """One limit on the number of steps for which a gradient can be trusted, and whether it was reached."""
 
     what: str  # ROUNDING, STEP, NEAR, FLIPS, AMBIGUOUS or SCATTER
     # the longest horizon, in steps, at which it did no harm; None where it was not examined
@@ -246,7 +246,7 @@ class Trust(Judgment):
 
 
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
-    """Return a simulation with other rounding for comparison, and the given run's formats below float64.
+    """Return a simulation with different rounding for comparison, and the formats narrower than float64.
 
     If the given run uses formats narrower than float64, the comparison uses float64 throughout. No hardware
     format is wider than float64: a float64 run is compared with a run whose start is shifted by one rounding
@@ -387,7 +387,7 @@ def trust(
 
 
 def grew(growth: GradientGrowth) -> bool:
-    """Return whether a gradient grew so much with the number of steps that other starts may differ."""
+    """Return whether a gradient grew so much that it may be very different for other initial states."""
     # over the first horizons all of them grow: velocities turn into lengths, and averages gain frames
     size = growth.table["size"][min(CLOCK_STEPS, len(growth.table["size"]) - 1) :]
     there = size[np.isfinite(size) & (size > 0)]
@@ -396,14 +396,14 @@ def grew(growth: GradientGrowth) -> bool:
 
 
 def no_half_step(simulation: Simulation) -> bool:
-    """Return whether a thermostat's noise would differ in a run at half the time step."""
+    """Return whether a run at half the time step would have different noise from a thermostat."""
     return simulation.integrator.random is not None
 
 
 def verdict_of(
     limits: Sequence[Limit], steps: int, chaotic: bool, skipped: bool
 ) -> tuple[str, int, str, tuple[str, ...]]:
-    """Return the verdict, the horizon before any limit is reached, the first limit, and unexamined limits."""
+    """Return the verdict, the horizon up to which no limit is reached, the first limit, unexamined limits."""
     examined = [one for one in limits if one.horizon is not None]
     horizon = min((one.horizon or 0 for one in examined), default=0)
     met = [one.what for one in examined if one.reached and one.horizon == horizon]
@@ -422,7 +422,7 @@ def _unseen(part: StretchTangents) -> None:
 
 
 def _digits(*relative: float) -> int:
-    """Return the number of decimal digits that correspond to the largest of some relative differences."""
+    """Return the number of decimal digits in which values agree, from the largest relative difference."""
     worst = max(relative)
     if not np.isfinite(worst):
         return 0
@@ -475,7 +475,7 @@ def _missed(
 
 
 def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
-    """Divide terms by the derivatives; return these shares, and their cumulative sums in quadrature."""
+    """Divide terms by the size of derivatives; return the ratios and their cumulative sums in quadrature."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
         share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))
@@ -486,7 +486,7 @@ def _left_out(
     made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
     tolerance: float,
 ) -> Limit | None:  # fmt: skip
-    """Return a limit if excluded grazing flips, or jumps of a loss of single frames, are too large."""
+    """Return a limit if gradients lack a large contribution of grazing flips or of jumps of the loss."""
     tape, met = made.tape, made.crossings[::-1]
     energy, virial, speed, weight, slow = (
         joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")
@@ -528,7 +528,7 @@ def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "poi
 def last_below(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the last horizon before values exceed a limit twice in succession, and whether they do so.
+    """Return the last horizon before values exceed a limit twice in succession, and whether this occurs.
 
     A single value beyond the limit is ignored (except at the last horizon), because the relative error is
     large where a gradient changes sign.
@@ -544,11 +544,11 @@ def last_below(
 def last_agreeing(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the longest horizon without a value above a limit, and whether the last horizon has one.
+    """Return the longest horizon with all values below a limit, and whether the last horizon is beyond it.
 
     Disagreement at shorter horizons is ignored: the relative error due to the time step may decrease again,
-    and a gradient over few flips changes in large steps. Agreement at a single horizon, with disagreement at
-    adjacent horizons, is regarded as chance.
+    and for few flips a change of a single flip is a large part of the gradient. Agreement at a single
+    horizon, with disagreement at adjacent horizons, is regarded as chance.
     """
     within = np.max(np.stack(list(values.values())), axis=0) <= limit
     if len(within) > 1:
