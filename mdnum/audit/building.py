@@ -54,8 +54,8 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
     second element, half of the atoms are of that element. The lattice constant is the one at which the
     calculator's energy is lowest. The crystal is repeated until the cell is two cutoffs wide (at most 500
     atoms, fewer for a slow calculator), and its atoms are displaced slightly. `info["origin"]` describes the
-    structure. If the calculator fails on atoms without neighbors, a denser crystal is built; this failure is
-    reported later and does not stop the audit.
+    structure. If the calculator fails on atoms without neighbors, a denser crystal is built; the failure is
+    reported later.
 
     Args:
         deadline: time limit for building; at the deadline, or after `BUILDING_CALLS` calls, the best

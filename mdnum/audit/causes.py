@@ -10,7 +10,7 @@ from mdnum.plain import beside
 
 @dataclass(frozen=True)
 class Cause:
-    """Consequences of the cause behind a finding code, alternative causes, and tests to tell them apart."""
+    """Consequences of the cause behind a finding code, alternative causes, and tests to distinguish these."""
 
     brings: tuple[str, ...] = ()  # codes of findings that it explains
     rivals: tuple[str, ...] = ()  # codes of other causes that show the same

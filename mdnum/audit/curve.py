@@ -1,10 +1,10 @@
-"""Locate jumps and kinks of a curve to adjacent floating-point numbers by scanning and zooming; measure them.
+"""Locate jumps and kinks of a curve by scanning and zooming, down to adjacent floating-point numbers.
 
 A curve consists of an energy and the force along one coordinate. Each energy and force is predicted from the
 points to the left and, independently, from the points to the right. Where the curve is smooth, the difference
 between the two predictions falls with the fourth power of the point spacing. At a kink, this difference falls
 only linearly with the spacing, and at a jump it does not fall. The decrease of the difference with smaller
-spacing therefore identifies the kind of singularity, whatever the curve is like elsewhere.
+spacing therefore identifies the kind of singularity.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Energy balance of a run: jumps of the energy at thresholds and elsewhere, work of the forces, drift.
 
 If the force is minus the gradient of the energy, a step's energy change plus the work of the forces along the
-straight line is zero for every integrator. An energy change that remains at a distance threshold is the
-energy jump of a flip. One at another single point is due to a limit on the number of neighbors or a selection
-of nearest neighbors. A distributed one means that the force is not minus this gradient.
+straight line is zero for every integrator. An energy change that is not explained by this work is, at a
+distance threshold, the energy jump of a flip. At another single point, such a change is due to a limit on the
+number of neighbors or a selection of nearest neighbors. A distributed change means that the force is not
+minus the gradient of the energy.
 """
 
 from __future__ import annotations
@@ -139,7 +140,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy and force along the straight line between two steps; `ends` takes both ends from the run."""
+    """Energy and force along the straight line between two steps; `ends` takes end values from the run."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:
@@ -255,7 +256,7 @@ def hidden_jumps(
     crossed: Mapping[int, Sequence[RunCrossing]],
     noise: float,
 ) -> HiddenJumps:
-    """Search the time steps with the largest unexplained energy change for jumps at single points.
+    """Search the time steps with the largest unexplained energy change for points at which the energy jumps.
 
     Args:
         rest: unexplained energy change of each step, eV; nan where unknown.

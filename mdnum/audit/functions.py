@@ -1,6 +1,6 @@
 """Check the smoothness of a user's pair function between close contact and cutoff from computed values.
 
-A run records the flips at its cutoff. If the pair function itself has a discontinuity, for example where two
+A run records the flips at the cutoff. If the pair function itself has a discontinuity, for example where two
 pieces do not join, a run records no flip there, and no derivative of the run includes the discontinuity.
 """
 
@@ -45,7 +45,7 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
     """Find the discontinuities of a user's pair functions from the closest initial pair to the cutoff.
 
     Returns:
-        None if all potentials are mdnum's, else plain values: `from` and `to`, length; `smoothness`, the
+        None if all potentials belong to mdnum, else plain values: `from` and `to`, length; `smoothness`, the
         number of derivatives of the cut energy that do not jump at the cutoff (-1: the energy jumps; 3: or
         more); `places`, a row each: `term`, `pair`, `distance`, the `order` of the lowest derivative of the
         energy that jumps (0: the energy, 1: the force), its name `what` and its `jump`, beyond minus before.

@@ -391,8 +391,8 @@ def digits(values: np.ndarray) -> Digits:
 def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
     """Yield a finding, QUANTIZED or LOW_PRECISION, if energies or forces carry fewer digits than a double.
 
-    Discrete steps are measured along a line of structures, because the digits of forces may not show them:
-    forces rounded before a unit conversion, or computed from rounded positions, use all digits of a double.
+    Discrete steps are measured along a line of structures, because digits may not show them: forces rounded
+    before a unit conversion, or computed from rounded positions, use all digits of a double.
     """
     stairs = steps(subject, atoms)
     size, typical = largest(stairs.energies), rms(stairs.forces)

@@ -48,7 +48,7 @@ def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) 
     neglected neighbors, appears at nearly all indices, or at other indices for another order.
 
     Returns:
-        None if no index deviates by more than is allowed, or if nearly all indices do.
+        None if energy and forces are correct at all indices, or if they are wrong at nearly all indices.
     """
     key = "places", atoms.positions.tobytes(), atoms.numbers.tobytes()
     if key not in subject.known:

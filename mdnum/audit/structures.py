@@ -121,8 +121,8 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
     """Return a pair of particles for every two species that the calculator supports, most frequent first.
 
     A pair consists of single atoms if the calculator supports single atoms at the smallest distance in the
-    structure. Otherwise each atom has two companion atoms, since a bond-order potential may divide by the
-    number of neighbors. If this fails too (rigid water), the pair consists of molecules of the structure.
+    structure. If single atoms fail, each atom has two companion atoms, since a bond-order potential may
+    divide by the number of neighbors. If companions fail too (rigid water), the pair consists of molecules.
 
     Returns:
         (pairs, omitted pairs with the reason).

@@ -1,11 +1,11 @@
-"""Search for discontinuities of the energy among many atoms, by moving atoms and by crowding them.
+"""Search for discontinuities of the energy among many atoms, using moving atoms and dense clusters.
 
 A pair of atoms may interact differently among many atoms (embedding energies, angles): an energy jump may
-have another size, and a threshold that is smooth for two atoms may jump. Therefore atoms and triples of atoms
-are moved through the pair thresholds and beyond. To detect a limit on the number of neighbors, one more atom
-is moved past all neighbors of a crowded central atom. A calculator that keeps only k neighbors exchanges the
-k-th neighbor for this atom when both are equally far away; then the energy or a force jumps. If a calculator
-keeps the first k neighbors in the order of the list, reordering the atoms reveals the limit.
+have another size, and a threshold that is smooth for two atoms may jump. To find these differences, atoms and
+triples are moved through the pair thresholds and beyond. To detect a limit on the number of neighbors, one
+more atom is moved past all neighbors of a crowded central atom. A calculator that keeps only k neighbors
+exchanges the k-th neighbor for this atom when both are equally far away; then the energy or a force jumps. If
+a calculator keeps the first k neighbors in the order of the list, reordering the atoms reveals the limit.
 """
 
 from __future__ import annotations
@@ -324,7 +324,7 @@ def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
 
 
 class CrowdOrder(NamedTuple):
-    """Effect of the order of the atoms in a crowded cluster on energy and forces."""
+    """Effect of the order of the atoms in a dense cluster on energy and forces."""
 
     # number of neighbors at which it starts to matter, None if it never does
     start: int | None = None
@@ -420,7 +420,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     side = _SIDE_OF_TIE * float(np.spacing(np.float32(max(np.abs(atoms.positions).max(), radius))))
 
     def change(place: float, without: int | None = None) -> tuple[float, Float[np.ndarray, "atoms"]]:
-        """Return the discontinuous changes of energy and forces between place - side and place + side.
+        """Return the jumps of energy and forces as an atom moves from `place - side` to `place + side`.
 
         (|energy change plus work of the force|, for each atom |change of the force on it minus the mean
         change over the adjacent intervals of the same length|).

@@ -120,7 +120,7 @@ class PairWalks:
 
 
 def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
-    """Return all distance thresholds of the calculator's pair interactions; they are computed only once."""
+    """Return all distance thresholds of the calculator's pair interactions; the scan is made only once."""
     if "thresholds" not in subject.known:  # a resumed audit knows them without a walk
         subject.known["thresholds"] = [one for walk in walk_pairs(subject).walks for one in walk.thresholds]
     return subject.known["thresholds"]
@@ -366,8 +366,8 @@ def _beyond(
 ) -> Beyond | None:
     """Search beyond the scan for a cutoff, as long as one could still remove a relevant energy.
 
-    None is returned if no distance could be evaluated: in a periodic cell, where images of the particles come
-    too near, or if the calculator fails.
+    The result is None if no distance could be evaluated: in a periodic cell, where images of the particles
+    come too near, or if the calculator fails.
     """
     if pair.periodic:
         return None

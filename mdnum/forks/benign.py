@@ -1,16 +1,16 @@
 """Test whether a fork is benign: whether two programs with diverging runs give the same averages.
 
 Runs of program B are compared with an ensemble of runs of program A, at a step that is found by calibration.
-At early steps, runs differ by less than rounding errors can cause; at late steps, a changed program has the
-same scatter, because every run has forgotten its start. The suitable steps depend on the system. Therefore
-programs with deliberate changes are run too; at the chosen step, all deliberate changes are distinguishable
-from rounding.
+At early steps, runs differ by less than rounding errors can cause; at late steps, every run has forgotten its
+start, and a changed program has the same scatter. The suitable steps depend on the system. For calibration,
+programs with deliberate changes are run; at the chosen step, all deliberate changes are distinguishable from
+rounding.
 
 The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
 Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
 run is an outlier if at least two of its principal components exceed the limit; a program fails the test if
-two of its three runs are outliers. Equivalently, the median over the three runs of the second-largest
-component exceeds the limit.
+two of its three runs are outliers. In other words, a program fails if the median over its three runs of the
+second-largest component exceeds the limit.
 """
 
 from __future__ import annotations

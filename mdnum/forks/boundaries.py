@@ -160,7 +160,7 @@ class NumberLine:
         return self.known[place].digest
 
     def bisect(self, a: int, b: int, pending: list[tuple[int, int]]) -> tuple[int, int]:
-        """Bisect to adjacent ordinals with different histories; append the other halves to `pending`."""
+        """Bisect to adjacent ordinals with different histories; append the unused halves to `pending`."""
         while b - a > 1:
             middle = (a + b) // 2
             here = self.digest(middle)
@@ -173,7 +173,7 @@ class NumberLine:
         return a, b
 
     def boundary(self, below: int, above: int) -> Boundary | None:
-        """Find the first differing decision of the runs at two ordinals; None if a run fails before it."""
+        """Find the first differing decision of the runs at two ordinals; None if a run fails earlier."""
         places = (below, above)
         runs = [self.run(place) for place in places]
         step = runs[0].first_difference(runs[1])
@@ -215,10 +215,11 @@ def boundaries(
     """Find the values of a parameter at which the decisions of a run change, within the resolution of a grid.
 
     The system is run at every grid value of the parameter. If the histories at the ends of a grid cell
-    differ, the cell is bisected until its ends are adjacent floats. If the other half contains a change too,
-    it is searched later. Boundaries are searched from the lowest value upward, so if there are more than
-    requested, the highest are missing. All runs use the program of a normal run; for the cutoff radius, it
-    takes the radius as an argument. The runs on both sides of every boundary are repeated in a new process.
+    differ, the cell is bisected until its ends are adjacent floats. If the other half of the cell contains a
+    change too, it is searched later. Boundaries are searched from the lowest value upward, so if there are
+    more than requested, the highest are missing. All runs use the program of a normal run; for the cutoff
+    radius, it takes the radius as an argument. The runs on both sides of every boundary are repeated in a new
+    process.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.

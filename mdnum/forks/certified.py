@@ -2,11 +2,11 @@
 
 Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound: exact arithmetic
 would give the same decisions for the same states. Up to the end of *protection*, the pair of atoms closest to
-its cutoff was further from it than the separation of the two runs can have moved this pair. As long as both
-conditions are met, the decisions of the two runs agree. If one program is at least as precise in every role,
-the other makes the same decisions up to the *shadow horizon*.
+its cutoff was further from it than the separation of the two runs can have moved this pair. As long as the
+certified horizon and the protection last, the decisions of the two runs agree. If one of two programs is at
+least as precise in every role, the other makes the same decisions up to the *shadow horizon*.
 
-All these steps refer to decisions for the actual states of the run. A run with correct decisions for its
+All these statements refer to decisions for the actual states of the run. A run with correct decisions for its
 states may have left the exact history long before (`forks.exact.certify` finds the step).
 """
 

@@ -3,8 +3,8 @@
 Neither run is repeated. The first differing bit and the fork (first differing decision) are read from both
 folders. To compare positions, `twin_of` rebuilds the programs, and `mdnum.forks.fork` repeats the runs.
 
-Runs cannot be compared if their systems differ in atoms, box, potential or contact. Any other difference, in
-a parameter or a numerical choice, is allowed.
+Runs cannot be compared if the atoms, box, potential or contact of their systems differ. Runs may differ in
+any other parameter or numerical choice.
 """
 
 from __future__ import annotations

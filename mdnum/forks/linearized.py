@@ -6,10 +6,11 @@ the largest Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Gal
 1980), so it does not saturate, unlike the separation of two runs.
 
 Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation: to first order
-the decision flips at a = -m / (dm/da). The smallest amplitude at each step is a limit for all perturbations,
-as long as the perturbed run remains close to the reference run and makes the same decisions. If the force
-jumps at the cutoff, the first flip kicks the two atoms, and the forecast ends because the linearization then
-describes another run. If the force is continuous at the cutoff, a flip changes nothing to first order.
+the decision flips at a = -m / (dm/da). The smallest amplitude that flips a decision at a step is a lower
+limit for all perturbations, as long as the perturbed run remains close to the reference run and makes the
+same decisions. If the force jumps at the cutoff, the first flip kicks the two atoms, and the forecast ends
+because the linearization then describes another run. If the force is continuous at the cutoff, a flip changes
+nothing to first order.
 """
 
 from __future__ import annotations

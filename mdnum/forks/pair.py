@@ -169,7 +169,7 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Return whether to run B under A's decisions, and A under B's, and the largest number of repeats.
+    """Return whether to impose decisions of run A on run B, and of B on A, and the number of repeats.
 
     Raises:
         InputError: a requested counterfactual run or repeat is not possible.
@@ -216,8 +216,8 @@ def displacements(fork: Fork) -> tuple[float, float]:
     """Return two displacements (lengths) for starts of repeats: the initial separation of the runs, and less.
 
     At a hundredth of the first displacement, a repeat begins to have the same rounding errors as the pair of
-    runs; at much smaller displacements, the repeat equals the pair and is no evidence. If a hundredth is less
-    than an ulp, the second displacement may be larger than the first.
+    runs; at much smaller displacements, the repeat equals the pair and is no evidence. If a hundredth of the
+    first displacement is less than an ulp, the second displacement may be larger than the first.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]

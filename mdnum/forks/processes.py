@@ -6,7 +6,7 @@ its own process. Variants whose positions have equal hashes at every step are nu
 the hashes differ, the pattern of agreement between variants reveals the cause.
 
 `python -m mdnum.forks.processes FILE` executes the task described in a JSON file. For `digests_elsewhere`,
-the process prints one digest per line; for `variants`, it writes a file with an array of positions.
+the process prints one digest per line; for `variants`, the process writes a file with an array of positions.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Molecular-dynamics runs repeated around a fork: nearby atoms, overridden decisions, and minimal causes.
 
-To override a decision of run B, the decision of run A is imposed; B makes all other decisions itself. The
-smallest set of overridden pairs that keeps B with A is found by bisection and delta debugging, the method by
-which Verrou finds the instructions that cause an error.
+To override a decision of run B, the decision of run A is imposed; run B makes all other decisions itself. The
+smallest set of overridden pairs that keeps run B close to run A is found by bisection and delta debugging,
+the method by which Verrou finds the instructions that cause an error.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Neighborhood:
 
 
 def neighborhood(fork: Fork) -> Neighborhood | None:
-    """Repeat both runs and return the atoms around the pair at the fork; None if no pair forked."""
+    """Repeat both runs and return the atoms around the pair at the fork; None if there is no such pair."""
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
@@ -89,7 +89,7 @@ def neighborhood(fork: Fork) -> Neighborhood | None:
 
 @dataclass(frozen=True)
 class Pinned:
-    """Result of a run of B in which some decisions were replaced by those of A."""
+    """Result of a run B in which decisions of run A were imposed on some pairs of atoms."""
 
     pairs: tuple[tuple[int, int], ...]  # whose decisions were
     # first, last: steps of the window in which they were
@@ -108,7 +108,7 @@ def pinned(
     last: int | None = None,
     steps: int | None = None,
 ) -> Pinned:
-    """Run B again with A's decisions on some pairs imposed, and compute the separation of B from A.
+    """Repeat run B with decisions of run A imposed on some pairs, and compute its separation from run A.
 
     Args:
         fork: a pair of runs with the same atom labels.
@@ -216,7 +216,7 @@ def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
 
 @dataclass(frozen=True)
 class Minimal:
-    """A smallest set of pairs of atoms such that imposing A's decisions on them keeps B close to A."""
+    """A smallest set of atom pairs such that imposing run A's decisions on them keeps run B close to A."""
 
     # pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A; None where
     # no set does
@@ -237,7 +237,7 @@ class Minimal:
 def minimal_cause(
     fork: Fork, *, tests: int = 80, progress: Callable[[int, int], None] | None = None
 ) -> Minimal:
-    """Find a minimal set of atom pairs such that imposing A's decisions on them prevents the split of B.
+    """Find a minimal set of atom pairs such that imposing run A's decisions on it prevents a split of run B.
 
     Args:
         fork: a pair of runs with the same atom labels that has forked and split.
@@ -271,7 +271,7 @@ def minimal_cause(
 
 
 class _Search:
-    """Runs of B with A's decisions imposed on some pairs, to test whether B stays close to A."""
+    """Runs of B with decisions of run A imposed on some pairs, to test whether B stays close to A."""
 
     def __init__(
         self,
@@ -300,7 +300,7 @@ class _Search:
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Test whether B stays close to A under A's decisions on some pairs; False if no run is left."""
+        """Test whether run B stays close to A under A's decisions on some pairs; False if no run is left."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():

@@ -141,8 +141,8 @@ def short_listed_eam(file: Path) -> Calculator:
 class EnergyOnNeighborList(ClassicalCalculator):
     """ASE calculator for an energy function, compiled separately and evaluated on ASE's neighbor list.
 
-    This reference tests neighbor lists, cutoff decisions and time steps; it tests neither the energy function
-    nor its derivatives, since the reference uses jax for these too.
+    This reference tests neighbor lists, cutoff decisions and time steps, but not the energy function and its
+    derivatives, since the reference uses jax for these too.
     """
 
     implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012

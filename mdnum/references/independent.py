@@ -1,7 +1,7 @@
 """Energies, forces and stress in plain numpy on ASE's neighbor list, computed from the formulas alone.
 
-This code is independent of the code used in a run (each cutoff has its own numpy `reference`). The numpy code
-is the reference if ASE has no class for a potential or a cutoff, and an additional reference otherwise.
+The numpy code is independent of the code used in a run (each cutoff has its own numpy `reference`). It is the
+reference if ASE has no class for a potential or a cutoff, and an additional reference otherwise.
 
 A model takes directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
 the total energy with respect to every d. Forces and stress follow from the gradient g of the energy with

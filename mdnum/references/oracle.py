@@ -71,8 +71,7 @@ def exactly_inside(
 ) -> bool:
     """Decide in exact arithmetic whether a pair is inside r_cut; `closed` counts r == r_cut as inside.
 
-    In exact arithmetic, r < r_cut and r² < r_cut² are equivalent; in floating-point arithmetic they may
-    differ.
+    In exact arithmetic, r < r_cut and r² < r_cut² are equivalent; rounding can make them differ.
     """
     squared, threshold = Fraction(0), Fraction(float(r_cut)) ** 2
     for axis in range(3):

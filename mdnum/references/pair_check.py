@@ -42,7 +42,7 @@ class Search:
 
     @property
     def ours(self) -> bool:
-        """True if the neighbor search is used by mdnum, so that the decisions of a run depend on it."""
+        """True if the neighbor search is used by mdnum, so that decisions of a run depend on the search."""
         return self.listed.package == "mdnum"
 
     @property
@@ -115,8 +115,8 @@ def all_searches(system: Simulation) -> tuple[Search, ...]:
 def own_searches(system: Simulation) -> tuple[Search, ...]:
     """Return the neighbor searches of mdnum, set up for a system.
 
-    "mdnum force loop" is the cutoff decision of the force evaluation, outside jit. "mdnum, host list" and
-    "mdnum, jax-md list" are mdnum's two list builders, with the same cutoff decision made on the host.
+    "mdnum force loop" is the cutoff decision in the force evaluation, without jit. "mdnum, host list" and
+    "mdnum, jax-md list" are the two list builders of mdnum, with the same cutoff decision made on the host.
     """
     compare, dtype = system.decider.compare, system.policy.decision
     unit = _SINGLE if "float32" in (dtype, system.policy.state) else 2.0**-53

@@ -51,8 +51,8 @@ class DynamicsCheck(AuditCheck):
     """Is the energy conserved in a short run at constant energy, and if not, why?
 
     The check reports the energy drift with a block error, and the drift due to the integrator, to flips and
-    to other causes. The drift that remains after subtracting flips and the work of the forces is due to the
-    integrator. This drift must fall to a quarter when the time step is halved; a second run tests this.
+    other causes. The drift that remains after subtracting flips and the work of the forces is due to the
+    integrator. The integrator's drift must fall to a quarter at half the time step; a second run tests this.
     """
 
     name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
@@ -360,7 +360,7 @@ class TwoRuns:
 
 
 class _Bridge(Calculator):
-    """An ASE calculator that wraps the audited calculator, and saves structures on which that one fails."""
+    """An ASE calculator around the audited calculator, to save structures on which the calculator fails."""
 
     implemented_properties = ["energy", "forces"]  # noqa: RUF012
 

@@ -286,7 +286,7 @@ def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]
 
 
 def _in_turns(ways: Iterable[Same]) -> list[Same]:
-    """Order representations so that the first of each kind comes first, then the second of each kind."""
+    """Order representations so that one of each kind is tested first, then a second of each kind."""
     seen: dict[str, int] = {}
     turns = []
     for same in ways:

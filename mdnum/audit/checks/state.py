@@ -296,8 +296,8 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
     """Return the longest move of an atom or cell edge, Å, that leaves energy and forces unchanged; or 0.
 
-    A move counts only if it should change several of the last digits of the results; the expected change is
-    proportional to the length of the move.
+    A move is taken into account only if it should change several of the last digits of the results; the
+    expected change is proportional to the length of the move.
     """
     # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate
     line = np.zeros((len(atoms), 3))

@@ -1,8 +1,8 @@
 """Choices of arithmetic: the floating-point format of each role, and the order in which sums are computed.
 
 The order of a sum is given by the reduction, or by the order of pairs in neighbor lists, which depends on how
-and when the lists are built. These choices do not change which pairs interact if every list is rebuilt before
-the motion of the atoms exceeds the skin. If sums do not depend on order, these choices must have no effect.
+and when the lists are built. A different order of a sum does not change which pairs interact if every list is
+rebuilt before motion exceeds the skin. If sums do not depend on order, a different order must have no effect.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ FORMATS = ("dense", "sparse", "ordered-sparse")
 class PrecisionChoice(Choice):
     """Another floating-point format in one role, or in several.
 
-    In molecular dynamics, 16-bit floats are allowed only for pair forces: in any other role they would change
-    the model, not only the rounding (`mdnum.numerics.roles.check_role` gives the reason).
+    In molecular dynamics, 16-bit floats are allowed only for pair forces: in any other role, 16-bit floats
+    would change the model, not only the rounding (`mdnum.numerics.roles.check_role` gives the reason).
     """
 
     screened: ClassVar = {

@@ -269,7 +269,7 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice that can set the summation of both runs; if sums do not depend on order, they must agree."""
+    """A choice that can set the summation of both runs; they must agree if sums do not depend on order."""
 
     worlds = ("md",)
     both: str | None = None  # reduction of both runs; None for the system's own

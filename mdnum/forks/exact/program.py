@@ -1,4 +1,4 @@
-"""The time steps of a run in exact real arithmetic. Ball (interval) arithmetic proves every decision.
+"""The time steps of a run in exact real arithmetic. Interval arithmetic (Arb) proves every decision.
 
 The initial state and all constants are the double-precision numbers of the program, taken as exact. Positions
 and velocities are balls (intervals) with many bits. A decision is proven if the interval of its margin lies

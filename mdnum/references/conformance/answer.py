@@ -51,8 +51,8 @@ def read(given: Any) -> ListAnswer:
     """Return the pairs in a neighbor list's return value as a `ListAnswer`.
 
     A neighbor list may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance,
-    vector), or i and j with any of the other arrays. The arrays are recognized by shape: one number per row
-    is a distance, the first array with three integers per row is the shift, and another array with three
+    vector), or i and j with some of the optional arrays. The arrays are recognized by shape: one number per
+    row is a distance, the first array with three integers per row is the shift, and another array with three
     numbers per row is the vector. A mapping with the keys i, j, shift, distance and vector, or an object with
     attributes of these names, is also accepted. Single pairs are accepted too: a list of tuples (i, j), or
     one array with a row (i, j) for each pair. A Python list of lists is always read as arrays, not as pairs,

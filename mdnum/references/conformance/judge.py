@@ -309,7 +309,7 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """Return the rounding error of a result that is correct for float32 or better; None for others."""
+    """Return the rounding error of a result that is correct for float32 or better; None for wrong results."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))
@@ -371,7 +371,7 @@ class Failed:
 
     @property
     def worst(self) -> Failure:
-        """The most severe failure in the test case; only this one is reported."""
+        """The most severe failure in the test case, which is the failure reported."""
         return min(self.failures, key=lambda failure: CODES.index(failure.code))
 
     @property

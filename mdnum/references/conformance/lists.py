@@ -19,10 +19,10 @@ from mdnum.registry import Registry
 
 
 class KeptList(Protocol):
-    """A neighbor list that is built once and then updated; pairs are returned as `answer.read` accepts them.
+    """A neighbor list that is built once and then updated; `answer.read` describes the form of the pairs.
 
     `allocate` builds a new neighbor list and may be called again on the same object; `update` receives the
-    current positions. The returned pairs must include every pair within r_cut at the current positions; they
+    current positions. The returned pairs must include every pair within r_cut at the current positions, and
     may include pairs that are farther apart by less than the skin. If a neighbor list has its own padding
     instead of the given skin, its attribute `skin` must contain this padding (length), which is read after
     each `allocate`.

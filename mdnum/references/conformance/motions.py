@@ -3,7 +3,7 @@
 A pair just beyond r_cut + padding when the list is built is inside the cutoff after its two atoms have
 approached by the padding; the smallest such motion is along the line between the two atoms. A rebuild
 criterion is sufficient if it tests whether two atoms could have approached by the padding, in any direction
-and whatever other atoms do. Each sequence of `motions` brings a pair closer by slightly more than the
+and for any motion of other atoms. Each sequence of `motions` brings a pair closer by slightly more than the
 padding: along axes, diagonals and random directions; by moving both atoms or one, in any proportion; alone,
 among atoms at rest, among hundreds of atoms that move little, or among atoms with the same motion or a common
 drift; in one step, slowly, or back and forth.
@@ -275,7 +275,7 @@ def _ways() -> list[ndarray]:
 
 
 def _closing(room: float) -> float:
-    """Return the decrease in distance that moves a pair from just beyond the padding into the cutoff."""
+    """Return the decrease of a pair distance from just beyond r_cut + padding to inside the cutoff."""
     return (1 + 2 * HAIR) * room
 
 
