@@ -314,8 +314,8 @@ class CellRescaling(Barostat):
     def _forces(self, v, at):
         """Return √V, the force on √V, and the traceless part of the excess pressure tensor (see `excess`).
 
-        The force is the derivative of k_B T times the logarithm of the density of √V, V^(1/2) exp(-(U + K + p
-        V) / k_B T).
+        The force on √V is the derivative of k_B T times the logarithm of the density of √V, V^(1/2) exp(-(U +
+        K + p V) / k_B T).
         """
         root, excess = jnp.sqrt(volume(at.cell)), self.excess(v, at)
         part = trace(excess) / 3

@@ -98,8 +98,8 @@ class Cell(eqx.Module):
     def reach(self, positions: Float[np.ndarray, "atoms 3"]) -> Reach:
         """Return the magnitudes of coordinates and lattice vectors in displacements, for rounding bounds.
 
-        Magnitudes along periodic axes follow from the box. Magnitudes along nonperiodic axes allow for motion
-        of the atoms to twice their present distances.
+        The magnitudes of coordinates along periodic axes follow from the box. Along nonperiodic axes, the
+        magnitudes allow for motion of the atoms to twice their present distances.
 
         Args:
             positions: initial positions of the atoms, length.
@@ -137,7 +137,7 @@ class Cell(eqx.Module):
     def deformation(self, now: Cell):
         """Return the deformation F from this box to another, shape (3, 3): new lattice rows = old rows @ F.
 
-        Directions along nonperiodic axes stay the same. If the boxes are equal, F is exactly the identity.
+        Directions along nonperiodic axes do not change. The deformation is exactly one for equal boxes.
         """
         return np.eye(3) + self.inverse @ (now.matrix - self.matrix)
 
@@ -330,7 +330,7 @@ def strain_loss(reference: Cell, now: Cell, r_list):
 def complete(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """Replace each lattice vector of a nonperiodic axis by a unit vector perpendicular to the other vectors.
 
-    A tilted vector of a nonperiodic axis would otherwise change the images chosen along periodic axes.
+    A tilted lattice vector of a nonperiodic axis would change the images chosen along periodic axes.
 
     Args:
         cell: lattice vectors as rows, length; rows of nonperiodic axes are ignored.

@@ -283,11 +283,11 @@ class _Switching(Cutoff):
     switches = True
 
     def factor(self, r, at: AtCutoff):
-        """Return s(r) and ds/dr beyond the onset, from an independent implementation in numpy."""
+        """Return the switching factor s(r) and ds/dr beyond the onset, implemented independently in numpy."""
         raise NotImplementedError
 
     def factor_of_ball(self, r2, at: AtCutoff):
-        """Return s and 2 ds/d(r²) beyond the onset, in ball arithmetic."""
+        """Return the switching factor s and 2 ds/d(r²) beyond the onset, in ball arithmetic."""
         raise NotImplementedError
 
     def reference(self, r, u, du, at):

@@ -241,7 +241,7 @@ class SlotJudge:
         return d, quantity, self.decider.inside(quantity, threshold), threshold
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return decisions of a group as the low bits of a byte per atom, and the smallest |margin| yet."""
+        """Return decisions for a group of slots as low bits of a byte per atom, and the smallest |margin|."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         margin = jnp.abs(threshold - quantity)
         for k in range(GROUP):
@@ -261,7 +261,7 @@ class SlotJudge:
         return self.finish(nearest, halves)
 
     def finish(self, nearest, halves) -> Decisions:
-        """Return the decisions of a complete pass over the list, two groups per byte."""
+        """Return the decisions for the whole neighbor list, with two groups of slots per byte."""
         return Decisions(packed(halves), jnp.min(nearest, initial=jnp.inf).astype(jnp.float64))
 
 

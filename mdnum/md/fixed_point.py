@@ -450,7 +450,7 @@ class FixedPointJudge(SlotJudge):
         return d, r2, r2 < limit, limit
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return decisions of a group as the low bits of a byte per atom, and the smallest |margin| yet."""
+        """Return decisions for a group of slots as low bits of a byte per atom, and the smallest |margin|."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         left = threshold - quantity
         away = jnp.maximum(left, 1 - left)
@@ -460,7 +460,7 @@ class FixedPointJudge(SlotJudge):
         return bits, nearest
 
     def finish(self, nearest, halves) -> Decisions:
-        """Return the decisions of a complete pass over the list, two groups per byte."""
+        """Return the decisions for the whole neighbor list, with two groups of slots per byte."""
         unit = self.units.spacing * self.units.spacing
         closest = jnp.min(nearest, initial=jnp.iinfo(jnp.int64).max)
         margin = jnp.where(closest < _NOWHERE, (closest.astype(jnp.float64) - 0.5) * unit, jnp.inf)

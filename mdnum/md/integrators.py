@@ -83,7 +83,7 @@ def quantity(
 
 
 class AtStep(NamedTuple):
-    """Data of a step after the evaluation of its forces, as an integrator needs them; atoms are sorted."""
+    """Input of an integrator: data of a step after the evaluation of forces, with sorted atoms."""
 
     acceleration: Vector  # force/mass, in the dtype of the state
     virial: Number  # sum over pairs of r_ij · F_ij, energy, float64
@@ -144,7 +144,7 @@ class Integrator(eqx.Module):
 
     @property
     def random(self) -> Any:
-        """Random key, an array, or None for an integrator without noise; eqx.tree_at may replace it."""
+        """Random key as an array; None for an integrator without noise; any object inside eqx.tree_at."""
         field = self.keys().get("seed")
         return None if field is None else getattr(self, field.name)
 

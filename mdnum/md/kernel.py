@@ -151,7 +151,7 @@ def over_pairs(
 
 
 def left_out(potential: Any) -> str | None:
-    """Return jax's name of the operation that prevents a potential from using the loop; None without any."""
+    """Return jax's name of the operation that excludes a potential from the loop; None if there is none."""
     return _LEFT_OUT.get(jax.tree.structure(potential))
 
 
@@ -546,7 +546,7 @@ def _listed(rows: int, margins: bool) -> list[str]:
 
 
 def _others(wide: int, columns: int, rows: int) -> list[str]:
-    """Write the loading of the neighbors in a slot: four numbers per load, followed by a transposition."""
+    """Write LLVM code that loads the neighbors in a slot, four numbers at a time, and transposes them."""
     parts = -(-columns // 4)
     lines = [
         f"%at.WIDE = getelementptr i32, ptr %r{rows - 3}, i64 %from.WIDE",

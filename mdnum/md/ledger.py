@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 
 class Columns:
-    """Base class of tables; the fields of a dataclass are columns of equal length, the first an array.
+    """Base class of tables: dataclasses with columns of equal length as fields, the first an array.
 
     A field that is not an array is a text that applies to all rows, or None for an unknown column.
     """
@@ -94,6 +94,6 @@ class FlipTable(Columns):
     by_box: Float[np.ndarray, "flips"] | Any = None
 
     def columns(self, rule: int = 0) -> dict[str, Any]:
-        """Return the known columns by their names in flips.parquet, with all rows from one rule."""
+        """Return the known columns by their names in flips.parquet, for rows that belong to one rule."""
         known = {name: column for name, column in vars(self).items() if column is not None}
         return {"rule": np.broadcast_to(np.int32(rule), len(self)), **known}

@@ -34,7 +34,7 @@ class RebuildRule:
     def first_allowed(self) -> int:
         """Smallest age, in steps, at which a neighbor list can be rebuilt.
 
-        LAMMPS calls a rebuild at this smallest age dangerous, since it may have been necessary earlier."""
+        LAMMPS calls a rebuild at the smallest age dangerous: an earlier rebuild may have been necessary."""
         return max(self.every, self.delay)
 
     @property

@@ -356,8 +356,8 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
 def _virial(made: kernel.PairSums, x: Float[Array, "3 atoms"]) -> list[Float[Array, ""]]:
     """Return force times displacement in Voigt order, summed over both atoms of all pairs.
 
-    A displacement is x_j - x_i minus lattice vectors. Force times position is summed over atoms; force times
-    lattice vectors is added in the loop over pairs, for the few pairs across a boundary.
+    A displacement is x_j - x_i minus lattice vectors. In the virial, force times position is summed over
+    atoms; force times lattice vectors is added in the loop over pairs, for the few pairs across a boundary.
     """
     force, totals = made.sums, made.totals
     return [-2 * jnp.sum(force[a] * x[b]) - total for (a, b), total in zip(VOIGT, totals, strict=True)]
@@ -377,7 +377,7 @@ def _in_one_loop_jvp(primals, tangents, *, decisions: bool, tensor: bool):
 def imposed(
     inside: Bool[Array, "4 atoms"], given: UInt8[Array, "atoms"], where: UInt8[Array, "atoms"] | None
 ) -> Bool[Array, "4 atoms"]:
-    """Return the decisions used in a group of slots: imposed decisions if given, otherwise `inside`.
+    """Return the decisions used in a group of slots: imposed decisions if given, else the own `inside`.
 
     A simple mask makes the compiler compute distances twice: a step of 864 atoms takes 2.2 times as long as a
     normal step, 1.3 times with a mask per slot (`unpacked`), and 1.2 times in this way.
@@ -398,11 +398,11 @@ class Guarded(eqx.Module):
     how: Callable[..., Any] = eqx.field(static=True)
 
     def at_cutoff(self) -> AtCutoff:
-        """Return the constants at the cutoff, computed in the modified arithmetic."""
+        """Return the constants of the potential at its cutoff, computed in modified arithmetic (`how`)."""
         return self.how(self.model.at_cutoff, self.zero)()
 
     def evaluate(self, r2, types, at: AtCutoff):
-        """Return energy and slope of pairs, computed in the modified arithmetic."""
+        """Return energy and slope of the potential for pairs, computed in modified arithmetic (`how`)."""
         return self.how(self.model.evaluate, self.zero)(r2, types, at)
 
 

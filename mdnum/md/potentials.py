@@ -458,7 +458,7 @@ class Channels(eqx.Module):
 
     @property
     def terms(self) -> dict[str, CutPotential]:
-        """Terms of all channels by name, with their weights."""
+        """Potential terms of all channels by name, with their weights."""
         return {name: term for part in self.parts for name, term in part.terms.items()}
 
     @property
@@ -482,7 +482,7 @@ class Channels(eqx.Module):
         return jnp.concatenate([part.r_cut for part in self.parts])
 
     def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
-        """Return energy jump and radial force jump as a pair enters, by term and channel's pair type."""
+        """Return energy jump and radial force jump as a pair enters, by term, channel and pair type."""
         sides = zip(*(part.jumps() for part in self.parts), strict=True)
         return np.stack([np.asarray(block_diag(*one)) for one in sides])
 

@@ -104,13 +104,13 @@ class NeighborFlips(AnalysisBase):
 
     After `run` with one rule, `results` has all attributes of `RuleResult` (`flips`, `pairs`, `near`,
     `min_margin`, `initial`, `last`, `contacts`, `occupancy`). With several rules, each element of
-    `results.rules` has these attributes. Tables have a method `to_pandas()`. With by="residue", pairs are
-    pairs of residues, i and j are rows of `results.residues`, and `results.left_out` counts the excluded
-    atoms. `results.resolution` is the resolution of positions in the file, and `results.bound` is the
-    resulting error bound of a distance, per frame. `results.repeats` lists the frames that repeat earlier
-    frames (see `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first frame
-    and the reason for it (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and
-    times of the frames analyzed; `FlipTable.frame` is an index into both.
+    `results.rules` is a `RuleResult`. Tables have a method `to_pandas()`. With by="residue", pairs are pairs
+    of residues, i and j are rows of `results.residues`, and `results.left_out` counts the excluded atoms.
+    `results.resolution` is the resolution of positions in the file, and `results.bound` is the resulting
+    error bound of a distance, per frame. `results.repeats` lists the frames that repeat earlier frames (see
+    `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first frame and the
+    reason for it (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and times of
+    the frames analyzed; `FlipTable.frame` is an index into both.
 
     If a frame cannot be read or contains impossible values, an error with the frame number is raised; the
     results of all earlier frames are kept.

@@ -1,7 +1,7 @@
 """Frame-by-frame reading of one trajectory, or of two for comparison, with frame checks and flip detection.
 
 The neighbor sets of two trajectories are compared completely only at the first frame. At later frames, the
-difference is updated with the flips of both trajectories, at a cost proportional to the number of flips.
+difference of the sets is updated with the flips, at a cost proportional to the number of flips.
 """
 
 from __future__ import annotations

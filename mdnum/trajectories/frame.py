@@ -84,7 +84,7 @@ class Frame:
 
     @cached_property
     def furthest(self) -> float:
-        """Largest absolute coordinate, in length units; inf or nan if any coordinate is; 0 without atoms."""
+        """Largest absolute coordinate, in length units; inf or nan if one coordinate is; 0 without atoms."""
         return furthest(self.positions)
 
     def furthest_of(self, atoms: AtomIndices) -> float:

@@ -164,7 +164,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if at most one image of a pair can be inside, even for pairs that approach by `moved`."""
+    """Return True if at most one image of a pair can be inside the cutoff, even if pairs approach."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )

@@ -4,7 +4,7 @@ MDAnalysis stores three lengths and three angles of a box, and assumes (like mos
 vector is along x and the second in the xy plane. For a box in another orientation, the periodic images
 computed from MDAnalysis's box are silently wrong:
 
-- CHARMM since version 22 writes symmetric box matrices to dcd files, which do not record it (see dcd_boxes).
+- CHARMM (since version 22) writes symmetric box matrices to dcd files, without a record (see dcd_boxes).
 - HOOMD's boxes have tilt factors, which MDAnalysis interprets as cosines of angles (in gsd files).
 - Boxes in H5MD files and DL_POLY's HISTORY files have vectors in any direction.
 

@@ -177,7 +177,7 @@ class Tracker:
     # ---- one frame
 
     def _moment(self, frame: Frame) -> Moment:
-        """Check a frame, and prepare its data for decisions."""
+        """Check a frame, and prepare its data for pair decisions."""
         atoms = len(frame.positions)
         if self._atoms < 0:
             self._atoms = atoms
