@@ -2,9 +2,9 @@
 
 A curve consists of an energy and the force along one coordinate. Each energy and force is predicted from the
 points to the left and, independently, from the points to the right. Where the curve is smooth, the difference
-between the two predictions falls with the fourth power of the point spacing. At a kink, this difference falls
-only linearly with the spacing, and at a jump it does not fall. The decrease of the difference with smaller
-spacing therefore identifies the kind of singularity.
+between the two predictions falls with the fourth power of the point spacing. At a kink, the difference
+between the predictions falls only linearly with the spacing, and at a jump the difference does not fall. The
+decrease of the difference with the spacing therefore identifies the kind of singularity.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ def smallest_steps(
     """Return the intervals scanned by `find_jumps`, and the smallest detectable force step in each interval.
 
     Returns:
-        (midpoints of the intervals that are compared with neighbors, detection limit in each, eV/Å).
+        (midpoints of the compared intervals, smallest detectable force step in each interval, eV/Å).
 
     Error:
         all 125 steps of this size, added to five potentials, are found; of steps a third as large, half are
@@ -305,9 +305,9 @@ def _outliers(
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
     """Mismatch across each interval: in energy, in force, and in energy change plus work of the force.
 
-    The first two mismatches are |prediction from the left minus prediction from the right| at the midpoint.
-    The third mismatch falls with the fifth power of the spacing if the curve is smooth, and is much more
-    sensitive to a jump of the energy alone.
+    The mismatches of energy and force are |prediction from the left minus prediction from the right| at the
+    midpoint. The mismatch of energy change and work falls with the fifth power of the spacing if the curve is
+    smooth, and is much more sensitive to a jump of the energy alone.
     """
     values = curve.many(places)
     windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
@@ -405,7 +405,7 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """Locate a jump of the energy's third derivative, using the force's second derivative on both sides.
 
-    Several fit widths are tried; the one whose result agrees best with that of half the width is used.
+    Of several fit widths, the width is used for which a fit of half the width gives the most similar result.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

@@ -1,10 +1,10 @@
 """Energy balance of a run: jumps of the energy at thresholds and elsewhere, work of the forces, drift.
 
 If the force is minus the gradient of the energy, a step's energy change plus the work of the forces along the
-straight line is zero for every integrator. An energy change that is not explained by this work is, at a
-distance threshold, the energy jump of a flip. At another single point, such a change is due to a limit on the
-number of neighbors or a selection of nearest neighbors. A distributed change means that the force is not
-minus the gradient of the energy.
+straight line is zero for every integrator. An energy change not explained by the work of the forces is, at a
+distance threshold, the energy jump of a flip. An unexplained change at another single point is due to a limit
+on the number of neighbors or a selection of nearest neighbors. A distributed unexplained change means that
+the force is not minus the gradient of the energy.
 """
 
 from __future__ import annotations

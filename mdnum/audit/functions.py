@@ -1,6 +1,6 @@
 """Check the smoothness of a user's pair function between close contact and cutoff from computed values.
 
-A run records the flips at the cutoff. If the pair function itself has a discontinuity, for example where two
+A run records the flips at the cutoff. If a pair function itself has a discontinuity, for example where two
 pieces do not join, a run records no flip there, and no derivative of the run includes the discontinuity.
 """
 
@@ -51,8 +51,8 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
         energy that jumps (0: the energy, 1: the force), its name `what` and its `jump`, beyond minus before.
         Where the function is "singular" or "not finite" the order is -1; it is -2 where the "force" is not
         minus the derivative of the energy, as with a wrong `custom_jvp`. If the energy is piecewise linear,
-        the row of the largest kink stands for all `kinks` `between` two distances; those within a 1920th of
-        the range count as one. `single`: whether a function rounds to float32 internally.
+        the row of the largest kink stands for all `kinks` `between` two distances; kinks within 1/1920 of the
+        range count as one. `single`: whether a function rounds to float32 internally.
 
     Error:
         a force step of 1e-6 of the force scale and a curvature step of 1e-4 of its scale are found, if no

@@ -44,8 +44,8 @@ def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) 
     """Find atom indices with wrong results, by exchanging atoms of equal species between two indices.
 
     Exchanging two atoms of the same species between two correct indices changes nothing. An error tied to an
-    index appears at this index for any order of the atoms. An error that depends on the whole order, such as
-    neglected neighbors, appears at nearly all indices, or at other indices for another order.
+    index appears at this index for any order of the atoms. An error that depends on the whole order of atoms,
+    such as neglected neighbors, appears at nearly all indices, or at other indices for another order.
 
     Returns:
         None if energy and forces are correct at all indices, or if they are wrong at nearly all indices.

@@ -121,8 +121,8 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
     """Return a pair of particles for every two species that the calculator supports, most frequent first.
 
     A pair consists of single atoms if the calculator supports single atoms at the smallest distance in the
-    structure. If single atoms fail, each atom has two companion atoms, since a bond-order potential may
-    divide by the number of neighbors. If companions fail too (rigid water), the pair consists of molecules.
+    structure. If single atoms fail, each gets two companion atoms, since a bond-order potential may divide by
+    the number of neighbors. If companion atoms fail too (rigid water), the pair consists of molecules.
 
     Returns:
         (pairs, omitted pairs with the reason).
@@ -264,8 +264,8 @@ def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndar
 def group(atoms: Atoms) -> int | None:
     """Return the number of atoms per molecule if a structure consists of identical molecules, else None.
 
-    A repeating sequence of species does not imply molecules: a salt crystal can have one too. The atoms of a
-    molecule must be bonded to one another (by covalent radii) and to no other atoms.
+    A repeating sequence of species does not imply molecules: a salt crystal can have such a sequence too. The
+    atoms of a molecule must be bonded to one another (by covalent radii) and to no other atoms.
     """
     numbers = atoms.numbers
     if len(set(numbers)) < 2:

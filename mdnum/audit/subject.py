@@ -211,8 +211,8 @@ class CalculatorSubject:
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:
         """Return (the energy consistent with the forces, the energy that a run writes to its log), eV.
 
-        In ASE the first energy is `free_energy` and the second `energy`; the second is None if a calculator
-        has only one.
+        ASE calls the energy consistent with the forces `free_energy` and the logged energy `energy`; the
+        logged energy is None if a calculator has only one.
         """
         asked = self._ask(atoms)
         both = self._answer(lambda: self._energies(asked), asked, "energy")
@@ -268,8 +268,8 @@ class CalculatorSubject:
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
         """Evaluate a structure again with the same calculator object, and count any difference in `repeats`.
 
-        A difference counts as random only if the second result agrees with that of a new object; otherwise
-        earlier evaluations by this object may be the reason.
+        A difference counts as random only if the second result agrees with that of a new calculator object;
+        otherwise earlier evaluations by this object may be the reason.
 
         Args:
             energy: the earlier energy, eV; the energy or the forces are required.

@@ -1,11 +1,11 @@
 """Search for discontinuities of the energy among many atoms, using moving atoms and dense clusters.
 
-A pair of atoms may interact differently among many atoms (embedding energies, angles): an energy jump may
-have another size, and a threshold that is smooth for two atoms may jump. To find these differences, atoms and
-triples are moved through the pair thresholds and beyond. To detect a limit on the number of neighbors, one
-more atom is moved past all neighbors of a crowded central atom. A calculator that keeps only k neighbors
-exchanges the k-th neighbor for this atom when both are equally far away; then the energy or a force jumps. If
-a calculator keeps the first k neighbors in the order of the list, reordering the atoms reveals the limit.
+A pair of atoms may interact differently among many atoms (embedding, angles): an energy jump may have another
+size, and a threshold that is smooth for two atoms may jump. To find jumps among many atoms, atoms and triples
+are moved through the pair thresholds and beyond. To detect a limit on the number of neighbors, one more atom
+is moved past all neighbors of a crowded central atom. A calculator that keeps only k neighbors exchanges the
+k-th neighbor for the moving atom when both are equally far away; then the energy or a force jumps. If a
+calculator keeps the first k neighbors in the order of the list, reordering the atoms reveals the limit.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Route:
     def crossings(self, thresholds: Sequence[PairThreshold], low: float, high: float) -> list[RouteCrossing]:
         """Return the points between low and high at which the moving atom crosses a threshold distance.
 
-        The squared distance is quadratic along the line, so these points are roots of quadratic equations.
+        The squared distance along a line is quadratic, so the points are roots of quadratic equations.
         """
         found: list[RouteCrossing] = []
         symbols = np.array(self.atoms.get_chemical_symbols())
@@ -313,7 +313,7 @@ def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tupl
 
 
 def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
-    """Return whether a jump is within rounding, for energies and forces with few decimals."""
+    """Return whether a jump is due to rounding, for a calculator whose results have few decimals."""
     if not any(quantum):
         return False
     small = abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]

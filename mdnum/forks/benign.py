@@ -2,9 +2,9 @@
 
 Runs of program B are compared with an ensemble of runs of program A, at a step that is found by calibration.
 At early steps, runs differ by less than rounding errors can cause; at late steps, every run has forgotten its
-start, and a changed program has the same scatter. The suitable steps depend on the system. For calibration,
-programs with deliberate changes are run; at the chosen step, all deliberate changes are distinguishable from
-rounding.
+start, and a changed program has the same scatter. The steps suitable for a comparison depend on the system.
+For calibration, programs with deliberate changes are run; at the chosen step, all deliberate changes are
+distinguishable from rounding.
 
 The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
 Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
@@ -120,7 +120,7 @@ def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations above which a principal component counts as an outlier.
 
     The limit is two, or more if needed for at most a tenth of the ensemble's own runs to be outliers. Each
-    run is judged by components computed from other runs: with its own influence it would stand out less.
+    run is judged by components of other runs: a run stands out less in components that it influenced.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):

@@ -121,7 +121,7 @@ class BoundaryMap:
 
 
 class NumberLine:
-    """Runs of a system for different values of a parameter, each identified by the ordinal of the float.
+    """Runs of a system for different values of a parameter; ordinal numbers of floats identify the values.
 
     Args:
         program: the program with the system's own value of the parameter.
@@ -216,10 +216,10 @@ def boundaries(
 
     The system is run at every grid value of the parameter. If the histories at the ends of a grid cell
     differ, the cell is bisected until its ends are adjacent floats. If the other half of the cell contains a
-    change too, it is searched later. Boundaries are searched from the lowest value upward, so if there are
-    more than requested, the highest are missing. All runs use the program of a normal run; for the cutoff
-    radius, it takes the radius as an argument. The runs on both sides of every boundary are repeated in a new
-    process.
+    change too, it is searched later. Boundaries are searched from the lowest parameter value upward; if more
+    exist than were requested, the highest are missing. All runs use the program of a normal run; for the
+    cutoff radius, it takes the radius as an argument. The runs on both sides of every boundary are repeated
+    in a new process.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.

@@ -2,12 +2,12 @@
 
 Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound: exact arithmetic
 would give the same decisions for the same states. Up to the end of *protection*, the pair of atoms closest to
-its cutoff was further from it than the separation of the two runs can have moved this pair. As long as the
+its cutoff was further from the cutoff than the separation of two runs can have moved the pair. As long as the
 certified horizon and the protection last, the decisions of the two runs agree. If one of two programs is at
 least as precise in every role, the other makes the same decisions up to the *shadow horizon*.
 
-All these statements refer to decisions for the actual states of the run. A run with correct decisions for its
-states may have left the exact history long before (`forks.exact.certify` finds the step).
+Decisions are certified only for the actual states of the run. A run with correct decisions for its states may
+have left the exact history long before (`forks.exact.certify` finds the step).
 """
 
 from __future__ import annotations
@@ -95,8 +95,8 @@ def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray
     """Return, per step, the distance of the nearest pair from its cutoff and the required distance (lengths).
 
     Each atom may be displaced by the separation of the runs, so the distance of two atoms may change by twice
-    the separation. The margins are taken from the run with the smaller rounding error; this error is added to
-    the required distance.
+    the separation. The margins are taken from the run with the smaller rounding error, which is added to the
+    required distance.
     """
     deciders = {"A": fork.twin.a.simulation.decider, "B": fork.twin.b.simulation.decider}
     a, b = deciders.values()

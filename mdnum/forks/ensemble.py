@@ -204,7 +204,7 @@ def planted(a: Simulation) -> tuple[Change, ...]:
 
     The test must detect a longer time step and a shorter cutoff. Forces in another precision, pairs in
     another order and the other neighbor search must pass. The cutoff and the precision of a many-body
-    potential cannot be changed, so these two programs are omitted.
+    potential cannot be changed, so these two changes are omitted for it.
     """
     longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
     search = next(name for name in BUILDERS if name != a.builder)

@@ -368,7 +368,7 @@ class Forecast:
     def first(self, amplitude: float, count: int = 3) -> tuple[PredictedFlip, ...]:
         """Predict the decisions that a perturbation flips first, by step, while the forecast is valid.
 
-        At most `KEPT` flips of a step are listed; a step with `KEPT` flips may have more.
+        At most `KEPT` flips of a step are listed; if there are `KEPT`, more decisions may flip at this step.
 
         Args:
             amplitude: amplitude of the perturbation; its sign matters.

@@ -5,8 +5,8 @@ The two forces of a pair are exactly opposite, so that a list format changes onl
 sparse lists contain each pair twice, and each entry contributes half of the pair force. For a sparse list,
 the halves from an atom's own row form one sum, those from rows that contain the atom as a neighbor another,
 and both sums are added; with sorted rows, one loop over atom labels does the same. For a dense list, the
-second halves are added one by one to the sum of the first halves. An ordered-sparse list contains each pair
-once: the terms of an atom with later atoms form one sum, those with earlier atoms another sum.
+neighbors' halves are added one by one to the sum of an atom's own halves. An ordered-sparse list contains
+each pair once: the terms of an atom with later atoms form one sum, those with earlier atoms another sum.
 
 Source: jax_md.smap.pair_neighbor_list and the transpose of its gathers, whose forces have these orders bit
 for bit (tests/forks/test_choices.py, jax-md 0.2.29). One detail of XLA is not reproduced: rows with more than

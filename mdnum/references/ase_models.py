@@ -1,6 +1,6 @@
 """Choose the reference calculator for a simulation: the corresponding ASE class, or else plain numpy.
 
-Differences between mdnum and ASE, with the conversions that remove these differences:
+Differences between mdnum and ASE, and the conversions of ASE's results that remove these differences:
 
 | system file | ASE | conversion |
 |---|---|---|

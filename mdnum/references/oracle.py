@@ -53,7 +53,7 @@ def rounding_bound(
 
     The bound is valid for a code that wraps coordinates, adds a lattice vector, subtracts and takes the norm:
     numbers are at most as large as the coordinates plus the cell, and each operation rounds once or twice.
-    Typical errors are a tenth of this bound.
+    Typical rounding errors are a tenth of this bound.
 
     Args:
         positions: coordinates as passed to the code.

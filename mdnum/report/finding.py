@@ -1,7 +1,7 @@
 """Findings of all commands, the sentences of findings, and the verdict that summarizes findings.
 
 A command's module determines code and values of a finding; a text file next to it has the sentences.
-`mdnum/verbs/__init__.toml` explains the content of these text files, and the formats of the fields.
+`mdnum/verbs/__init__.toml` explains the content of the text files, and the formats of the fields.
 """
 
 from __future__ import annotations

@@ -175,9 +175,9 @@ class Translate(Summed):
 class Images(Choice):
     """Atoms that start in other periodic images.
 
-    Positions are wrapped before the first step, so this choice changes no bit if the images are exact;
-    usually, the sum of a position and a lattice vector is rounded. Both runs start at positions for which
-    this sum is exact; these differ from the positions in the file by at most one ulp of the lattice vector.
+    Positions are wrapped before the first step, so this choice changes no bit if images are exact; usually,
+    the sum of a position and a lattice vector is rounded. Both runs start at positions whose sum with a
+    lattice vector is exact, at most one ulp of the lattice vector from those in the file.
     """
 
     worlds = ("md",)

@@ -256,8 +256,8 @@ def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
 def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
     """Return how many bits closer to the exact positions one run is than another, while decisions agree.
 
-    The value is the median over the second half of the steps before the first wrong decision. Unlike the
-    horizon, this median does not depend on which pair of atoms happens to approach its cutoff.
+    The number of bits is the median over the second half of the steps before the first wrong decision. Unlike
+    the step of this decision, the median does not depend on which pair happens to approach its cutoff.
     """
     if base.separation is None or row.separation is None:
         return float("nan")

@@ -59,7 +59,7 @@ def read(given: Any) -> ListAnswer:
     since some such lists would be ambiguous.
 
     Raises:
-        Malformed: the value has none of these forms.
+        Malformed: the value has none of the supported forms.
     """
     given = parts(given)
     i, j = _indices(given["i"], "i"), _indices(given["j"], "j")

@@ -171,8 +171,8 @@ def source_of(made: Any) -> str:
 def from_object(made: Any, name: str | None = None, source: str | None = None) -> PairList:
     """Return a `PairList` made from a function, from a class of updatable lists, or from an updatable list.
 
-    Its properties are read from the attributes `full` (bool), `unit` (roundoff), `superset` (bool) and
-    `limits` (`ListLimits`) of the object, if present.
+    The properties of the neighbor list are read from the attributes `full` (bool), `unit` (roundoff),
+    `superset` (bool) and `limits` (`ListLimits`) of the object, if present.
 
     Raises:
         InputError: the object is neither a function nor a neighbor list.

@@ -2,7 +2,7 @@
 
 Every function and class in this module imports what it requires and uses nothing else in the module, since
 its source is copied into scripts that reproduce a failure without mdnum. Each function calls its library as a
-user would, and passes on atoms outside the box, unusual cells and few atoms unchanged.
+user would: atoms outside the box, unusual cells and few atoms are passed on unchanged.
 """
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalCall=false

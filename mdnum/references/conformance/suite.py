@@ -105,8 +105,8 @@ class Examiner:
     def _find_padding(self) -> None:
         """Determine whether an updatable list returns pairs beyond the cutoff, and up to which distance.
 
-        The padding is the declared one, or the distance from the cutoff to the nearest pair missing from the
-        list.
+        The padding is the declared padding, or the distance from the cutoff to the nearest pair missing from
+        the list.
         """
         report = self.report
         crowd = replace(once("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
