@@ -1,4 +1,4 @@
-"""Check the smoothness of a user's pair function between close contact and cutoff from computed values.
+"""Use computed values to check how smooth a user's pair function is between close contact and cutoff.
 
 A run records the flips at the cutoff. If a pair function itself has a discontinuity, for example where two
 pieces do not join, a run records no flip there, and no derivative of the run includes the discontinuity.

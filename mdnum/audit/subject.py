@@ -62,7 +62,7 @@ class Repeats:
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
-        """Record the first energy or force of a new calculator object, the object number `which`."""
+        """Record the first energy or force of a new calculator object; `which` numbers the objects."""
         before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:

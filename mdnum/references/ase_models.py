@@ -4,16 +4,16 @@ Differences between mdnum and ASE, and the conversions of ASE's results that rem
 
 | system file | ASE | conversion |
 |---|---|---|
-| lennard-jones, shifted | LennardJones(smooth=False) | none: ASE always shifts the energy to zero at rc |
+| lennard-jones, shifted | LennardJones(smooth=False) | none; ASE always shifts the energy to zero at rc |
 | lennard-jones, hard | LennardJones(smooth=False) | + u(r_cut) for every pair inside; same forces |
-| lennard-jones, switched | LennardJones(smooth=True, ro=onset) | none: the same cubic in r² |
-| lennard-jones, several species | one LennardJones has one sigma | all minus like pairs |
-| morse, hard or shifted | MorsePotential | its own switch moved beyond the list; shifted: - u(r_cut) a pair |
+| lennard-jones, switched | LennardJones(smooth=True, ro=onset) | none; the switch is the same cubic in r² |
+| lennard-jones, several species | one sigma only | energy of all pairs minus like pairs |
+| morse, hard or shifted | MorsePotential | ASE's switch beyond the list; if shifted, - u(r_cut) per pair |
 | morse, quintic | MorsePotential(rcut1, rcut2) | alpha = rho0 / r0; the switch is the same quintic in r |
 | eam | EAM(potential=file) | none |
-| tersoff | Tersoff | none: the same 14 constants |
-| an energy function | no ASE class | the function on ASE's neighbor list, and labeled so |
-| all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), and labeled so |
+| tersoff | Tersoff | none; the same 14 constants |
+| an energy function | no ASE class | the function on ASE's neighbor list, named in the label |
+| all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), named in the label |
 
 ASE's LennardJones keeps a pair at r == rc (it drops r² > rc²); ASE's neighbor lists do not (r < rc). The
 energy of a pair at r == rc is zero for shifted and switched cutoffs, so only its force can differ.

@@ -209,7 +209,7 @@ class InvarianceCheck(AuditCheck):
 
 
 class _Judge:
-    """Compares representations of a structure with limits measured once for each size of rounding error."""
+    """Compares representations of a structure; allowed differences are measured for each size of rounding."""
 
     def __init__(self, subject: CalculatorSubject, rng: np.random.Generator):
         self.subject, self.worker, self._rng = subject, subject.fresh(), rng
