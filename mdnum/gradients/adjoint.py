@@ -4,9 +4,9 @@ With jax.value_and_grad, the forward pass rounds differently from an ordinary ru
 steps makes other decisions. Here, the run is made first, by the same program as every other run.
 
 A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
-times that vector. For a pair potential this product is a sum over neighbors, like the forces, and requires no
-scatter operation. For any other energy, the product is one tangent evaluation of the gradient of the energy.
-The operations of a step need not be stored.
+times that vector. For a pair potential, J times a vector is a sum over neighbors, like the forces, and
+requires no scatter operation. For any other energy, J times a vector is a tangent evaluation of the gradient
+of the energy. The operations of a step need not be stored.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return slope, *back(onto)
 
     def onto_weights(r2, along, inside, types, weights, others):
-        """Compute the cotangents of the atoms' weights from each neighbor slot; each pair has two slots."""
+        """Compute the cotangents of the atoms' weights from each neighbor slot (two slots for each pair)."""
         onto = jnp.where(inside, energy, 0), -2 * jnp.where(inside, along, 0)
         by = jax.vjp(lambda *weights: model.evaluate(r2, types, at, *weights), *weights)[1](onto)
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
@@ -415,7 +415,7 @@ class StretchReversal:
         )  # fmt: skip
 
     def through(self, stretch: TapeStretch) -> tuple[Float[np.ndarray, "room most"], AdjointCarry]:
-        """Propagate cotangents through a stretch; return the weights of its crossings and all cotangents."""
+        """Propagate cotangents through a stretch of steps; return weights of crossings and all cotangents."""
         self.carry, (weights, trace) = transposed(*self.arguments(stretch))
         return np.asarray(weights), trace
 
@@ -452,9 +452,9 @@ def transposed(
     """Propagate cotangents backward through a stretch of steps with one neighbor list.
 
     Returns cotangents at the beginning of the stretch, weights of its crossings, and cotangents of every
-    step. JAX transposes the part of a step between two force evaluations. For a linear `KickDrift` integrator
-    this derivative does not depend on the forces, so forces need not be recorded. For derivatives with
-    respect to the integrator's parameters, `pull_back` computes the forces.
+    step. JAX transposes the part of a step between two force evaluations. For a linear `KickDrift`
+    integrator, the derivative of a step does not depend on the forces, which therefore need not be recorded;
+    `pull_back` computes forces for derivatives with respect to the integrator's parameters.
     """
     loss, origin, around, onto_total, pace = looking
     order, moves = tables.order, integrator.moves_cell

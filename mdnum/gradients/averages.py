@@ -3,8 +3,8 @@
 The derivative of an average with respect to a parameter has up to three contributions. First, the observable
 in each frame changes at fixed positions. Second, if the observable jumps when a pair enters the cutoff, the
 average changes with the cutoff radius by the jump times the density of pairs at the cutoff. Derivatives at
-fixed decisions lack this contribution. Third, with a thermostat, the statistical weight exp(-U/kT) of each
-frame changes.
+fixed decisions lack the contribution of the jumps. Third, with a thermostat, the statistical weight
+exp(-U/kT) of each frame changes.
 """
 
 from __future__ import annotations
@@ -322,9 +322,9 @@ class Reweighting(Method):
     The derivative is the sum of the explicit derivative (see `BoundaryTerm`) and of the response of the
     weights, which is minus the covariance of the loss and the derivative of the energy, divided by kT.
 
-    Error: statistical; `details` contains a standard error from block averages. With few independent frames
-    this error is large, and it covers only the variation within this run. Source: Thaler and Zavadlav, Nature
-    Communications 12, 6884 (2021).
+    Error: statistical; `details` contains a standard error from block averages. This standard error is large
+    for few independent frames, and covers only the variation within the run. Source: Thaler and Zavadlav,
+    Nature Communications 12, 6884 (2021).
     """
 
     at_states: BoundaryTerm = field(default_factory=BoundaryTerm)  # the explicit part

@@ -105,7 +105,7 @@ def compare(
 
 
 class Dependence(NamedTuple):
-    """Whether the program uses a parameter for the loss, and whether these operations were executed."""
+    """Whether the program uses a parameter to compute the loss, and whether the run did so."""
 
     written: bool
     used: bool
@@ -168,7 +168,7 @@ def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str
 
 def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
     """Return the program with loops in place of the custom derivative rule of `stopping.elementwise`. A zero
-    in the Jacobian of this rule would not show whether a loop has zero slope or did not run.
+    in the Jacobian of the rule would not show whether a loop has zero slope or did not run.
     """
 
     def run(*inputs):

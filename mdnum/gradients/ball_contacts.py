@@ -46,7 +46,7 @@ class FixedPointRule(eqx.Module):
 
     For a ball in contact, the iteration y ← G(y) = y + gain max(0, -y) approaches the fixed point y = 0 from
     below. At y = 0, dG/dy is discontinuous. The derivative for y < 0 is used, because the iteration
-    approaches from there (as with the active set of a complementarity problem). The implicit function
+    approaches y = 0 from below (as for the active set of a complementarity problem). The implicit function
     theorem, (1 - dG/dy) dy = dG/dgain dgain, gives gain dy = -y dgain for each ball.
     """
 
@@ -82,7 +82,7 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """Gradient method: derivative of the fixed point of the projection, by the implicit function theorem.
 
-    The loss uses the iterations that ran. The derivative uses the limit of the iterations (the floor). The
+    The loss uses the iterations that ran. The derivative uses the limit of the iterations, the floor. The
     method `unrolled` gives a nonzero derivative with respect to k, an artifact of the solver's tolerance.
     """
 
@@ -189,8 +189,8 @@ class SoftFloor(BallMethod):
         Raises:
             InputError: eps is not positive, or the smooth program does not have the parameter.
 
-        Error: rounding error for the smooth program. Compared with the given program there is a bias, which
-        decreases with eps only if the given program has a derivative.
+        Error: rounding error for the smooth program. With respect to the derivative of the given program, if
+        one exists, there is a bias that decreases with eps.
         """
         eps = _suitable(problem) if self.eps is None else self.eps
         if not eps > 0:
@@ -260,9 +260,9 @@ class ThroughContacts(BallMethod):
 
     Contact is decided at the end of a step. The derivative of the discrete steps therefore lacks the effect
     that a ball that starts higher arrives later. This method adds the saltation matrix of every contact. If
-    impacts are located within a step, the program's own derivative already contains this matrix. A projection
-    is treated like the impact that it approximates. The force of a spring without a damper does not jump; for
-    such a spring the result equals that of the method `unrolled`.
+    impacts are located within a step, the program's own derivative already contains the saltation matrix. A
+    projection is treated like an impact. The force of a spring without a damper does not jump; for such a
+    spring the result is the same as from the method `unrolled`.
     """
 
     name = "event-aware"

@@ -1,10 +1,10 @@
 """Contributions of flips to a gradient through the times at which pairs cross their cutoff (saltation).
 
 A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the momentum of the
-pair differs after the crossing. Derivatives of a program's steps lack this effect, however short the time
-step is. The contribution is computed in reverse mode with the saltation matrix of mdnum.numerics, for the
-cutoff sphere as threshold. A loss that contains the potential energy or the virial also jumps at a crossing:
-if its frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
+pair differs after the crossing. Derivatives of a program's steps lack the effect of crossing times, however
+short the time step is. This effect is computed in reverse mode by the saltation matrix of mdnum.numerics, for
+the cutoff sphere as threshold. A loss that contains the potential energy or the virial also jumps at a
+crossing: if its frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
 
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
 dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.
@@ -163,8 +163,8 @@ def onto_crossings(
         d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
         d(W) = (f r_cut n ⊗ n) dr/s        on the integrator's use of the virial tensor W
 
-    so that the cotangent of dr is f/s n · (v̄_j/m_j - v̄_i/m_i) + f r_cut/s n · S n, where v̄ is the
-    cotangent of the velocities, and S that of the virial tensor in a step, divided by the time step.
+    so that the cotangent of dr is f/s n · (v̄_j/m_j - v̄_i/m_i) + f r_cut/s n · S n. Here v̄ is the cotangent
+    of the velocities, and S is the cotangent of the virial tensor in a step, divided by the time step.
 
     Args:
         met: the crossings between the previous step and this one.

@@ -3,9 +3,9 @@
 A replica is the same system with different initial velocities and, with a thermostat, different noise.
 Replicas have different neighbor lists and are therefore run one after another on each device.
 
-When a parameter changes, cutoff crossings move to other steps. If the force jumps, the loss then jumps too;
-between such parameter values the slope of the loss is the derivative of the steps. The event-aware gradient
-is the slope across many jumps, so a finite difference for comparison must span many jumps.
+When a parameter changes, cutoff crossings move to other steps. If the force jumps, the loss then jumps, too;
+between jumps, its slope is the derivative of the steps. The event-aware gradient is the slope across many
+jumps, which a finite difference for comparison must also span.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class Differentiated(NamedTuple):
 def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
     """Differentiate f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
-    Steps decrease by factors of 1.4, and the extrapolation with the smallest estimated error is returned.
-    This choice balances truncation errors of large steps against noise of small steps.
+    Steps decrease by factors of 1.4, and the extrapolation with the smallest estimated error is returned. The
+    choice balances truncation errors of large steps against noise of small steps.
 
     Args:
         f: function of one number. x: point. step: the largest step. levels: number of steps.
@@ -157,7 +157,7 @@ def choose_step(f: Callable[[float], float], x: float, first: float, spacing: fl
 
 
 def nonzero(problem: Problem, name: str) -> float:
-    """Return the value of a scalar parameter; raise an error if it is 0, because steps are relative to it.
+    """Return the value of a scalar parameter; raise an error for 0, because steps are relative to the value.
 
     Raises:
         InputError: the value is 0.
@@ -422,7 +422,7 @@ def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
 
 
 def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
-    """Return the number of steps from which the standard error exceeds the mean; None if it never does."""
+    """Return the number of steps from which the standard error exceeds the mean, or None."""
     mine = [row for row in rows if row["name"] == name]
     kept = [k for k, row in enumerate(mine) if row["error"] < row["mean"]]
     after = max(kept, default=-1) + 1

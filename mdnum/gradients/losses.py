@@ -1,9 +1,9 @@
 """Losses of a trajectory, evaluated frame by frame, so that the trajectory need not be stored.
 
 A loss computes observations from each frame (and the first frame), sums the observations over frames, and
-computes a number from these sums. Averages, correlations with the start and histograms have this form, and
-their derivatives need only one frame at a time. Each loss of the command line is a class in this module with
-a name, a label and a unit.
+computes a number from these sums. Averages, correlations with the start and histograms are losses of this
+form; derivatives also need only one frame at a time. Each loss of the command line is a class in this module
+with a name, a label and a unit.
 """
 
 from __future__ import annotations

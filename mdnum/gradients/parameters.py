@@ -1,4 +1,4 @@
-"""Parameters with respect to which a simulation can be differentiated, and the inputs that they change.
+"""Parameters with respect to which a simulation can be differentiated, and the inputs they change.
 
 Names, values and units of parameters are those of `mdnum.systems.parameters`.
 """

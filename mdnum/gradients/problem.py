@@ -124,7 +124,7 @@ class Gradient:
 class Method:
     """Base class of gradient methods: frozen dataclasses of options, registered in METHODS.
 
-    Methods for molecular dynamics derive from this class, and methods for a ball from `ball.BallMethod`.
+    Gradient methods for molecular dynamics are subclasses of `Method`, for a ball of `ball.BallMethod`.
 
     Attributes:
         name: name on the command line. description: which derivative the method computes, one sentence.

@@ -127,7 +127,7 @@ class Pace(NamedTuple):
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
         """Return the number of frames per time around a step. If a jump just before the step occurs earlier
-        by dt, on average dt times this number of frames change, because frames are taken at whole steps.
+        by dt, on average dt times this number of frames change, since frames are taken at whole steps.
         """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
@@ -222,9 +222,9 @@ class RunTape:
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
-        """Derivatives of the loss with respect to energy and virial of a frame, for a loss of single frames
-        whose energy or virial jumps at flips: these jumps of the loss are not included in gradients. For
-        equally spaced frames, gradients include the jumps, and both numbers are 0.
+        """Derivatives of the loss with respect to energy and virial of a frame, if gradients do not include
+        the jumps of energy and virial at flips, as for losses of a single frame. For equally spaced frames,
+        gradients include the jumps, and the derivatives returned are 0.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0
@@ -307,7 +307,7 @@ class ReversibleTape(RunTape):
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:
-        """Run the steps again, because they are not stored, and yield the stretches in order."""
+        """Run the steps again, because states are not stored, and yield the stretches of steps in order."""
         return RunTape(self.simulation, self.loss, self.steps, flips=self.flips).forward()
 
     def backward(self) -> Iterator[TapeStretch]:

@@ -56,10 +56,10 @@ class Advice:
     Attributes:
         key: key of the axis. end: the value that is regarded as converged; None if there is none.
         settings: every value with its comparison, starting at the converged end.
-        best: the value furthest from the end for which it and all values between are within the tolerance;
-            the end itself if there is no other.
-        undecided: the first undecided value beyond best.
-        converged: whether the value next to the end agrees with it within the tolerance: if not, the end
+        best: the value furthest from the end for which this value and all values in between are within the
+            tolerance, or else the end itself.
+        undecided: the first value beyond `best` whose comparison is undecided.
+        converged: whether the value next to the end agrees with the end within the tolerance. If not, the end
             itself may not be converged.
     """
 

@@ -264,7 +264,7 @@ def _advice(
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return two settings: all recommended values, and all converged values; empty if the two are equal.
 
-    Each choice was varied alone; runs with these two settings show the combined effect of all choices.
+    Each choice was varied alone; runs with the two settings show the combined effect of all choices.
     """
     best = {row["choice"]: row["best"] for row in advice if row["best"] is not None}
     ends = {row["choice"]: row["end"] for row in advice if row["end"] is not None}
@@ -289,7 +289,7 @@ def _together(
     means: Means, results: _Results, joint: Sequence[Setting],
     tolerances: Mapping[str, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Compare the results with all recommended values combined with those with all converged values."""
+    """Compare results at the setting of all recommended values with results at all converged values."""
     setting, end = joint
     found = _along(means, results, {"": setting}, end, list(tolerances))
     one = compared_with_end(setting, "", found, tolerances, len(tolerances))

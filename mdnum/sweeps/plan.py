@@ -53,7 +53,7 @@ class Plan:
     """Settings, points and measures of a sweep, determined before any run.
 
     Attributes:
-        loaded: the system or simulation with its own values. system, overrides: the arguments from which it
+        loaded: the system or simulation with its own values. system, overrides: arguments from which `loaded`
             was made.
         base: the value of each axis that is kept while another axis is varied.
         points: points in the order in which they are run.
@@ -220,7 +220,7 @@ def _axes(over: Any) -> list[Axis]:
 
 
 def _own_value(axis: Axis, own: Mapping[str, Any], loaded: Any, system: Any, overrides: Any) -> Any:
-    """Return the value of a choice in the system file (if it is not there, the first value of the sweep)."""
+    """Return the value of a choice in the system file, or else the first value given for the sweep."""
     from mdnum.systems import BallSystem, load
     from mdnum.systems.parameters import names, number, resolve
 

@@ -9,9 +9,9 @@
       claims/ADDRESS.N                the process that is computing it
 
 The address of a point is defined as in signac: the MD5 hash of the state point as JSON. A point is computed
-in a temporary folder, and a single rename moves the folder to the address; a killed process therefore leaves
-no partial result there. To claim a point, a process creates a claim file, which only one process can do
-(O_EXCL). If the claiming process ends without a result, another process creates a claim with the next number.
+in a temporary folder, which a single rename moves to the address, so that a killed process leaves no partial
+result. To claim a point, a process creates a claim file, which only one process can do (O_EXCL). If the
+claiming process ends without a result, another process creates a claim with the next number.
 """
 
 from __future__ import annotations

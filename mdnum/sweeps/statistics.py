@@ -2,8 +2,8 @@
 
 For each run, the mean of a quantity has an error, estimated from its autocorrelation. The scatter of the
 means of several seeds estimates the same variance. The errors from autocorrelation have many degrees of
-freedom, but are too small if a mode relaxes more slowly than the length of a run. These errors are therefore
-multiplied by one factor, which is determined from the scatter of all seeds of all settings.
+freedom, but are too small if a mode relaxes more slowly than the length of a run. Errors from autocorrelation
+are therefore multiplied by one factor, which is determined from the scatter of all seeds of all settings.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class SeedMean:
 def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K, SeedMean]:
     """Return the mean of one measure at each setting, over runs that differ only in their random seed.
 
-    The error of a mean follows from the errors of its runs, multiplied by the ratio of the scatter between
-    seeds to these errors. The ratio is one number for all settings of a measure; with more settings, its
-    error decreases. If this error has fewer degrees of freedom than the scatter between the seeds of the
-    setting, the scatter is used instead.
+    The error of a mean is the error from its runs, times the ratio of the scatter between seeds to the error
+    from the runs. The ratio is one number for all settings of a measure; with more settings, its error
+    decreases. If the error has fewer degrees of freedom than the scatter between the seeds of the setting,
+    the scatter is used instead.
 
     Args:
         found: (value, standard error, independent samples) of each run; nan if unknown.

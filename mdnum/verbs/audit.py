@@ -220,7 +220,7 @@ def _ask_all(
 def answer_of(
     check: AuditCheck, subject: CalculatorSubject, log: frame.Progress, before: Iterable[CheckResult]
 ) -> CheckResult:
-    """Run a check and return its result; if the calculator fails, the result contains a finding about it.
+    """Run a check and return its result; if the calculator fails, the result is a finding on the failure.
 
     If the calculator gave different results for the same input, a finding is added, once per audit.
     """
@@ -401,7 +401,7 @@ def _named(value: Any, given: units.Units) -> Any:
 
 
 def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]]:
-    """Group findings by cause: pairs of a finding and a list of the findings that it may explain."""
+    """Group findings by cause; return pairs of a finding and the list of findings that it may explain."""
     above = heads([(one.code, one.severity) for one in found])
     return [
         (one, [other for k, other in enumerate(found) if k != place and above[k] == place])

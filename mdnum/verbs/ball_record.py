@@ -284,7 +284,7 @@ def solved(run: BallRun) -> np.ndarray:
 
 
 def ambiguous_flips(run: BallRun) -> np.ndarray:
-    """True for contact flips that are within their rounding bound, unless this bound is zero."""
+    """True for contact flips whose margin is within a rounding bound greater than zero."""
     return run.contacts.ambiguous & (run.contacts.bound > 0)
 
 
@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step; with one residual per ball, those of the smallest margin."""
+    """Residual and stop margin of each step; if each ball has a solve, those with the smallest margin."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

@@ -309,7 +309,7 @@ def _species_cutoffs(words: _Pairs) -> Mapping[Any, float]:
 
 
 def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
-    """Return the cutoff of the mdnum run that wrote the trajectory, from the folder of this run."""
+    """Return the cutoff of the mdnum run that wrote the trajectory, from the folder of the run."""
     radius = None
     # no run of mdnum's
     with suppress(OSError, MdnumError, AttributeError):
@@ -348,7 +348,7 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
 def _with_other_box(
     trajectory: Trajectory, frame: Any, found: Pass, of: Groups | ByResidue
 ) -> dict[str, Any] | None:
-    """Count the pairs of a frame in another box that is also plausible; None if there is no such box."""
+    """Count the neighbor pairs of a frame in another plausible box; None if there is no other box."""
     from mdnum.trajectories.tracker import Tracker
 
     if (other := trajectory.other_box(frame.index)) is None:
@@ -570,7 +570,7 @@ def _counted(
 
 
 def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
-    """Return names of atoms such as "GLY 12 CA" (or "CA" if there are no residues), of residues "GLY 12".
+    """Return names of atoms, such as "GLY 12 CA" (without residues, "CA"), or of residues, such as "GLY 12".
 
     If there are several segments, each name begins with the name of the segment: "A GLY 12".
     """

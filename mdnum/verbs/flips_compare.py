@@ -131,7 +131,7 @@ class ComparisonView(FlipsView):
 
     @property
     def largest(self) -> tuple[str, str]:
-        """Largest separation of an atom in any frame, and the separation that rounding explains there."""
+        """Largest separation of an atom in any frame, and the separation due to rounding in this frame."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))

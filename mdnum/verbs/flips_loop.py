@@ -98,7 +98,7 @@ def findings(
 
 
 def sections(view: FlipsView) -> Iterator[Section]:
-    """Yield sections on the neighbor lists and on the energy, if the loop recorded these data."""
+    """Yield a section on recorded neighbor lists and a section on recorded energies, if there are any."""
     rows, energy = view.table("loop"), view.summary.get("energy")
     some = slice(None, None, -(-len(rows["number"]) // _POINTS) or 1)
     drawn = {"lists": {"pairs lost": rows["lost"].astype(float)}, "energy": {"energy": rows["energy"]}}

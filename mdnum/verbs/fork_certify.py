@@ -120,7 +120,7 @@ def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[s
 
 
 def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
-    """Count the decisions within their rounding bounds for each precision, and evaluate these exactly."""
+    """Count, for each precision, decisions within rounding bounds, and evaluate these decisions exactly."""
     from mdnum.forks.certified import certified_horizon
     from mdnum.numerics import PrecisionPolicy
 

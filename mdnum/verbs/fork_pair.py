@@ -357,7 +357,7 @@ def _of_ball(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
 
 
 def _exponent(made: Fork) -> dict[str, Any]:
-    """Return the largest Lyapunov exponent of run A, or the reason why it is not available."""
+    """Return the largest Lyapunov exponent of run A, or the reason why no exponent is available."""
     from mdnum.forks.linearized import lyapunov
 
     def why(name: str, **values: Any) -> dict[str, Any]:

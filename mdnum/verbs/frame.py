@@ -99,7 +99,7 @@ class View:
         return [restore(each) for each in found if each.get("code") not in codes]
 
     def page(self, title: str, about: str, keys: Iterable[Key], sections: Iterable[Section]) -> Page:
-        """Return the report page of this folder, with system and provenance; empty sections are omitted."""
+        """Return the report page of the folder, with system and provenance; empty sections are omitted."""
         kept = [section for section in sections if section.parts]
         file = self.folder.system_file
         what = ("", "") if file is None else (file.name, read_text(file))
@@ -117,7 +117,7 @@ class Verb:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised if control-C was pressed after results were stored; `outcome` contains these results."""
+    """Raised if control-C was pressed after results were stored; `outcome` contains the results."""
 
     def __init__(self, outcome: Outcome):
         super().__init__(outcome)
@@ -174,10 +174,10 @@ class UnknownKeyword(InputError, TypeError):
 
 
 def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
-    """Wrap a public function so that it rejects unknown keywords before it reads or writes any file.
+    """Wrap a public function to reject unknown keyword arguments before any file is read or written.
 
-    Without this check, misspelled keywords in `**keep` would raise an error only when the output folder is
-    made, after the function has used default values instead.
+    Otherwise, misspelled keywords in `**keep` would raise an error only when the output folder is made, after
+    the function has used default values in place of the given values.
 
     Args:
         more: names of keywords that the verb passes on in addition to those of `Keep`.

@@ -187,7 +187,7 @@ def _too_long(method: Method, problem: Problem, names: int) -> str:
 
 
 def _over(method: Any, replicas: int, horizons: bool = True) -> Method:
-    """Return a method with the given number of initial states, if the method averages over these."""
+    """Return a method with the given number of initial states, if the method averages over states."""
     if not replicas or not hasattr(method, "replicas"):
         return method
     changed = replace(method, replicas=replace(method.replicas, count=replicas))

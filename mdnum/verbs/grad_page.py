@@ -31,7 +31,7 @@ _GROWN = {"forward bounded, gradient not": "growing", "forward not bounded": "un
 
 
 def by(summary: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
-    """Return the stored result of a gradient method, or of the closed form if this is the reference."""
+    """Return the stored result of a gradient method (or of the closed form, if it is the reference)."""
     if summary.get("exact") and method == summary["reference"]:
         exact = {"gradient": summary["exact"], "details": {}, "error": {}}
         return {"method": method, "description": TEXTS("exact"), **exact}
@@ -86,7 +86,7 @@ def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str
 
 
 def slope_unit(summary: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
-    """Return the unit of a derivative: that of the loss divided by that of the parameter."""
+    """Return the unit of a derivative: unit of the loss divided by unit of the parameter."""
     above, below = summary["loss"]["unit"], parameter["unit"]
     if above == below:
         return ""

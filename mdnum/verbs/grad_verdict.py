@@ -199,7 +199,7 @@ def _of_flips(view: View) -> Iterator[Finding]:
 
 
 def _of_the_motion(view: View) -> Iterator[Finding]:
-    """Yield a finding on methods that disagree with the exact derivative, if this is known."""
+    """Yield a finding on methods that disagree with the exact derivative, if a closed form is known."""
     rows = view.summary["comparisons"] if view.summary.get("exact") else ()
     off = [row for row in rows if row["relative"] is None or row["relative"] > _CLOSE]
     methods: dict[str, list[str]] = {}

@@ -22,7 +22,7 @@ class Outcome:
     """Return value of every command: a summary and a verdict, with methods that read tables and figures.
 
     An outcome can be pickled, and returned by the workers of a pool. Tables, figures and the page are read
-    from the output folder when they are used, so the folder must not be moved.
+    from the output folder on first use, so the folder must not be moved.
 
     Example:
         >>> outcome = mdnum.run("argon/crystal-108", steps=200)
@@ -86,7 +86,7 @@ class Outcome:
             return folder.table(name)
 
     def plot(self, name: str) -> Axes:
-        """Draw a figure of the page as a new pyplot figure; `name` is that of its file in figures/.
+        """Draw a figure of the page as a new pyplot figure; `name` is the name of its file in figures/.
 
         Returns:
             the matplotlib axes, or the first axes if there are several; `.figure.axes` lists all axes.

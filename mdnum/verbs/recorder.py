@@ -34,9 +34,9 @@ _NONE = {name: np.zeros(0, np.int64) for name in ("rule", "i", "j", "rank", "ent
 class Recorder:
     """Recorder of flips, and of pairs that are missing from the neighbor list, for any simulation loop.
 
-    The results are the same as those of `mdnum.flips` for a file with these frames. Decisions (pair inside or
-    outside the cutoff) are computed from the positions in float64. Decisions that are uncertain because the
-    positions are in float32 are marked.
+    The results are the same as from `mdnum.flips` for a file with the recorded frames. Decisions (pair inside
+    or outside the cutoff) are computed from the positions in float64. Decisions that are uncertain because
+    the positions are in float32 are marked.
 
     Example:
         >>> with mdnum.Recorder(8.5, box=box, fractional=True, out="runs/mine") as rec:
@@ -189,7 +189,7 @@ class Recorder:
 
     @property
     def outcome(self) -> Outcome:
-        """The outcome of the recording, like that of `mdnum.flips`; the recorder is closed."""
+        """The outcome of the recording, as from `mdnum.flips`; reading this attribute closes the recorder."""
         return self.close()
 
     def __enter__(self) -> Recorder:

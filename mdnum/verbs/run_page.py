@@ -124,8 +124,8 @@ class RunView(View):
         """Indicators of whether the time step is small enough; an indicator that is unknown is None.
 
         `per_period`: number of steps per period of the fastest vibration in the first and the last frame;
-        `fluctuation`: fluctuation of the conserved energy (without the jumps of flips) divided by that of the
-        kinetic energy; `drift`, `drift_error`: drift of this energy over the run and its error, k_B T per
+        `fluctuation`: fluctuation of the conserved energy (without the jumps of flips) over the fluctuation
+        of the kinetic energy; `drift`, `drift_error`: drift of the conserved energy and its error, k_B T per
         atom.
         """
         period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
@@ -310,7 +310,7 @@ def _energy(run: RunView) -> Iterator[Any]:
 
 
 def _pressure(run: RunView, parts: Mapping[str, Any]) -> Iterator[Any]:
-    """Yield contributions to the pressure, including those of force jumps at the cutoff and of the tail."""
+    """Yield the contributions to the pressure, such as kinetic part, virial part and tail correction."""
     units = run.units
     rows = TEXTS.rows("pressure", **vars(units), **parts)
     terms = [

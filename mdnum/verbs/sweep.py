@@ -247,7 +247,7 @@ def _compute(
 def _after_a_loss(
     place: Workspace, one: Task, wanted: Mapping[str, Planned], error: BaseException, counts: dict[str, Any]
 ) -> list[list[Planned]]:
-    """Handle a task whose process died repeatedly: mark the current point as failed; return the others."""
+    """Handle a task whose process died repeatedly: mark its current point as failed, return other points."""
     from mdnum.sweeps.points import write_result
 
     again = []

@@ -1,6 +1,6 @@
 """Measures of a sweep that require further runs: divergence of two runs, and gradients.
 
-This module adds these measures to `mdnum.sweeps.measures.MEASURES`, because the package `sweeps` must not
+These measures are added to `mdnum.sweeps.measures.MEASURES` here, because the package `sweeps` must not
 import forks and gradients.
 """
 

@@ -37,7 +37,7 @@ def _unit(view: View, name: str) -> str:
 
 
 def _moved(view: View) -> dict[str, list[str]]:
-    """Return, for each choice, the names of the physical measures that it changes significantly."""
+    """Return the names of the physical measures that each choice changes significantly, by choice."""
     found: dict[str, list[str]] = {axis["key"]: [] for axis in view.summary["axes"]}
     physical = {one["name"] for one in view.summary["measures"] if one["physical"]}
     for row in view.summary["differences"]:

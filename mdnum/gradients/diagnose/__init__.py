@@ -226,11 +226,11 @@ class GradientDiagnosis:
     """Results on whether and how far a gradient can be trusted. Results that were not requested are None.
 
     Attributes:
-        horizon: steps. names: full names of the parameters. value: the loss.
+        horizon: number of steps. names: full names of the parameters. value: value of the loss.
         agreement, growth, spectrum, trust, flips, detective, scaling: results of the functions with these
             names.
-        edges: boundaries of decisions, by parameter.
-        notes: warnings about single parameters: no dependence, a missing term.
+        edges: parameter values at which decisions change, by parameter.
+        notes: warnings about parameters, such as a loss without dependence on a parameter.
         failed: results that were requested and are not available, with the reason.
     """
 

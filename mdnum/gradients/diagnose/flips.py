@@ -1,7 +1,7 @@
 """Contribution of each flip to a gradient, and jumps of a gradient at parameter values where flips change.
 
 The contribution of a crossing is a product of two factors. The first factor, from a reverse pass, is the
-derivative of the loss with respect to the cutoff of this crossing alone; it includes the effect of all later
+derivative of the loss with respect to the cutoff of one crossing alone, including the effect of all later
 flips. The second factor, from tangents without flips, is the distance by which the cutoff moves ahead of the
 pair. The contributions of all flips therefore sum exactly to the total contribution of flips.
 
@@ -134,7 +134,7 @@ def flips(
 
 @dataclass(frozen=True)
 class DecisionEdge:
-    """The nearest decision boundary on one side of a parameter, and the gradient on both sides of it."""
+    """Nearest parameter value, on one side, at which a decision changes, with gradients on both sides."""
 
     side: str  # "below" or "above"
     runs: int  # that the search took
@@ -159,7 +159,7 @@ class DecisionEdge:
 
 @dataclass(frozen=True)
 class DecisionEdges:
-    """The nearest decision boundaries below and above the value of one parameter."""
+    """Nearest values below and above a parameter's value at which a decision changes."""
 
     name: str
     value: float
@@ -172,8 +172,8 @@ def edges(
 ) -> DecisionEdges:
     """Find the nearest decision boundaries below and above a parameter's value, with gradients on both sides.
 
-    Tangents predict the parameter shift at which a decision first changes. Near this shift, runs are compared
-    until two adjacent floats with different decisions are found.
+    Tangents predict the parameter shift at which a decision first changes. Near the predicted shift, runs are
+    compared until two adjacent floats with different decisions are found.
 
     Args:
         problem: of a pair potential. name: a parameter of one entry.

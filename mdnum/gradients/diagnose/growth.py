@@ -109,8 +109,8 @@ class GrowthWatch:
                 self.gradient[name][first + row] = value
 
     def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> GradientGrowth:
-        """Return the table of norms and its growth rate. The last row is the gradient of the whole run,
-        because a loss may depend on the first frame too, and cotangents of single steps lack this dependence.
+        """Return the table of norms and its growth rate. The last row is the gradient of the whole run: the
+        loss may depend on the first frame, and cotangents of single steps lack this dependence.
         """
         units = self.simulation.units
         timestep = float(self.simulation.integrator.timestep)
@@ -157,7 +157,7 @@ def growth(
         InputError: a parameter does not exist, or flips were requested without a pair potential.
         NumericalError: the run blew up.
 
-    Error: that of the reverse pass. A horizon below T belongs to a later start on the same trajectory.
+    Error: the error of the reverse pass. Horizons below T belong to later starts on the same trajectory.
     """
     names = parameters.resolve(problem.simulation, names)
     watch = GrowthWatch(problem.simulation, names, problem.steps)

@@ -2,9 +2,9 @@
 
 A pair that turns back just outside its cutoff causes no flip. If the pair came slightly closer, it would
 enter and leave at a radial speed near zero, and the contribution of each crossing to the gradient would be
-proportional to the inverse of this speed. Conversely, a pair that passes the cutoff by little contributes to
-the gradient, and this contribution could vanish. All turning points near the cutoff are therefore examined,
-on either side and also between two steps.
+proportional to the inverse of this speed. Conversely, the contribution of a pair that passes the cutoff by
+little could vanish after a small change. All turning points near the cutoff are therefore examined, on either
+side and also between two steps.
 
 Near the turning point the distance is r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth
 d crosses the cutoff twice at speed sqrt(2 a d), and the two crossings contribute 2 w / sqrt(2 a d), where w
@@ -54,21 +54,20 @@ class Turns:
     """Table of turning points of pair distances near the cutoff.
 
     Attributes:
-        table: one row per turning point, in the order of steps:
-            step: the step after the turning point. row: row of that step in its stretch.
-            i, j: the pair, i < j. a, b: the same in the order of the stretch's list. kind: pair type.
-            gap: distance left to the cutoff, length; negative while the pair is beyond the cutoff.
-            side: 1 if the distance has a minimum there, -1 if it has a maximum.
-            bend: magnitude of the second derivative of the distance there, length per internal time².
-            unseen: whether the pair is beyond the cutoff only between two steps, so that no decision shows
-                it.
-            weight: derivative of the loss by the cutoff of one crossing there, times its radial speed.
-            moved: distance by which the cutoff moves ahead of the pair, per unit of each number; NaN before
-            the tangents have been computed.
-            shift: largest difference of the distance from other runs (another time step, another rounding),
-            length; 0 before any. finer: how much larger the distance is with the shorter steps.
-            normal: from a to b. images: lattice vectors from the wrapped to the nearest image of b.
-            part: time between the two steps, 0 to 1. before, after: distances at the two steps.
+        table: one row per turning point, in the order of steps, with the columns
+            step: the step after the turning point. row: row of this step in its stretch of steps.
+            i, j: the pair, i < j. a, b: the pair in the order of the neighbor list. kind: pair type.
+            gap: distance to the cutoff, length; negative if the pair passed the cutoff.
+            side: 1 for a minimum of the distance, -1 for a maximum.
+            bend: magnitude of the second time derivative of the distance, length per internal time².
+            unseen: whether the pair passed the cutoff only between two steps, without a recorded flip.
+            weight: derivative of the loss with respect to the cutoff of one crossing, times radial speed.
+            moved: distance by which the cutoff moves ahead of the pair, per unit of each parameter entry;
+            NaN before the tangents have been computed.
+            shift: largest change of the distance in other runs (another time step, another rounding),
+            length; 0 before any other run. finer: change of the distance with shorter time steps.
+            normal: unit vector from a to b. images: lattice vectors from wrapped to nearest image of b.
+            part: time between the two steps, as a fraction. before, after: distances at the two steps.
     """
 
     table: dict[str, np.ndarray]
@@ -95,7 +94,7 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """True if the distance is within its uncertainty of the cutoff, or passed it between two steps."""
+        """True if the cutoff is within the distance's uncertainty, or was passed between two steps only."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property

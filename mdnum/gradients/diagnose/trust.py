@@ -4,8 +4,8 @@ A gradient ceases to be trusted in five cases. (1) Another precision gives a dif
 rounding errors have grown. (2) Half the time step gives a different gradient. (3) A pair turned around so
 close to its cutoff that another time step could add or remove a flip with a relevant contribution. (4) A
 decision was so close to its threshold that rounding determined the decision. (5) Gradients from other starts
-of the same system scatter by more than their mean. These limits are independent; if one is not examined, the
-verdict remains undecided.
+of the same system scatter by more than their mean. The five limits are independent; if one limit is not
+examined, the verdict remains undecided.
 
 The gradients for all horizons are computed from one run and one pass of tangents.
 """
@@ -250,7 +250,7 @@ def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[
 
     If the given run uses formats narrower than float64, the comparison uses float64 throughout. No hardware
     format is wider than float64: a float64 run is compared with a run whose start is shifted by one rounding
-    error. This shift shows the effect of rounding on the gradient up to a factor of order one.
+    error. The shifted start shows the effect of rounding on the gradient up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -387,7 +387,7 @@ def trust(
 
 
 def grew(growth: GradientGrowth) -> bool:
-    """Return whether a gradient grew so much that it may be very different for other initial states."""
+    """Return whether a gradient grew so much that gradients from other initial states may be different."""
     # over the first horizons all of them grow: velocities turn into lengths, and averages gain frames
     size = growth.table["size"][min(CLOCK_STEPS, len(growth.table["size"]) - 1) :]
     there = size[np.isfinite(size) & (size > 0)]
@@ -528,7 +528,7 @@ def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "poi
 def last_below(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the last horizon before values exceed a limit twice in succession, and whether this occurs.
+    """Return the last horizon before values exceed a limit at two successive horizons, and whether they do.
 
     A single value beyond the limit is ignored (except at the last horizon), because the relative error is
     large where a gradient changes sign.
@@ -544,7 +544,7 @@ def last_below(
 def last_agreeing(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the longest horizon with all values below a limit, and whether the last horizon is beyond it.
+    """Return the longest horizon with all values below a limit, and whether a longer horizon exists.
 
     Disagreement at shorter horizons is ignored: the relative error due to the time step may decrease again,
     and for few flips a change of a single flip is a large part of the gradient. Agreement at a single
