@@ -168,9 +168,9 @@ class MTK(Barostat):
     Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), with the operator splitting of Tuckerman et al.,
     J. Phys. A 39, 5629 (2006), eq. 38 ff. A step applies the thermostat chains of box and atoms, the kick of
     the box by its excess pressure, the kick of the atoms, the drift in the changing box, and the same
-    operators in reverse order. The inertia of the box is (N_f + 3) k_B T τ_p² (a third of this value for a
-    full box). An isotropic box has one degree of freedom, a full box six. The drift at box rate a is exact:
-    x' = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
+    operators in reverse order. The inertia of the box is (N_f + 3) k_B T τ_p² (a third of this for a full
+    box). An isotropic box has one degree of freedom, a full box six. The drift at box rate a is exact: x' = x
+    exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -276,12 +276,12 @@ class CellRescaling(Barostat):
     """Integrator for the isothermal-isobaric ensemble: first-order stochastic cell rescaling with CSVR.
 
     In the middle of the drift, the square root of the volume is propagated by an Euler step with the present
-    forces. The noise of this square root does not depend on the volume. Velocities are scaled inversely to
-    the box (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section II C). In a full box, the traceless
-    strain is also propagated by an Euler step, with noise computed from the geometric mean of the volumes
-    before and after the step (del Tatto, Raiteri, Bernetti, Bussi, Appl. Sci. 12, 1139, 2022). From the
-    probabilities of each step and its reverse, an effective energy (total energy minus heat and work) is
-    computed, which is conserved within the time-step error.
+    forces. The noise of the square root does not depend on the volume. Velocities are scaled inversely to the
+    box (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section II C). In a full box, the traceless strain
+    is also propagated by an Euler step, with noise computed from the geometric mean of the volumes before and
+    after the step (del Tatto, Raiteri, Bernetti, Bussi, Appl. Sci. 12, 1139, 2022). From the probabilities of
+    each step and its reverse, an effective energy (total energy minus heat and work) is computed, which is
+    conserved within the time-step error.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,

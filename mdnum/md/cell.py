@@ -85,7 +85,7 @@ class Cell(eqx.Module):
     def nearby2(self):
         """Square of half the smallest perpendicular width, reduced by a margin for rounding (inside jit).
 
-        `minimum_image` returns displacements shorter than this half width unchanged, bit for bit.
+        `minimum_image` returns displacements shorter than half a width unchanged, bit for bit.
         """
         return (1 - 1e-9) * 0.25 / jnp.max(jnp.sum(self.inverse * self.inverse, axis=0))
 
@@ -162,7 +162,7 @@ class Cell(eqx.Module):
     def spent(self, x, reference: Cell, home, r_list):
         """Return the largest displacement relative to the box plus half the strain loss (inside jit).
 
-        A neighbor list contains every pair inside the cutoff as long as the result is at most half the skin.
+        A neighbor list is complete as long as the returned length is at most half the skin.
 
         Args:
             x, home: present positions, in this box, and positions when the list was built, in the box

@@ -34,7 +34,7 @@ class AtCutoff(NamedTuple):
 
 
 class Undecided(Exception):
-    """Error for an interval that contains a threshold, so the decision is not proven at this precision."""
+    """Error for an interval that contains a threshold, so that a decision cannot be proven."""
 
 
 class Cutoff(ABC):
@@ -75,7 +75,7 @@ class Cutoff(ABC):
 
     @property
     def continuous(self) -> Cutoff:
-        """The same cutoff with a shifted, continuous energy; the forces are unchanged."""
+        """A cutoff with the same forces, whose energy is shifted to be continuous at r_cut."""
         return self if self.smoothness >= 0 else Level(self)
 
     def reference(

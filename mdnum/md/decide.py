@@ -58,7 +58,7 @@ class PairDecider:
 
     @property
     def convention(self) -> PairDecider:
-        """The same decision rule without radii and error-bound data, as static data for compiled programs."""
+        """The decision rule without radii and error-bound data, as static data for compiled programs."""
         return replace(self, r_cut=(), reach=_NO_REACH, state="float64")
 
     @property
@@ -76,7 +76,7 @@ class PairDecider:
 
     @property
     def exact_thresholds(self) -> tuple[float, ...]:
-        """Thresholds by pair type in double precision; thresholds in other dtypes are rounded from these."""
+        """Thresholds by pair type in double precision, before rounding to the dtype of the comparison."""
         return tuple(threshold.value for threshold in replace(self, dtype="float64").thresholds)
 
     @cached_property
@@ -294,7 +294,7 @@ class Changes(NamedTuple):
         return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(3, np.int64))
 
     def emptied(self) -> Changes:
-        """Return the same buffers after removal of all changes."""
+        """Return the buffers after removal of all changes."""
         return self._replace(count=jnp.zeros_like(self.count))
 
     @property

@@ -236,7 +236,7 @@ class FixedPointStep(Integrator):
     zero: Int[Array, ""] = eqx.field(kw_only=True)  # an integer zero that XLA must not know
 
     def momentum(self, v: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
-        """Return momenta as integers, in units of momentum; exact for velocities of this simulation."""
+        """Convert velocities to integer momenta; the conversion is exact for velocities of a simulation."""
         return jnp.round(v * (masses / self.impulse))
 
     def velocity(self, p: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
@@ -417,7 +417,7 @@ def _counted_jvp(primals, tangents):
 
 
 class FixedPointJudge(SlotJudge):
-    """Pair decisions in fixed-point units; this version of `SlotJudge` compares integers."""
+    """Pair decisions by comparison of integers, in fixed-point units; otherwise like `SlotJudge`."""
 
     def __init__(
         self, decider: FixedPointDecider, limits, cell: Cell, zero, positions, units: FixedPointUnits

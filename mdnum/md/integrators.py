@@ -1,8 +1,8 @@
 """Integrators, which update the state between two force evaluations, and the time step that uses them.
 
-A step evaluates the forces at x_s and completes the previous step (`finish`), which gives the full-step
-velocity v_s. The first half of the next step (`begin`) then gives x_{s+1}. The state between steps is
-(x_{s+1}, half-step velocity, extra). An outdated neighbor list is therefore replaced before forces are
+A step evaluates the forces at x_s and completes the previous step (`finish`), which gives full-step
+velocities v_s. The first half of the next step (`begin`) gives the positions x_{s+1}. The state between steps
+is (x_{s+1}, half-step velocity, extra). An outdated neighbor list is therefore replaced before forces are
 evaluated, and a simulation can stop and resume between steps without evaluating forces twice.
 """
 
@@ -150,7 +150,7 @@ class Integrator(eqx.Module):
 
     @property
     def noise_belongs_to(self) -> tuple[str, ...]:
-        """Symmetries, "atoms" or "axes", that the noise breaks because it is tied to atom or axis indices."""
+        """Permutation symmetries ("atoms", "axes") broken by noise that is tied to atom or axis indices."""
         return () if self.random is None else ("atoms", "axes")
 
     def number(self, key: str, units: Units) -> float:
@@ -195,8 +195,8 @@ class Integrator(eqx.Module):
     def deform(self, v: Vector, extra: Any, at: AtStep) -> tuple[Float[Array, "3 3"], Vector, Any]:
         """Return the deformation of the box before the next force evaluation; the default is no deformation.
 
-        This method is called after `begin`. Lattice vectors and positions, as rows, are multiplied by the
-        deformation; `begin` must make only the motion relative to the box.
+        The method `deform` is called after `begin`. Lattice vectors and positions, as rows, are multiplied by
+        the deformation; `begin` must make only the motion relative to the box.
 
         Args:
             v, extra: sorted velocities and extra state, as returned by `begin`.
@@ -212,7 +212,7 @@ class Integrator(eqx.Module):
         return type(self).deform is not Integrator.deform
 
     def check(self, cell: Cell) -> None:
-        """Raise `InputError` for an unsupported box or option; this check runs once, on the host."""
+        """Raise `InputError` for an unsupported box or option; `check` is called once, on the host."""
 
     def freedom(self, masses: Float[Any, "atoms"]) -> int:
         """Return the number of degrees of freedom: 3 per atom, minus 3 if the total momentum is zero."""
@@ -236,7 +236,7 @@ class Integrator(eqx.Module):
     def exchanged(self, extra: Any, at: AtStep) -> tuple[Number | float, Number | float]:
         """Return the energies transferred to the atoms so far: heat from the thermostat, and work of the box.
 
-        Potential plus kinetic energy, minus both terms and minus heat returned by `begin`, is conserved.
+        The total energy minus heat and work, and minus the heat returned by `begin`, is conserved.
         """
         return 0.0, 0.0
 

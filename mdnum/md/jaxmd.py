@@ -154,7 +154,7 @@ def as_neighbor_list(
 ) -> NeighborList:
     """Make a jax-md NeighborList from the list of another program, for use with jax-md energy functions.
 
-    The function also works inside jit; padding entries keep their places in the arrays.
+    The conversion also works inside jit; padding entries keep their places in the arrays.
 
     Args:
         idx_dense: neighbors of each atom, in both directions, padded with the number of atoms. Entries of an
@@ -231,7 +231,7 @@ class PairSearch:
     """Neighbor search of jax-md for one cell, for repeated calls with new positions.
 
     Positions are passed to jax-md as fractional coordinates wrapped into [0, 1), with the perpendicular
-    widths as the box. For positions outside the box, jax-md loses pairs without an error; it also rejects
+    widths as the box. For positions outside the box, jax-md loses pairs without an error; jax-md also rejects
     some valid triclinic boxes. The overflow flag is read after every search, outside jit; after an overflow,
     the list is enlarged.
 

@@ -546,7 +546,7 @@ def _listed(rows: int, margins: bool) -> list[str]:
 
 
 def _others(wide: int, columns: int, rows: int) -> list[str]:
-    """Write LLVM code that loads the neighbors in a slot, four numbers at a time, and transposes them."""
+    """Write LLVM code that loads the neighbors in a slot, four numbers at a time, and transposes the data."""
     parts = -(-columns // 4)
     lines = [
         f"%at.WIDE = getelementptr i32, ptr %r{rows - 3}, i64 %from.WIDE",

@@ -1,10 +1,10 @@
 """Pair forces, computed from a neighbor list that contains each pair in both directions.
 
 Every pair is evaluated twice, once for each atom. Each atom sums over its neighbors in a fixed order, without
-scattered writes. In double precision on a CPU, forces are computed by one compiled loop (`md.kernel`).
-Otherwise, XLA evaluates a group of slots for all atoms at once and packs the decisions into bits, so that
-temporary arrays are small enough for the cache. Evaluating the whole (slots, atoms) array at once takes twice
-as long for 4,000 atoms and ten times as long for 32,000 atoms.
+scattered writes. In double precision on a CPU, forces are computed by one compiled loop (`md.kernel`). On
+other devices, or in other precisions, XLA evaluates a group of slots for all atoms at once and packs the
+decisions into bits, so that temporary arrays are small enough for the cache. Evaluating the whole (slots,
+atoms) array at once takes twice as long for 4,000 atoms and ten times as long for 32,000 atoms.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class PairForce(eqx.Module):
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
     def _near(self, pair: Callable[..., Any], tensor: bool) -> kernel.Shortcut | None:
-        """Return a pair function without minimum image, for near pairs; None if it would save no time."""
+        """Return a pair function without minimum image, for near pairs; None if that would save no time."""
         if not any(self.cell.pbc) or (self.cell.orthorhombic and not tensor):
             return None
 
@@ -380,7 +380,7 @@ def imposed(
     """Return the decisions used in a group of slots: imposed decisions if given, else the own `inside`.
 
     A simple mask makes the compiler compute distances twice: a step of 864 atoms takes 2.2 times as long as a
-    normal step, 1.3 times with a mask per slot (`unpacked`), and 1.2 times in this way.
+    normal step, 1.3 times with a mask per slot (`unpacked`), and 1.2 times with this code.
 
     Args:
         where: slots in which decisions are imposed; None for all.

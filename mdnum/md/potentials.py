@@ -81,7 +81,7 @@ class PairPotential(eqx.Module):
 
     @property
     def typed(self) -> PairPotential:
-        """The potential with each per-species parameter as two values per pair type, one for each atom."""
+        """The potential with two values per pair type, one for each atom, of each per-species parameter."""
         return self
 
     def split(self) -> tuple[Any, Any]:
@@ -399,7 +399,7 @@ class CutPotential(eqx.Module):
 
     @property
     def typed(self) -> CutPotential:
-        """The potential with each per-species parameter as two values per pair type, one for each atom."""
+        """The potential with two values per pair type, one for each atom, of each per-species parameter."""
         return replace(self, potential=self.potential.typed)
 
     def at_cutoff(self) -> AtCutoff:
@@ -432,7 +432,7 @@ class CutPotential(eqx.Module):
 
 
 class Channels(eqx.Module):
-    """Sum of cut potentials with different radii, where a pair has one decision for each radius.
+    """Sum of potentials with different cutoff radii, with one decision per pair and radius.
 
     Decisions are numbered by pair type, plus the number of pair types in all previous channels.
     """

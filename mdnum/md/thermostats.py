@@ -139,8 +139,8 @@ class CSVR(Integrator):
     """Stochastic velocity rescaling in the canonical ensemble: velocity Verlet, then a random scale factor.
 
     Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). The noise is a function of the random key
-    and the step number, so that two runs can have the same noise and a resumed run continues the same noise.
-    The effective energy (eq. 15 of the paper), which is the total energy minus the heat, is conserved.
+    and the step number, so that two runs can have the same noise and a resumed run continues the noise. The
+    effective energy (eq. 15 of the paper), which is the total energy minus the heat, is conserved.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="csvr",

@@ -108,9 +108,9 @@ class NeighborFlips(AnalysisBase):
     of residues, i and j are rows of `results.residues`, and `results.left_out` counts the excluded atoms.
     `results.resolution` is the resolution of positions in the file, and `results.bound` is the resulting
     error bound of a distance, per frame. `results.repeats` lists the frames that repeat earlier frames (see
-    `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first frame and the
-    reason for it (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and times of
-    the frames analyzed; `FlipTable.frame` is an index into both.
+    `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first frame and a reason
+    (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and times of the frames
+    analyzed; `FlipTable.frame` is an index into both.
 
     If a frame cannot be read or contains impossible values, an error with the frame number is raised; the
     results of all earlier frames are kept.

@@ -1,10 +1,10 @@
 """Readers of GROMACS's xtc and trr files that check each frame before it is decoded.
 
 On damaged data, the library that decodes xtc files divides by zero or writes outside its buffers; the process
-ends, and all earlier results are lost. Each frame is therefore checked before it is decoded. The compressed
-stream contains the number of bits of each atom's coordinates, so that the header, the number of atoms, the
-bit counts and the length can be verified without decoding. File damage that leaves a valid stream is not
-detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
+ends, and all earlier results are lost. Each frame of a file is therefore checked before it is decoded. The
+compressed stream contains the number of bits of each atom's coordinates, so that the header, the number of
+atoms, the bit counts and the length can be verified without decoding. File damage that leaves a valid stream
+is not detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
 
 MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. These readers write the index
 through symbolic links, and trust an index file even if it belongs to another trajectory; this module uses no

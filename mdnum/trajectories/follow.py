@@ -126,7 +126,7 @@ class NeighborCounts:
             np.add.at(self._now, one, counts)
 
     def count(self) -> tuple[int, float, int]:
-        """Return (fewest, mean, most) neighbors per atom at this frame; add the frame to the histogram."""
+        """Return (fewest, mean, most) neighbors per atom at a frame; add the frame to the histogram."""
         here = np.bincount(self._now if self._atoms is None else self._now[self._atoms])
         if len(here) > len(self.seen):
             self.seen = np.pad(self.seen, (0, len(here) - len(self.seen)))
@@ -302,7 +302,7 @@ class SetDifference:
         return len(self.only_a) + len(self.only_b)
 
     def step(self, a: FlipTable, b: FlipTable) -> None:
-        """Update the difference with the flips of both trajectories at one frame."""
+        """Update the difference of the neighbor sets with the flips of both trajectories at one frame."""
         differed: dict[Pair, bool] = {}
         for flips, mine, others in ((a, self.only_a, self.only_b), (b, self.only_b, self.only_a)):
             columns = (flips.i.tolist(), flips.j.tolist(), flips.rank.tolist(), flips.entered.tolist())
@@ -488,8 +488,8 @@ def _apart(
 ) -> tuple[Separation, float]:
     """Return (separation, the separation that file resolution can explain), both without a common shift.
 
-    A common shift is removed only if it explains nearly all of the separation. Such a shift arises from
-    different origins of two files, or from center-of-mass motion removed in one file.
+    A shift common to all atoms is removed only if it explains nearly all of the separation. A shift can
+    result from different origins of two files, or from removal of center-of-mass motion in one file.
     """
     now = separation(a, b, atoms)
     allowed = sum(side.position_bound(now.periods) for side in sides)

@@ -213,9 +213,9 @@ def doublings(frames: int) -> list[int]:
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:
     """Count the decisions that change if all atoms move in straight lines for a short time.
 
-    The root mean square displacement in this time is the length `move`. This length should be small compared
-    with the distance over which paths bend, but large enough that many pairs cross. `count` returns the
-    number of flips between two frames.
+    The root mean square displacement is the length `move`, which should be small compared with the distance
+    over which paths bend, but large enough that many pairs cross the cutoff. `count` returns the number of
+    flips between two frames.
 
     Returns:
         (number of flips, duration of the motion in the time unit of the velocities); None if no atom moves.

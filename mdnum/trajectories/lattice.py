@@ -2,8 +2,8 @@
 
 Lattice vectors are reduced first, so that a search in a skewed box is as fast as in the compact box with the
 same lattice. Every decision is based on the length of (x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2, computed in
-this order from stored coordinates x, i < j, integers s and reduced vectors a. A decision therefore does not
-depend on the search algorithm that found the pair.
+this order from stored coordinates x, i < j, integers s and reduced vectors a. A pair decision therefore does
+not depend on the search algorithm that found the pair.
 
 For a search, the reduced box is divided into bins. Coordinates along a nonperiodic direction are folded onto
 a limited number of bins, so that a distant atom does not enlarge the grid. For each bin, the atoms of all
@@ -277,7 +277,7 @@ class SearchLimits(NamedTuple):
 
     @classmethod
     def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> SearchLimits:
-        """Return limits of squared distances for pairs inside the radius, and for a band around it."""
+        """Return limits of squared distances for pairs inside a radius, with a band around the radius."""
         low = np.where(radii >= 0, np.maximum(radii - band, 0.0) ** 2, np.inf)
         high = np.where(radii >= 0, (radii + band) ** 2, -1.0)
         return cls(kind, low, high, float((radii.max(initial=0.0) + band) ** 2))

@@ -69,13 +69,13 @@ class Resolution:
     told: bool = True  # whether the coordinates determine it; where all are 0, it is the format's usual one
 
     def bound(self, frame: Frame, atoms: AtomIndices = None) -> float:
-        """Return the largest error of a distance in this frame due to rounding of the data in the file.
+        """Return the largest error of a distance in a frame due to rounding of the data in the file.
 
         The bound, in length units, is the worst case: rounding moves both atoms by half a step along every
         axis in opposite directions; for pairs across the boundary, the box error is added. For float64
         positions, the bound is the rounding error of the distance. A margin to a cutoff has the same error
-        bound; a margin among nearest neighbors (a difference of two distances) has twice this bound. If
-        `atoms` are given, the bound is valid for distances between these atoms.
+        bound as a distance; a margin among nearest neighbors (a difference of two distances) has twice the
+        bound. If `atoms` are given, the bound is valid for distances between these atoms.
 
         Error: the bound holds for pairs across one period of the box; each further period adds the box error.
         """
@@ -370,9 +370,9 @@ def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]
 def unrounded(variance: float, size: float) -> float:
     """Return the variance of displacements before positions were rounded to multiples of `size`.
 
-    If a displacement exceeds an integer number of steps by the fraction f of a step, rounding adds size² f (1
-    - f) to its mean square. The mean of this term for normally distributed displacements of variance v is, by
-    its Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
+    If a displacement is n + f steps with integer n and 0 <= f < 1, rounding adds size² f (1 - f) to the mean
+    square over all starting points. For normally distributed displacements of variance v, the mean of this
+    addition is, by a Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
     """
     low, high, k = 0.0, variance, np.arange(1, 200)
     for _ in range(60):

@@ -170,7 +170,7 @@ class Nearest(_Membership):
 class Capped(_Membership):
     """Directed rule: the neighbors of an atom are the `most` nearest atoms inside a cutoff radius.
 
-    Graph builders that limit the number of neighbors by keeping the nearest atoms use this rule.
+    Graph builders with a limited number of neighbors use this rule if they keep the nearest atoms.
     """
 
     radius: float

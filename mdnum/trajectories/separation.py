@@ -160,8 +160,8 @@ def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
     """Return the inconsistency between displacements, velocities and times, if any, by medians over frames.
 
     If atoms turn around between two frames, displacements are smaller than predicted from velocities, but not
-    inconsistent. A smaller displacement counts only if it is parallel to velocities that kept their
-    directions.
+    inconsistent. Smaller displacements count only if velocities kept their directions and are parallel to
+    displacements.
 
     Returns:
         the factor by which displacements are too large (or too small, below 1), and whether it is a lower
@@ -199,7 +199,7 @@ def growth(
     """Fit an exponential and a power law to a separation that grows in time.
 
     A constant error of a force or a velocity makes the separation of two runs grow as a low power of time;
-    chaos makes it grow exponentially. Zero lengths, and lengths above `limit`, are left out.
+    chaos makes the separation grow exponentially. Zero lengths, and lengths above `limit`, are left out.
 
     Args:
         began: earliest and latest possible time at which the separation began, as the origin of a power law.

@@ -57,7 +57,7 @@ class _Numbers(NamedTuple):
 
 
 class _Limits(NamedTuple):
-    """Thresholds for the pairs with the same cutoff radius."""
+    """Thresholds of decisions for all pairs with the same cutoff radius."""
 
     radius: float
     square: float  # of the radius
@@ -84,7 +84,7 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Update tiles to a frame; return True if they contain all pairs within `clear` of their radius."""
+        """Update to a frame; return True if the tiles contain all pairs within `clear` of their radius."""
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
@@ -164,7 +164,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if at most one image of a pair can be inside the cutoff, even if pairs approach."""
+    """Return True if at most one image per pair can be inside the cutoff after an approach by `moved`."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )

@@ -10,8 +10,8 @@ computed from MDAnalysis's box are silently wrong:
 
 In a PDB file with many models, MDAnalysis loses boxes outside the models. Programs write CRYST1 once in the
 header (OpenMM), before each model (GROMACS), or inside each model. MDAnalysis reads a model from its MODEL
-record to the next MODEL record. A box before the first model is therefore never read, and a box after a model
-is assigned to this model instead of the next one.
+record to the next MODEL record. A box before the first model is therefore never read, and a box between two
+models is assigned to the first of them.
 """
 
 from __future__ import annotations

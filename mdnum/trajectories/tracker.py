@@ -164,7 +164,7 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return threshold distances of a directed rule at the last frame, by center; nan for others.
+        """Return threshold distances of a directed rule at the last frame, by center; nan for other atoms.
 
         Returns:
             (distance below which a neighbor stays one, distance below which another atom becomes a neighbor).
@@ -245,7 +245,7 @@ class Tracker:
     # ---- two frames
 
     def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
-        """Return the flips found with the current tiles; None if tiles cannot be used for this frame."""
+        """Return the flips found with the current tiles; None if tiles cannot be used for a frame."""
         who, bound, horizon = self._who, self.bound + now.rounding, HORIZON * self._who.radius
         clear = max(bound, horizon)
         if self._list is not None and not self._list.serve(before, now, who.radius, clear):

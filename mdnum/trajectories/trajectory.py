@@ -31,7 +31,7 @@ class Trajectory(ABC):
     """Frames of one file, which can be read in order any number of times; each frame is read when needed.
 
     A subclass sets the number of atoms (`has_atoms`), reads raw frames (`raw_frames`) and decodes raw frames
-    (`decoded`). An exception in these methods is reported as an unreadable frame.
+    (`decoded`). An exception in a method of a subclass is reported as an unreadable frame.
 
     Args:
         path: the trajectory file.
