@@ -1,6 +1,6 @@
 """mdnum: neighbor-set flips, forks and gradients of cutoff-based molecular dynamics.
 
-A simulation is created from Python objects or from a system file:
+A simulation is created from Python objects, or from a system file, as follows:
 
     >>> argon = mdnum.LennardJones(sigma=3.405, epsilon=0.0103235)
     >>> sim = mdnum.simulation(atoms, argon, mdnum.Cut("switched", 8.5), timestep=0.002)
@@ -19,13 +19,14 @@ Functions take a simulation, or the name or path of a system file, and write a f
     conform             test whether a neighbor list finds every pair
     bounce, demonstrate runs and demonstrations of a bouncing ball
 
-Nouns: `Simulation` and its `parameters` by path, pair potentials (`LennardJones`, `Morse`, `SoftSphere`,
-`PairFunction` for one of your own), `energy_function` for any energy over a neighbor list, `Cut`, `Term` for
-several that add, integrators (`VelocityVerlet`, `Langevin`; `KickDrift` and `Integrator` to write one),
-`PrecisionPolicy`, `Problem` with `value_and_grad` and `method` for gradients, and `MdnumCalculator` for ASE.
+The package provides `Simulation` and its `parameters`, pair potentials (`LennardJones`, `Morse`,
+`SoftSphere`, and `PairFunction` for user functions), `energy_function` for other energy functions, cutoffs
+(`Cut`), sums of potentials (`Term`), integrators (`VelocityVerlet`, `Langevin`, and `KickDrift` and
+`Integrator` for new ones), `PrecisionPolicy`, gradients (`Problem`, `value_and_grad`, `method`) and
+`MdnumCalculator` for ASE.
 
-The names below are imported on first use (PEP 562), because importing jax takes half a second and importing
-jax_md takes six seconds, and `mdnum --help` does not need these packages.
+Names of this package are imported on first use (PEP 562), because importing jax takes half a second and
+importing jax_md takes six seconds, and `mdnum --help` does not need these packages.
 """
 
 from __future__ import annotations

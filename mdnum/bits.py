@@ -17,7 +17,7 @@ from mdnum.vectors import lowest_bit
 
 @njit
 def _scan(before, rows, columns, row, slot, column, values):
-    """Record the bits that change between consecutive rows, until the buffer is full; return their number."""
+    """Record the bits that change between rows while there is space; return the number of all changes."""
     at, room = 0, row.shape[0]
     for r in range(rows.shape[0]):
         # the eight slots that the scan is in, and the places of their bytes

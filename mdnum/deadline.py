@@ -27,7 +27,7 @@ class Deadline:
     """A deadline, after which a command does not start further work.
 
     The evidence for a verdict is the number of calls, which does not depend on the speed of the machine. A
-    deadline can only reduce this number; the command then reports this.
+    deadline can only reduce the number of calls; the command then reports the reduced number.
 
     Args:
         minutes: time from now in minutes; None for no limit.
@@ -65,7 +65,7 @@ class Deadline:
 def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
     """Raise `TimeUp` in the main thread if the block is still running `grace` seconds after the deadline.
 
-    The interruption is repeated, because the block may catch it. Compiled code is not interrupted.
+    The exception is raised repeatedly, because the block may catch it. Compiled code is not interrupted.
     """
     if math.isinf(deadline.left) or threading.current_thread() is not threading.main_thread():
         yield
@@ -84,7 +84,7 @@ def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
 def fewest(
     items: Sequence[T], enough: Callable[[list[T]], bool], spent: Callable[[], bool] = lambda: False
 ) -> list[T]:
-    """Return a sufficient subset of items, which is minimal unless the search was stopped early.
+    """Return a subset of items that satisfies a condition; it is minimal unless the search was stopped.
 
     Args:
         items: items that are sufficient together.

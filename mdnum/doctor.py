@@ -4,8 +4,8 @@ All tests are computations on the current machine. Versions that are known to be
 no version is assumed to be correct.
 
 Error bounds require that +, -, *, / and sqrt are each correctly rounded, and that sums are not reordered. XLA
-satisfies these conditions on CPUs, but contracts a*b+c and rewrites divisions by constants. This changes last
-bits, so the cutoff decisions of two builds may differ if a margin is below its error bound.
+satisfies these conditions on CPUs, but contracts a*b+c and rewrites divisions by constants. Such changes
+affect last bits, so the cutoff decisions of two builds may differ if a margin is below its error bound.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def _differing(a: Any, b: Any) -> int:
 
 
 def float64() -> DoctorRow:
-    """Test that jax uses float64, and that transfer to the device and jit do not change float64 numbers."""
+    """Test that jax uses float64, and that device transfer and jit do not change float64 numbers."""
     values = np.array([np.float64(1) / 3, np.pi, 1 + 2**-52, 8.5125, 1e300, -(2.0**-1000)])
     after = np.asarray(jax.jit(lambda x: x)(jnp.asarray(values)))
     kept = after.dtype == np.float64 and after.tobytes() == values.tobytes()

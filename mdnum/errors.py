@@ -102,7 +102,7 @@ class CapacityError(MdnumError):
 
 
 class NumericalError(MdnumError):
-    """Raised if a number that must be finite is not.
+    """Raised if a number that must be finite is infinite or NaN.
 
     Args:
         folder: the run folder, which contains all results before this number.

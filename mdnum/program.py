@@ -1,11 +1,10 @@
 """Interface of simulations to analyses such as forks and parameter maps, and results of comparisons.
 
-Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. A
-program determines all bits of a run, including the initial state. Forks, parameter maps, screening and
-certificates use only this interface. Decisions (such as whether a pair is inside the cutoff) are an input of
-a time step. Records therefore contain the decisions that were used, and decisions of one program can be
-imposed on another program. The implementations are `mdnum.rollout.program.MdProgram` and
-`mdnum.ball.program.BallProgram`.
+Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. An
+object with this interface (a program) determines all bits of a run, including the initial state. Forks,
+parameter maps, screening and certificates use only this interface. Decisions, such as whether a pair is
+inside the cutoff, are an input of each time step. Therefore decisions can be recorded, and imposed on another
+program. The implementations are `mdnum.rollout.program.MdProgram` and `mdnum.ball.program.BallProgram`.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class Program(Protocol):
     def imposable(self) -> str | None: ...
 
     def check(self, other: Any) -> None:
-        """Raise an error if another program has other kinds of decisions or other numbers of atoms or balls.
+        """Raise an error if another program has another number of atoms or balls, or other decisions.
 
         Raises:
             InputError: the programs cannot be compared.
@@ -74,7 +73,7 @@ class Program(Protocol):
     def repeats(
         self, others: Sequence[Any], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Return separations of other runs from this run, without and with this run's decisions imposed.
+        """Return the separations of other runs from this run, without and with this run's decisions imposed.
 
         Args:
             others: the same program with perturbed starts.
@@ -85,7 +84,7 @@ class Program(Protocol):
         ...
 
     def nudged(self, size: float, count: int, seed: int) -> list[Any]:
-        """Return programs with random displacements of the start, at most about `size`, at least an ulp."""
+        """Return programs with random displacements of the start, which are at most about `size`."""
         ...
 
     def decision(self, other: Any, flips: Sequence[Any], separation: float) -> Decision:
@@ -98,7 +97,7 @@ class Program(Protocol):
         ...
 
     def number(self, key: str) -> Number:
-        """Return a numerical parameter of the system, which can be varied, by its key.
+        """Return the numerical parameter of the system that belongs to a key.
 
         Raises:
             InputError: no parameter or several parameters match; the message lists the known parameters.
@@ -110,13 +109,13 @@ class Program(Protocol):
         ...
 
     def differing(self, other: Any, steps: int, step: int, key: str) -> Differing:
-        """Return the decision that differs at a step from a program with an adjacent parameter value."""
+        """Return the decision that differs at a step between this and another program."""
         ...
 
 
 @dataclass(frozen=True)
 class Twin:
-    """Two simulations (programs) that differ in one numerical setting."""
+    """Two simulations that differ in one numerical setting."""
 
     # a, b: the programs
     a: Any
@@ -163,7 +162,7 @@ class PairRows:
         return len(self.cross)
 
     def until(self, last: int) -> PairRows:
-        """Return the rows up to a time step, and the events in these rows."""
+        """Return the part of the record up to a time step."""
         rows = last - self.first + 1
         if rows >= self.rows:
             return self

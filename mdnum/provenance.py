@@ -1,4 +1,4 @@
-"""Record of software and machine of a run, which can explain why two runs of the same input differ.
+"""Record of the software and the machine of a run, which helps to explain differences between runs.
 
 Two runs of the same system file and structure should agree bit for bit if their fingerprints agree. The
 fingerprint includes everything on which code generation and arithmetic depend: versions, instruction set of
@@ -26,7 +26,7 @@ _RECORDED: dict[str, list[str]] = beside(__file__)  # names of what is recorded
 
 
 class _System(Protocol):
-    """Protocol with the required attributes of a system, because systems are defined in a higher layer."""
+    """Protocol with the attributes of a system that this module needs."""
 
     @property
     def name(self) -> str: ...
@@ -37,7 +37,7 @@ class _System(Protocol):
 
 
 def collect(system: _System) -> dict[str, Any]:
-    """Return everything outside the system file on which a run depends, and hashes of its input.
+    """Return everything outside the system file on which a run depends, and hashes of the input.
 
     Returns:
         a mapping of plain values, ready for JSON.
@@ -93,7 +93,7 @@ def surroundings() -> dict[str, Any]:
 
 
 def fingerprint(parts: Mapping[str, Any]) -> str:
-    """Return a short hash of values that determine the arithmetic; equal values give equal hashes.
+    """Return a short hash of the values that determine the arithmetic.
 
     Args:
         parts: plain values; the order of keys does not matter.
@@ -146,10 +146,10 @@ def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
 def hashes(system: _System) -> dict[str, str | None]:
     """Return SHA-256 digests of the system file, of the settings that it defines, and of the structure.
 
-    The settings are all parameters except the structure, with defaults and overrides. A change of any value
-    changes their hash; a change of the system's name does not. The structure is hashed as numbers (species,
-    masses, positions, velocities, cell, periodicity), so the same atoms in another file format have the same
-    hash.
+    The settings are all parameters except the structure, with defaults and overrides. Any change of a value
+    changes the hash of the settings; a change of the system's name does not. The structure is hashed as
+    numbers (species, masses, positions, velocities, cell, periodicity), so the same atoms in another file
+    format have the same hash.
 
     Returns:
         file (None for a system that did not come from a file), program, and structure (None without atoms).

@@ -1,4 +1,4 @@
-"""Ranges of numbers, and floating-point formats that are too narrow for these ranges (without jax)."""
+"""Ranges of numbers, and detection of floating-point formats that are too narrow for these ranges."""
 
 from __future__ import annotations
 

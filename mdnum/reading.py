@@ -1,4 +1,4 @@
-"""Reading of files by other packages, with one-line error messages.
+"""Reading of files with ASE and MDAnalysis, with one-line error messages.
 
 The readers of ASE and MDAnalysis can raise any Python exception, with a message of many lines or without a
 message. `reading` converts each exception to one line with the file and the frame.
@@ -172,7 +172,7 @@ def whole_text(file: str | Path | BinaryIO, where: str | Path) -> str:
     """Return the whole text of a UTF-8 file; raise an error if the file is too large for memory.
 
     Raises:
-        InputError: the file is too large. OSError, UnicodeDecodeError: as from `open` and `read`.
+        InputError: the file is too large. OSError, UnicodeDecodeError: the file cannot be read.
     """
     if isinstance(file, str | Path):
         with open(file, "rb") as opened:

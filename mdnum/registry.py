@@ -1,12 +1,12 @@
 """Registries of named objects (cutoffs, integrators, methods) from mdnum and from other packages.
 
 A registry maps a name to a *value*: an object, or a class or function that creates an object. Another package
-adds a value by an entry point of the registry's group, such as
+adds a value to a registry by an entry point of the registry's group, such as
 
     [project.entry-points."mdnum.cutoffs"]
     "smooth-cubic" = "my_package.cutoffs:SmoothCubic"
 
-The other package is imported only when the name is used or described.
+A package that adds a name is imported only when this name is used or described.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class Registry(Generic[T]):
         return name in self._own or name in self._added()
 
     def place(self, name: str) -> str:
-        """Return the module registered under a name, in a registry of modules, without importing it.
+        """Return the name of the module that is registered under a name, without importing the module.
 
         Raises:
             InputError: there is no such name.
@@ -167,10 +167,10 @@ class Registry(Generic[T]):
         return loaded
 
     def parse(self, text: str) -> T:
-        """Return the value to which a text refers; the text is a name or "name=argument".
+        """Return the value for a text of the form "name" or "name=argument".
 
         A class or function is called with the text of the argument, if any (or the `parse` method of the
-        class, if it exists). Any other value is returned unchanged and cannot have an argument.
+        class, if it exists). Any other value is returned unchanged, and cannot have an argument.
 
         Raises:
             InputError: the name is unknown, or an argument is unexpected or missing.

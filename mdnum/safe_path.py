@@ -29,7 +29,7 @@ def python(*words: str) -> list[str]:
 
 
 def environment(**changes: str) -> dict[str, str]:
-    """Return environment variables for a child process, so that it imports mdnum from the same location."""
+    """Return environment variables with which a child process imports mdnum from the same location."""
     home = Path(__file__).resolve().parents[1]
     if home.name in ("site-packages", "dist-packages"):
         return {**os.environ, **changes}
@@ -69,7 +69,7 @@ def executed(file: Path, name: str) -> ModuleType:
     """Run a Python file, and return the resulting module with a given name.
 
     Raises:
-        BaseException: the code in the file raises an exception.
+        BaseException: the code in the file raises this exception.
     """
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None and spec.loader is not None  # of every file that ends in .py

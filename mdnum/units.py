@@ -57,9 +57,9 @@ FORCE = f"{ENERGY}/{LENGTH}"
 
 
 def named(quantity: str, units: Mapping[str, Any]) -> str:
-    """Replace quantities in a unit by the unit names of a unit system; empty if a name is missing.
+    """Replace quantities ("energy/length") by names of units ("eV/Å"); return "" if a name is missing.
 
-    An explicit unit ("kcal/mol") is unchanged.
+    A text without names of quantities, such as "kcal/mol", is returned unchanged.
 
     >>> named("energy/length", {"energy": "eV", "length": "Å"})
     'eV/Å'
@@ -70,7 +70,7 @@ def named(quantity: str, units: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Measured:
-    """A measured number with unit, noise floor (largest value that noise explains) and reference value."""
+    """A measured number with its unit, its noise level, and a reference value for comparison."""
 
     value: float
     unit: str = ""  # of names ("eV/Å") or, until it is written, of quantities ("energy/length")
@@ -79,18 +79,18 @@ class Measured:
 
     @property
     def found(self) -> bool:
-        """True if the magnitude exceeds the noise floor, or if the number is NaN."""
+        """True if the magnitude of the number exceeds the noise level, or if the number is NaN."""
         return self.floor is None or not abs(self.value) <= self.floor
 
     @property
     def digits(self) -> str:
-        """The number as text with the digits that the noise floor justifies (all digits without a floor)."""
+        """The number as text, rounded to the digits that are significant at its noise level."""
         if self.floor is None or self.floor < 1e-12:
             return repr(float(self.value))
         return f"{self.value:.{min(max(math.ceil(-math.log10(self.floor)), 1), 15)}f}"
 
     def to(self, prefix: str, units: Mapping[str, Any] = MappingProxyType({})) -> Measured:
-        """Convert the number to a unit with a prefix ("m" for meV), with the unit names of a unit system."""
+        """Convert the number to a unit with a prefix ("m" for milli), with the names of a unit system."""
         unit = named(self.unit, units) or self.unit
         size = {"": 1.0, "m": 1e3}[prefix]
         scaled = {name: size * part for name, part in vars(self).items() if isinstance(part, float)}

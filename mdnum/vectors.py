@@ -115,7 +115,7 @@ def moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any
 
 @intrinsic
 def kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: Any, at: Any) -> Any:
-    """Write the labels that a mask selects from eight labels; return the next free position."""
+    """Write those of eight labels that a mask selects to an array; return the next free position."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits, to = (_Vectors(context, builder, one.dtype, EIGHT) for one in (mask, labels))

@@ -1,7 +1,7 @@
 """The bouncing ball, a system with a known exact solution, for tests of events, stopping rules and precision.
 
-The names below are imported on first use, because most modules import jax, which is not needed to validate a
-system file.
+Names of this package are imported on first use, because most modules import jax, which is not needed to
+validate a system file.
 """
 
 # ruff: noqa: F401

@@ -6,12 +6,13 @@ has speed e^(n-1) s, and the time between impacts n and n + 1 is 2 e^n s / g. Th
 
     t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e),
 
-so infinitely many impacts take place in a finite time (Zeno). With a spring and a damper, y'' = -g - k y - c
-y' below the floor, and each contact is a damped cosine. Penalty contacts discretize this equation. A ball
-with a coefficient of restitution moves differently, even in the limit of stiff springs, unless e = 1.
+so infinitely many impacts take place before the finite time t_rest (Zeno behavior). With a spring and a
+damper, y'' = -g - k y - c y' below the floor, and each contact is a damped cosine. Penalty contacts are time
+discretizations of this differential equation. A ball with a coefficient of restitution moves differently,
+even in the limit of stiff springs, unless e = 1.
 
-All computations use numpy in float64. They share no code with the simulations of this package, because they
-are the reference for these simulations.
+All computations use numpy in float64. The exact solution shares no code with the simulations of this package,
+because it is their reference.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ class _Motion:
         return self.state(t)[0]
 
     def velocity(self, t: Times) -> Known:
-        """Return the velocity (m/s) at time t (s); at the time of an impact, the velocity after it."""
+        """Return the velocity (m/s) at time t (s); at the time of an impact, the value after the impact."""
         return self.state(t)[1]
 
 
@@ -143,7 +144,7 @@ class ExactImpact(_Motion):
         return self._known(lambda p: (_powers(p["restitution"], power)[0] * _down(p)[1],))[0]
 
     def impact_time(self, n: Counts) -> Known:
-        """Return the time of impact n, s."""
+        """Return the time (s) of impact n."""
         n = _numbers(n)
         return self._known(lambda p: _impact(p, n))[0]
 
@@ -214,8 +215,8 @@ class ExactPenalty(_Motion):
 
     The equation y'' = -g - k y - c y' holds as long as the ball is below the floor, so the damper may pull at
     the end of a contact. Without damping, the end time of a contact has a closed form. With damping, the end
-    time is the root of an equation between the lowest point and the next maximum of the height. If this
-    maximum is below the floor, the ball comes to rest at depth g / k.
+    time is the root of an equation between the lowest point and the next maximum of the height. A ball whose
+    next maximum is below the floor comes to rest at depth g / k.
 
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.

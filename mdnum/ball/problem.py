@@ -87,7 +87,7 @@ class BallProblem:
     loss: BallLoss = field(default_factory=FinalHeight)  # of the rollout
 
     def with_values(self, values: Mapping[str, Any]) -> BallProblem:
-        """Return the problem with other parameter values, including initial heights and velocities."""
+        """Return the problem with other values of parameters, initial heights or initial velocities."""
         start = {name: values[name] for name in START if name in values}
         rest = {name: value for name, value in values.items() if name not in START}
         return replace(self, world=self.world.with_values(rest), **start)
@@ -128,7 +128,7 @@ class BallProblem:
     def value_and_grad(
         self, names: Sequence[str], imposed: BallDecisions | None = None, scale: float = 1.0
     ) -> tuple[float, dict[str, float]]:
-        """Compute the loss and its derivatives with respect to named parameters, through all iterations.
+        """Compute the loss and its derivatives with respect to parameters, through all solver iterations.
 
         Args:
             names: names of parameters; y0 and v0 are common displacements of all balls.
@@ -149,7 +149,7 @@ class BallProblem:
 
     @property
     def bare(self) -> tuple[int, BallLoss]:
-        """The number of steps and the loss, without the bouncing-ball model."""
+        """The number of time steps and the loss of the problem."""
         return self.steps, self.loss
 
     @property
@@ -189,7 +189,7 @@ def loss_of(
 
 
 def loss_at(bare, world, y0, v0, values, imposed):
-    """Compute the loss for given parameter values; all inputs are arguments, so that XLA keeps fences.
+    """Compute the loss for given parameter values, which are arguments so that XLA cannot fold them.
 
     Args:
         bare: number of steps, and loss.
@@ -216,7 +216,7 @@ def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
     """Compute final heights and their derivatives with respect to one parameter, by forward mode.
 
-    The function is compiled once for all time steps and numbers of steps.
+    The function is compiled only once, because the time step and the number of steps are arguments.
     """
     return _arrive(world, y0, jnp.asarray(steps), name)
 

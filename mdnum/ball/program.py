@@ -1,4 +1,4 @@
-"""The bouncing ball as a `Program` for comparisons of runs; runs are short and compared as a whole."""
+"""Bouncing-ball simulation with the interface `Program`, by which two runs are compared."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ImposedDecision:
 
 @dataclass(frozen=True)
 class BallProgram:
-    """Model, initial state and steps of a bouncing-ball run, with methods to compare it with another run."""
+    """A bouncing-ball run (model, initial state and steps), and methods to compare two runs."""
 
     problem: BallProblem  # the program
     # its balls are those of the other program in this order; None where they are the same
@@ -74,7 +74,7 @@ class BallProgram:
 
     @property
     def streams(self) -> bool:
-        """Always False, because a run is compared at exactly the requested steps."""
+        """Always False, because a run has exactly the requested number of steps."""
         return False
 
     @property
@@ -101,7 +101,7 @@ class BallProgram:
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
-        """Run the simulation; the result has the balls in the order of the program with which it is compared.
+        """Run the simulation; the result has the balls in the order of the other run of a comparison.
 
         Args:
             decisions: decisions imposed on the balls in that order; None for the program's own decisions and
@@ -125,7 +125,7 @@ class BallProgram:
         return run
 
     def _pinned(self, steps: int) -> BallDecisions | None:
-        """Return the pinned decisions as arrays, with -1 for other decisions; None if nothing is pinned."""
+        """Return the decisions to impose as arrays, with -1 for other decisions; None if there are none."""
         if not self.pins:
             return None
         world = self.problem.world
@@ -199,7 +199,7 @@ class BallProgram:
         return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
 
     def decision(self, other: BallProgram, flips: Sequence[CrossDecision], separation: float) -> Decision:
-        """Return the decision that differs first at a fork: contacts before stops, lowest ball first."""
+        """Return the first decision that differs between two runs: contacts first, then lowest ball index."""
         first = flips[0]
         return Decision(
             channel=first.channel,
@@ -246,7 +246,7 @@ class BallProgram:
         )
 
     def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
-        """Return the decisions of a run (see `Program.history`), with the loss of the problem."""
+        """Return all decisions of a run and the loss of the problem (see `Program.history`)."""
         problem = replace(self.problem, steps=steps)
         run = problem.run(keep=False)
         contact, counts = run.contact, run.iterations.reshape(steps, -1)
@@ -261,7 +261,7 @@ class BallProgram:
         return DecisionHistory(every, digest, x, value, float("nan"), "", first=1)
 
     def differing(self, other: BallProgram, steps: int, step: int, key: str) -> Differing:
-        """Return the first decision at a step that differs from another program, and both loss gradients."""
+        """Return the first decision that differs between two runs at a step, and both loss gradients."""
         problems = [replace(one.problem, steps=steps) for one in (self, other)]
         runs = [problem.run(history=True) for problem in problems]
         flips = [flip for flip in cross_decisions(runs[0], runs[1], step) if flip.step == step]
@@ -290,7 +290,7 @@ def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float
 
 
 def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
-    """Return a run with its balls in the order of the program with which it is compared."""
+    """Return a run with its balls in the order of the balls in the other run of a comparison."""
     place = np.argsort(order)
     columns = ("y", "v", "height", "contact", "iterations", "reason", "residual", "margin", "before")
     arrays = {name: getattr(run, name) for name in columns}
@@ -319,7 +319,7 @@ def _apart(one: BallRun, other: BallRun, last: int) -> Float[np.ndarray, "times"
 
 
 def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
-    """Return the last step at which both runs are finite, and how each run ends."""
+    """Return the last step at which heights and velocities are finite in both runs, and how each run ends."""
     ends = {}
     for name, run in (("A", a), ("B", b)):
         finite = np.isfinite(run.y.astype(np.float64)) & np.isfinite(run.v.astype(np.float64))
@@ -333,7 +333,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
 
 
 def _guarded(separation: np.ndarray, furthest: np.ndarray, guard: float | None) -> np.ndarray:
-    """Set separations to NaN after the step at which a contact is imposed too far from the floor."""
+    """Set separations to NaN after the first step at which a contact is imposed too far from the floor."""
     beyond = furthest > (np.inf if guard is None else guard)
     if beyond.any():
         separation[int(beyond.argmax()) + 1 :] = np.nan

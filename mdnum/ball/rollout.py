@@ -28,7 +28,7 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """Record of a finished run. In arrays with one row per step, row s is the step from state s to s + 1.
+    """Record of a finished run. In arrays with a row per step, row s is the step from state s to state s + 1.
 
     Attributes:
         world: the bouncing-ball model that was simulated.
@@ -177,7 +177,7 @@ _COUNTS: dict[tuple[Any, int], tuple[int, ...]] = {}
 
 
 def undecided(world: World, start: BallState, steps: int) -> BallDecisions:
-    """Return arrays of decisions with -1 everywhere, so that no decision is imposed; first axis: steps."""
+    """Return arrays of decisions in which every value is -1, so that no decision is imposed."""
     kind = jax.tree.structure(world), len(start.y)
     if kind not in _COUNTS:
         solve = eqx.filter_eval_shape(lambda world, start: world.advance(start)[1].solve, world, start)
@@ -200,7 +200,7 @@ def _chunk(world: World, state: BallState, imposed: Any, length: int, history: b
 
 
 def _flips(world: World, made: int, before, y, v, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Find all contact flips in a chunk of steps, given the state and contacts before the chunk."""
+    """Find all changes of contact decisions in a group of steps, given the state before the group."""
     contact = rows["contact"]
 
     def packed(bits: np.ndarray) -> np.ndarray:
@@ -278,13 +278,13 @@ class CrossDecision(NamedTuple):
 
     @property
     def run(self) -> str:
-        """Run with the decision "yes": its ball touches the floor, or its solver stops first."""
+        """Name of the run in which the ball touches the floor, or in which the solver stops first."""
         return "A" if (self.a > self.b) == (self.channel == "contact") else "B"
 
 
 @dataclass(frozen=True)
 class BallDifference:
-    """Differences between two runs of the same length: first steps, numbers of decisions, and separation."""
+    """Differences between two runs: first differing steps, numbers of differing decisions, and separation."""
 
     seed: int | None  # first step whose state bits differ (0: the start itself); None where none do
     fork: int | None  # first step whose decisions differ; None where none do
@@ -374,7 +374,7 @@ def _stops(a: BallRun, b: BallRun, rows: int) -> list[CrossDecision]:
 
 
 def _solving(run: BallRun, rows: int) -> np.ndarray:
-    """Return whether iterations of a step can move a ball; a projection moves only balls in contact."""
+    """Return, for each step and ball, whether solver iterations can move the ball."""
     if isinstance(run.world.contact, Projection):
         return run.contact[:rows]
     return np.ones((rows, run.balls), bool)
@@ -420,7 +420,7 @@ def overridden(
 
 
 def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
-    """Return where iteration counts differ, shape (rows, 1) for a shared rule, else (rows, balls)."""
+    """Return a mask of steps (and balls, if separate) at which two runs have different iteration counts."""
     counts = [run.iterations.reshape(run.steps, -1)[:rows] for run in (a, b)]
     differ = counts[0] != counts[1]
     if _counted(a) != _counted(b):
@@ -432,7 +432,7 @@ def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
 
 
 def _counted(run: BallRun) -> str:
-    """Return the name of the quantity that the iteration counts of a run represent."""
+    """Return the meaning of a run's iteration counts, such as "impacts"."""
     contact, scheme = run.world.contact, run.world.integrator
     if isinstance(scheme, EventLocated):
         return "impacts"

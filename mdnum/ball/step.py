@@ -36,7 +36,7 @@ class BallState(NamedTuple):
 
 
 class BallDecisions(NamedTuple):
-    """All decisions of a time step; decisions can also be imposed on a step in this form."""
+    """All decisions of a time step; the same format is used to impose decisions on a step."""
 
     # whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1, and a negative
     # number where the step is to decide by itself
@@ -68,7 +68,7 @@ class Rounding(eqx.Module):
     zero: Int[Array, ""]  # an integer zero that the compiler must not know (see mdnum.numerics.exact)
 
     def __call__(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return x, and force the compiler to round x to its dtype at this point."""
+        """Return x; the compiler is forced to round x to its dtype before x is used."""
         return fence(x, self.zero)
 
 
@@ -281,8 +281,8 @@ class _Forceless(eqx.Module):
 class Penalty(eqx.Module):
     """Force k p - damping v on a ball in contact, with p = -y; a smooth contact has a softplus p.
 
-    If contact is imposed, the force is -k y for either sign of y: like an imposed pair force beyond its
-    cutoff, the contact force continues smoothly beyond its threshold.
+    If contact is imposed, the force is -k y for either sign of y, so that the contact force continues
+    smoothly above the floor, like an imposed pair force beyond its cutoff.
 
     Source: soft contact of the discrete element method (Cundall and Strack 1979).
     """
@@ -373,8 +373,8 @@ class Impact(_Forceless):
     """Instantaneous impact: v ← -restitution v at the floor.
 
     With `EventLocated`, the impact takes place at its exact time, and the flight continues for the rest of
-    the step. With any other scheme, a ball below the floor is put on the floor, and its velocity is reset, at
-    the end of the step. This causes an error of order h in the state and of order 1 in the derivative.
+    the step. With any other scheme, a ball below the floor is put on the floor at the end of the step, and
+    its velocity is reset. The resulting error is of order h in the state and of order 1 in the derivative.
     """
 
     restitution: Any = 0.8  # speed after over speed before
@@ -465,7 +465,7 @@ def lowest(y, v, a, time, r):
 def time_of_impact(y, v, a, r):
     """Return the first time (s) at which the parabola meets the floor; infinite if there is no such time.
 
-    The relative error is a few units of roundoff, because the formula for the root avoids cancellation.
+    The relative error is a few units of roundoff, because the formula avoids cancellation.
     """
     inside = r(r(v * v) - r(r(2.0 * a) * y))
     # the argument is masked as well, so that no derivative is taken where there is no root

@@ -1,7 +1,7 @@
 """Iterative solvers: the loop, the rules that stop the loop, and derivatives of the loop.
 
-A stopping rule computes, from the residual of each ball, the quantity that is compared with a threshold. The
-sum over all balls couples independent balls, and its last bits depend on the order of summation; a separate
+A stopping rule computes, from the residual of each ball, the quantity that is compared with a threshold. A
+sum over all balls couples independent balls, and its last bits depend on the order of summation. A separate
 rule for each ball avoids both problems.
 """
 
@@ -75,7 +75,7 @@ class StopRule(Protocol):
 
 
 def stops(threshold: Float[Array, "..."], residual: Float[Array, "..."]) -> Bool[Array, "..."]:
-    """Return whether the solver stops: True if residual < threshold."""
+    """Return True if the solver stops, which requires residual < threshold."""
     return Threshold(threshold, "<", "residual").decide(residual)
 
 
@@ -131,7 +131,7 @@ class HysteresisStop(eqx.Module):
 
     @property
     def max_iter(self) -> int:
-        """Largest number of iterations of the inner rule `rule`."""
+        """Largest number of iterations of the inner stopping rule."""
         return self.rule.max_iter
 
     def measure(self, terms, accumulate, decision, zero):
@@ -246,12 +246,13 @@ def no_solve(dtype: Any) -> Solve:
 
 
 def elementwise(function: Map) -> Map:
-    """Make an elementwise function that contains a while_loop differentiable in forward and reverse mode.
+    """Return a version of a function with a `while_loop` that is differentiable in forward and reverse mode.
 
     JAX has no reverse mode for a `while_loop`, because the required memory is not known in advance. However,
-    a function that treats each ball separately has a diagonal Jacobian. A few tangents that are propagated in
-    the same loop give all entries, and no iteration is stored. The result is the derivative of the actual
-    iterations, with every decision fixed. The record and the inputs in `rest` have no derivative.
+    a function that treats each ball separately has a diagonal Jacobian. All entries of this Jacobian follow
+    from a few tangents that are propagated in the loop, and no iteration is stored. The result is the
+    derivative of the actual iterations, with every decision fixed. The record and the inputs in `rest` have
+    no derivative.
 
     Args:
         function: a function whose outputs for ball b depend only on the inputs for ball b (and on `rest`).

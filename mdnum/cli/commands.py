@@ -1,4 +1,4 @@
-"""Command-line commands, created from the text files of the commands (format: `mdnum/verbs/__init__.toml`).
+"""Command-line commands, created from text files in the format of `mdnum/verbs/__init__.toml`.
 
 The modules of a command are imported only when this command is called.
 """
@@ -215,7 +215,7 @@ def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> in
     stopped = False
 
     def again() -> str | None:
-        """Return a sentence that tells the user how to continue, for example by --resume."""
+        """Return a sentence that tells the user how to continue a stopped command."""
         folder = given.get("resume") or progress.folder or given.get("out")
         with suppress(MdnumError):
             if "resume" in typed and folder is not None:
@@ -266,7 +266,7 @@ def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any
 
 
 def _refuse_new(said: Mapping[str, Any], given: Mapping[str, Any]) -> None:
-    """Raise an error for options that cannot be used with --resume, because the folder has their values."""
+    """Raise an error for options that cannot be combined with --resume."""
     from mdnum.verbs.frame import refuse
 
     labels = {name: one["metavar"].strip("[]") for name, one in said["arguments"].items() if "new" in one}

@@ -84,7 +84,7 @@ def print_reply(reply: Reply, as_json: bool) -> int:
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Print a line of text, with control characters escaped."""
+    """Print a line of text in which control characters are escaped."""
     # typer's own echo writes UTF-8 to a stream that is ascii
     print(printable(text), file=sys.stderr if err else sys.stdout, flush=True)
 

@@ -1,11 +1,11 @@
-"""Elementary functions made of IEEE 754 operations, with the same bits wherever none are fused.
+"""Elementary functions made of IEEE 754 operations, with the same bits unless operations are fused.
 
 Elementary functions differ between libraries, and between the instruction sets for which a compiler generates
-code. The functions here have no branch, no table and no fused multiply-add. They consist only of sums,
-products, quotients, roots, comparisons, selections and bit operations. jax traces these functions, and every
-interpreter that runs the trace operation by operation (such as the compiled loop) obtains the same number.
+code. The functions here have no branch, no table and no fused multiply-add. Each function consists of sums,
+products, quotients, roots, comparisons, selections and bit operations. Every interpreter that runs the jax
+trace of a function operation by operation (such as the compiled loop) obtains the same number.
 
-Arguments and results are float64. Subnormal arguments count as 0. Results below 2.2261e-308 are 0, and
+Arguments and results are float64. Subnormal arguments are treated as 0. Results below 2.2261e-308 are 0, and
 results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps, the spacing of the
 floats at the result. The error bound of the exponential was derived by counting roundings. The other bounds
 are at least 1.3 times the largest error measured for 100,000 (error functions) or ten million arguments
@@ -82,7 +82,7 @@ _EXP = (
 
 
 def _reduced(x: Any, low: Any = None) -> tuple[Any, Any]:
-    """Return p and a float whose last bits are the integer n, such that exp(x + low) = (1 + p) 2^n."""
+    """Return p and n such that exp(x + low) = (1 + p) 2^n; the integer n is in the last bits of a float."""
     shifted = x * (1 / math.log(2)) + _ROUND
     n = shifted - _ROUND
     r = (x - n * _LN2[0]) - n * _LN2[1]

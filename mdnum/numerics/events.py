@@ -1,4 +1,4 @@
-"""Events: comparisons of a quantity with a threshold (decisions), and the table of decisions that flip."""
+"""Decisions (comparisons of a quantity with a threshold), and the table of all changes of decisions."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ INCLUSIVE = {"<": False, "<=": True}
 
 @dataclass(frozen=True)
 class Threshold:
-    """A threshold with which a computed quantity is compared, and the comparison operator.
+    """A threshold with which a computed quantity is compared, together with the comparison operator.
 
-    The comparison is part of the physical model: two codes with the same cutoff may use `<` or `<=` and
-    compare r or r². They then differ for pairs exactly at the cutoff.
+    The comparison is part of the physical model. Two codes with the same cutoff that compare by `<` and `<=`,
+    or r and r², differ for pairs exactly at the cutoff.
     """
 
     # the threshold in the quantity's own space, exactly as the program compares it: a number, or an array
@@ -40,7 +40,7 @@ class Threshold:
         return self.value - quantity
 
     def decide(self, quantity):
-        """Return True where the quantity meets the comparison with the threshold; NaN gives False."""
+        """Return the result of comparing a quantity with the threshold; NaN gives False."""
         return quantity <= self.value if INCLUSIVE[self.comparison] else quantity < self.value
 
 
@@ -126,16 +126,16 @@ class Ledger:
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "flips"]:
-        """Whether the step of each flip depends on rounding: |margin| does not exceed the error bound."""
+        """Whether |margin| of each flip is within the error bound, so that the step depends on rounding."""
         return np.abs(self.margin) <= self.bound
 
     def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:
-        """Return, for each step 0..steps, how many decisions changed to yes and how many changed to no."""
+        """Return the number of decisions that changed to yes, and to no, for each step from 0 to `steps`."""
         entered = np.bincount(self.step[self.entered], minlength=steps + 1)
         left = np.bincount(self.step[~self.entered], minlength=steps + 1)
         return entered, left
 
     def jumps(self, steps: int) -> Float[np.ndarray, "steps"]:
-        """Return, for each step 0..steps, the sum of the energy jumps of all flips."""
+        """Return the sum of the energy jumps of all flips, for each step from 0 to `steps`."""
         # bincount of nothing is a row of integers, whatever its weights
         return np.bincount(self.step, weights=self.jump, minlength=steps + 1).astype(np.float64)

@@ -1,10 +1,10 @@
 """Floating-point arithmetic inside jit whose results have the same bits on every processor.
 
 XLA on a CPU contracts a*b + c into a fused multiply-add. Therefore the bits of an expression depend on fusion
-and on the instruction set, and differ from those of numpy. Whether a pair is inside the cutoff must not
-depend on the compiler: fences protect the products, and numpy reproduces the comparison bit for bit. Other
-formulas can be run operation by operation: with every result rounded, in interval arithmetic, or with the
-same bits on every processor.
+and on the instruction set, and differ from those of numpy. The decision whether a pair is inside the cutoff
+must not depend on the compiler. Therefore `fence` prevents the contraction, and numpy reproduces the decision
+bit for bit. Other formulas can be evaluated operation by operation: with every result rounded, in interval
+arithmetic, or with the same bits on every processor.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def integer_of(dtype):
 
 
 def zero_bits(dtype) -> jax.Array:
-    """Return an integer zero with the bits of dtype, for `fence`; pass it into jit as an argument."""
+    """Return an integer zero with as many bits as dtype, which `fence` needs as an argument of jit."""
     return jax.device_put(np.zeros((), integer_of(dtype)))
 
 
@@ -40,10 +40,10 @@ def _through_integers(x, zero):
 
 @jax.custom_jvp
 def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
-    """Return x unchanged, but prevent XLA from fusing the operation that computed x with the next one.
+    """Return x, and prevent XLA from contracting the operation that computes x with the next operation.
 
-    The fence is an exclusive-or of the bits of x with a zero that XLA does not know. It also forces the
-    rounding to float16 and bfloat16, which XLA on a CPU may omit because it computes in float32.
+    The fence is an exclusive-or of the bits of x with a zero that XLA does not know. The fence also forces
+    the rounding to float16 and bfloat16, which XLA on a CPU may omit.
 
     Source: optimization_barrier and reduce_precision do not prevent the contraction on a CPU
     (openxla/xla#41579).
@@ -58,7 +58,7 @@ def _fence_jvp(primals, tangents):
 
 
 def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
-    """Return dx² + dy² + dz², rounded after every operation, so that the result has the bits of numpy's.
+    """Return dx² + dy² + dz² with the same bits as in numpy, because every operation is rounded.
 
     Error: at most gamma_3 r² for exact dx, dy, dz, where gamma_n = n u / (1 - n u) (Higham 2002, 3.1).
     """
@@ -69,8 +69,8 @@ def root(x: jax.Array) -> jax.Array:
     """Return the square root, correctly rounded on every device.
 
     On a GPU, the float32 square root has an error of one ulp for one number in six (XLA, H200). A float64
-    square root that is rounded to float32 is correct, because 53 bits are enough: at least 2 * 24 + 2
-    (Figueroa 1995, "When is double rounding innocuous?").
+    square root that is rounded to float32 is correct, because 53 bits are at least 2 * 24 + 2 bits (Figueroa
+    1995, "When is double rounding innocuous?").
     """
     if x.dtype != jnp.float32 or jax.default_backend() == "cpu":
         return jnp.sqrt(x)
@@ -161,9 +161,9 @@ def rounded(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]
     """Return a version of a function that rounds the result of every 16-bit floating-point operation.
 
     XLA on a CPU computes float16 and bfloat16 expressions in float32, and may omit the rounding between two
-    operations. Here a fence after each operation forces the rounding. For + - * / and sqrt, the results have
-    the same bits as numpy with ml_dtypes; exp and cos are computed in float32 and may differ between
-    libraries. Results of other dtypes do not change.
+    operations. In the returned function, a fence after each operation forces the rounding. For + - * / and
+    sqrt, the results have the same bits as numpy with ml_dtypes; exp and cos are computed in float32 and may
+    differ between libraries. Results of other dtypes do not change.
 
     Args:
         function: function of arrays; it may close over others.
@@ -182,7 +182,7 @@ def _is_short(dtype: Any) -> bool:
 
 
 def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list[Any]]:
-    """Return a float64 function in interval arithmetic: each result is an interval with the exact value.
+    """Return a version of a float64 function in interval arithmetic; each interval contains the exact value.
 
     Constants of the formula are exact float64 numbers. If an interval contains values on both sides of the
     condition of a `where`, the result is the union of the intervals of both branches.
@@ -326,7 +326,7 @@ _SAFE = (
 
 @dataclass
 class _Held:
-    """A number in a jaxpr that is interpreted, with flags that tell whether the number needs a fence."""
+    """A number during interpretation of a jaxpr, with flags that decide whether the number needs a fence."""
 
     value: Any
     safe: bool = True

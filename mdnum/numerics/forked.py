@@ -13,10 +13,10 @@ _forked = False
 
 
 def check_not_forked() -> None:
-    """Raise an error if this process cannot use jax; called before the first use of jax.
+    """Raise an error if this process cannot use jax; call this function before the first use of jax.
 
     Raises:
-        InputError: this process is a fork of one in which jax had been used.
+        InputError: this process is a fork of a process that has used jax.
     """
     if _forked:
         raise InputError(

@@ -30,7 +30,7 @@ class FloatFormat:
 
     @property
     def emin(self) -> int:
-        """Exponent of the smallest normal number."""
+        """Exponent of the smallest normal number of the format."""
         return 2 - 2 ** (self.exponent - 1)
 
     @property
@@ -45,7 +45,7 @@ class FloatFormat:
 
     @property
     def smallest_normal(self) -> float:
-        """The smallest positive number with full precision."""
+        """The smallest positive number of the format with full precision."""
         return 2.0**self.emin
 
     @property
@@ -93,7 +93,7 @@ def _identity_slope_jvp(primals, tangents):
 
 
 def _rounded(x: Float[Array, "..."], name: str, whole: Callable[[Array], Array]) -> Float[Array, "..."]:
-    """Round x to a format; the function `whole` rounds x in units of the local spacing to an integer."""
+    """Round x to a format, where `whole` is the function that rounds x / spacing to an integer."""
     form = format_of(name)
     if form.significand >= 53:
         return x
@@ -112,8 +112,8 @@ def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
     """Round x to the nearest number of a format, ties to even, in the dtype of x.
 
     Subnormal numbers of the format are kept (`lax.reduce_precision` flushes them to zero), and numbers beyond
-    the largest become infinite. A float64 is rounded once, whereas a cast may round twice. The derivative is
-    1.
+    the largest become infinite. A float64 number is rounded once, whereas a cast may round twice. The
+    derivative is 1.
 
     Args:
         x: float64 or narrower.
@@ -127,9 +127,9 @@ def matmul(
 ) -> Float[Array, "... m n"]:
     """Emulate a device's matrix product, with inputs in one format and sums in a wider format.
 
-    With "float64" and "float32", inputs, products and sums are in this format. With "tf32", "bfloat16" and
-    "float16", inputs are rounded to the format, products are exact, and sums are in float32. The result has
-    the dtype of the first matrix.
+    With the formats "float64" and "float32", inputs, products and sums are in the same format. With "tf32",
+    "bfloat16" and "float16", inputs are rounded to the format, products are exact, and sums are in float32.
+    The result has the dtype of the first matrix.
 
     Error: at most (2u + gamma_k) |a| |b| with the unit roundoff u of the format and gamma_k of float32. The
     order of summation is that of the CPU, which differs from the order on a device.
@@ -167,8 +167,8 @@ def quantize(
 ) -> Float[Array, "..."]:
     """Return the multiple of `scale` nearest to x, between `lowest` * `scale` and `highest` * `scale`.
 
-    The derivative is 1 inside this range and 0 outside. Inside, the error is at most scale/2 plus one
-    rounding.
+    The derivative is 1 inside the range and 0 outside. Inside the range, the error is at most scale/2 plus
+    one rounding.
     """
     return jnp.clip(jnp.rint(x / jnp.broadcast_to(scale, x.shape)), lowest, highest) * scale
 

@@ -48,9 +48,9 @@ def held_numbers(closed: Any, least: int = 10) -> int:
 
 
 def single_numbers(closed: Any) -> list[str]:
-    """Return the constants of a jaxpr that were rounded to single precision, as short decimal numbers.
+    """Return the constants of a jaxpr that were rounded to float32, each as a short decimal number.
 
-    A constant that was rounded and widened again has a single-precision value with few decimal digits.
+    A float64 constant that was rounded to float32 can be written with fewer decimal digits.
     """
     numbers: dict[str, None] = {}
     for program in _programs(closed):
@@ -122,7 +122,7 @@ def is_inexact(leaf: Any) -> bool:
 
 @dataclass
 class _Interpreter:
-    """Interpreter that runs a jaxpr one operation at a time, also after a result that is not finite."""
+    """Interpreter that runs a jaxpr one operation at a time, and finds results that are not finite."""
 
     mended: list[int]  # numbers of operations whose results are made finite
     found: Operation | None = None  # the first operation at fault

@@ -126,7 +126,7 @@ class Exact(Reduction):
         return jnp.where(special, jnp.sum(flat, axis=0), total).reshape(shape)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """Return the error bound u |sum|, where |sum| is replaced by an upper bound computed in float64."""
+        """Return the error bound u |sum|, with an upper bound of |sum| that is computed in float64."""
         wide = terms.astype(np.float64)
         total = np.abs(wide.sum(axis=0)) + gamma(len(terms)) * np.abs(wide).sum(axis=0)
         return np.asarray(unit_roundoff(terms.dtype) * total)
@@ -165,7 +165,7 @@ class FixedPoint(Reduction):
 
 
 def _numbered(reduction: Callable[[int], Reduction], default: int) -> Callable[..., Reduction]:
-    """Return a function that creates a summation order from its parameter, a number given as text."""
+    """Return a function that creates a summation order from the text of its numerical parameter."""
 
     def make(number: str | None = None) -> Reduction:
         try:

@@ -86,7 +86,7 @@ class PrecisionPolicy:
 
 @dataclass(frozen=True)
 class RolePrecision:
-    """The dtypes of the numbers in a bouncing-ball simulation, where 16-bit formats are also allowed."""
+    """The dtypes of all numbers in a bouncing-ball simulation; 16-bit formats are also allowed."""
 
     state: str = "float64"  # what is carried from step to step
     arithmetic: str = "float64"  # the operations between one state and the next

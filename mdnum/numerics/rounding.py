@@ -1,8 +1,9 @@
-"""Floats as integers (ulps), and bounds on the rounding error of pair distances.
+"""Differences of floats in ulps, and bounds on the rounding errors of pair distances.
 
 A displacement is x_j - x_i minus at most one lattice vector for each periodic axis, rounded after every
-subtraction. Its squared components are added from x to z. The error of each rounding is proportional to the
-magnitude of the rounded result; `Reach` bounds these magnitudes for all positions in a box.
+subtraction. The squared components of the displacement are added in the order x, y, z. The error of each
+rounding is proportional to the magnitude of the rounded result; `Reach` bounds these magnitudes for all
+positions in a box.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ def _signed(dtype: np.dtype) -> np.dtype:
 def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
     """Return the index of x among all floats of its dtype, as a signed integer; -0 and +0 have index 0.
 
-    Adjacent finite floats have adjacent indices, so differences count ulps. The index of NaN has no meaning.
+    Adjacent finite floats have adjacent indices, so a difference of indices is a number of ulps. The index of
+    NaN has no meaning.
     """
     x = np.asarray(x)
     integer = _signed(x.dtype)
@@ -89,7 +91,7 @@ class Reach:
         return cls(tuple(_three(row) for row in lattice), _three(coordinate))
 
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
-        """Return the summed magnitudes of lattice terms in rounded results, and the number of roundings.
+        """Return the sum of |lattice components| in all rounded results, and the number of roundings.
 
         After the first subtraction, a component is d + n_1 a_1 + n_2 a_2 + n_3 a_3, where d is the final
         displacement and each n is -1, 0 or 1. Each following subtraction removes one term n_k a_k.
@@ -118,10 +120,11 @@ def displacement_bound(
 ):
     """Return a bound on the error (length of the error vector) of a computed displacement.
 
-    Each rounded result contributes at most u times its magnitude. If the state has more digits than dtype,
-    both positions are rounded first. If float64 has more digits than dtype, the box is also rounded. The
-    exact displacement is defined by the positions of the state and the box of the system file. The nearest
-    image in dtype must be the true nearest image: r_cut is below half the box width by more than rounding.
+    Each rounded result contributes at most u times its magnitude. If the dtype of the state has more digits
+    than `dtype`, both positions are rounded first. If float64 has more digits than `dtype`, the box is also
+    rounded. The exact displacement is defined by the positions of the state and the box of the system file.
+    The nearest image in dtype must be the true nearest image: r_cut is below half the box width by more than
+    rounding.
 
     Args:
         r: length(s) of the displacement.
@@ -161,8 +164,8 @@ def squared_distance_bound(
 def distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None):
     """Return a bound on |computed r - exact r|, where r is the correctly rounded square root of r².
 
-    The error of a length is at most the length of the vector's error. The square root halves the relative
-    error of r² and adds one rounding.
+    The error of the length of a vector is at most the length of the error vector. The square root halves the
+    relative error of r² and adds one rounding.
 
     Args: as `displacement_bound`.
 

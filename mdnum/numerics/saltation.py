@@ -1,9 +1,9 @@
 """Saltation: the change of a tangent vector (a perturbation) when the trajectory passes an event.
 
 A perturbed trajectory reaches a threshold at a different time; between both times, only one of the
-trajectories follows the new equation of motion. To first order, this changes the tangent by a rank-one term.
-Derivatives of a discrete time-stepping program do not contain this term, because the steps do not move with
-the event.
+trajectories follows the new equation of motion. To first order, this difference changes the tangent by a
+rank-one term. Derivatives of a discrete time-stepping program lack this term, because the time steps do not
+move with the event.
 
 The functions accept numpy and jax arrays with any number of leading batch axes, also inside jit.
 """
@@ -37,7 +37,7 @@ def time_shift(
     normal: Float[Any, "*batch state"],
     threshold_rate: Any = 0.0,
 ) -> Float[Any, "*batch"]:
-    """Return the change of the event time per unit of the tangent dx: -(n · dx + dc) / (n · F-).
+    """Return the change -(n · dx + dc) / (n · F-) of the event time along the tangent dx.
 
     Args:
         tangent: dx, the perturbation just before the event.
@@ -65,7 +65,7 @@ def carry(
     reset_rate: Any = 0.0,
     threshold_rate: Any = 0.0,
 ) -> Float[Any, "*batch state"]:
-    """Propagate a tangent through an event: DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
+    """Return the tangent after an event, DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
 
     The result is the product of the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-) and dx. The matrix
     is never formed, so the function can be used for many atoms. For a ball with coefficient of restitution e

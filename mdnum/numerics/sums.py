@@ -2,10 +2,10 @@
 
 A summation order is used in two ways. The force loop of molecular dynamics passes blocks of terms, and a
 partial sum is carried from block to block, so that the terms of a whole neighbor list are never stored at
-once. An order that needs all terms stores them and adds at the end. All other callers pass a whole array and
-get the sum over the leading axis, rounded after every addition in the dtype of the terms, with the same bits
-as a numpy loop. `jnp.sum` differs from all orders here: it adds 16-bit terms in float32 and in another order,
-which hides the effect of a 16-bit accumulator.
+once. A summation order that needs all terms stores the terms and adds them at the end. All other callers pass
+a whole array and get the sum over the first axis, which is rounded after every addition and has the same bits
+as a numpy loop in the dtype of the terms. `jnp.sum` differs from all orders here: it adds 16-bit terms in
+float32 and in another order, which hides the effect of a 16-bit accumulator.
 
 The derivative of every sum is that of the exact sum, because rounding and order have no derivative.
 """
@@ -63,7 +63,7 @@ class Reduction:
     """
 
     def within(self, total: jax.Array, terms: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array | None]:
-        """Process one block of terms; return the partial sum, and stored terms (or None) for `finish`."""
+        """Process one block of terms; return the partial sum, and the terms that `finish` adds (or None)."""
         return total, jnp.stack(list(terms))
 
     def finish(self, total: jax.Array, blocks: jax.Array | None) -> jax.Array:
@@ -100,7 +100,7 @@ class Reduction:
         return np.asarray((factor if factor >= 0 else np.inf) * np.abs(terms.astype(np.float64)).sum(axis=0))
 
     def depth(self, n: int) -> int:
-        """Return the largest number of additions to which any of n terms contributes."""
+        """Return the largest number of additions that involve the same term in a sum of n terms."""
         return max(n - 1, 0)
 
 
@@ -118,7 +118,7 @@ def in_order(terms, add, start=None):
 
 
 class Serial(Reduction):
-    """A summation order in which terms are added one after another to one accumulator."""
+    """Base class of summation orders in which terms are added one after another to one accumulator."""
 
     def places(self, terms: np.ndarray) -> list[int]:
         """Return the indices of terms, shape (n,), in the order of the additions."""
@@ -133,7 +133,7 @@ class Sequential(Serial):
     order: Literal["forward", "reversed"] = "forward"
 
     def within(self, total, terms):
-        """Add the terms to the partial sum if the order is forward; store them if it is reversed."""
+        """Add the terms to the partial sum if the order is forward; return them if the order is reversed."""
         if self.order == "reversed":
             return super().within(total, terms)
         for term in terms:
@@ -227,20 +227,20 @@ class Permuted(Serial):
     seed: int = 0  # of the order; the same for every sum of as many terms
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Add the terms in the random order that belongs to this number of terms."""
+        """Add the terms in a random order, which depends only on the seed and the number of terms."""
         return in_order(terms[np.array(self.places(terms))], add)
 
     def places(self, terms: Any) -> list[int]:
-        """Return the random order that belongs to this number of terms."""
+        """Return a random order of the terms, which depends only on the seed and the number of terms."""
         return np.random.default_rng(self.seed).permutation(len(terms)).tolist()
 
 
 @dataclass(frozen=True)
 class Halves(Reduction):
-    """A sequential sum of the first half of the terms plus a sequential sum of the second half.
+    """The sum of the first half of the terms plus the sum of the second half, each added sequentially.
 
-    This order results from two scatter operations, one for each atom of a pair, if each pair is stored once.
-    Error: at most gamma_{n/2} * sum |terms|.
+    A sum over pairs has this order if each pair is stored once, with one scatter operation for each of its
+    atoms. Error: at most gamma_{n/2} * sum |terms|.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -257,10 +257,10 @@ class Halves(Reduction):
 
 @dataclass(frozen=True)
 class Twice(Reduction):
-    """A sequential sum in which each term is halved and added twice: all terms once, then all terms again.
+    """A sequential sum of all halved terms, followed by the same halved terms again.
 
-    This order results from scatter operations over a neighbor list that stores each pair for both atoms.
-    Error: at most gamma_{2n} * sum |terms|, if no halved term is subnormal.
+    A sum over a neighbor list that stores each pair for both atoms has this order. Error: at most gamma_{2n}
+    * sum |terms|, if no halved term is subnormal.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -269,7 +269,7 @@ class Twice(Reduction):
         return in_order(halves, add, in_order(halves, add))
 
     def depth(self, n: int) -> int:
-        """Return the number of additions to which a term contributes in both passes."""
+        """Return the largest number of additions that involve the same term in both passes."""
         return max(2 * n - 1, 0)
 
 
@@ -284,7 +284,7 @@ class Sorted(Serial):
     order: Literal["ascending", "descending"] = "ascending"  # of magnitudes, "ascending" or "descending"
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Sort each column of terms along the first axis, and add its terms in this order."""
+        """Sort the terms along the first axis, and add the terms in this order."""
         _, terms = lax.sort((jnp.abs(terms), terms), dimension=0, num_keys=2)
         return in_order(terms if self.order == "ascending" else terms[::-1], add)
 
@@ -365,7 +365,7 @@ class Neumaier(_Compensated):
 
 @dataclass(frozen=True)
 class Addition:
-    """One addition in the record of a sum."""
+    """A single addition in the record of a sum."""
 
     term: str  # index of the term that was added
     addend: float  # what was added to the accumulator

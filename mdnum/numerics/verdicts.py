@@ -1,13 +1,13 @@
-"""Divergence of two runs that differ in one setting: its start, its rate, and whether flips caused it.
+"""Divergence of two runs that differ in one setting: start, growth rate, and whether flips are the cause.
 
 A flip is a cutoff decision that differs between the runs. The verdict compares the second run with a
 counterfactual run, which has the arithmetic of the second run but the cutoff decisions of the first run. If
-the counterfactual run stays close to the first run, the flips caused the split. If it also splits, repeats of
-the pair of runs decide whether the flips accelerated the split or are bystanders. Repeats are evaluated by a
-sequential sign test: if at most half of all pairs are delayed, the probability that k or more of n pairs are
-delayed is at most that of k or more heads in n coin tosses, for any distribution of the delays. All these
-pairs start with the same displacement. If the majority differs at another displacement, the verdict is left
-open. docs/verdict-calibration.md has the error rates.
+the counterfactual run stays close to the first run, the flips caused the split. If the counterfactual run
+also splits from the first run, repeats of the pair of runs decide whether the flips accelerated the split or
+are bystanders. Repeats are evaluated by a sequential sign test. If a pair is delayed with probability at most
+1/2, the probability of k or more delays in n pairs is at most that of k or more heads in n coin tosses, for
+any distribution of the delays. All repeats have the same initial displacement. If the majority differs at
+another displacement, the verdict is left open. Error rates are given in docs/verdict-calibration.md.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _ALIKE = 4
 
 @dataclass(frozen=True)
 class Delay:
-    """The steps at which a pair of runs splits, without and with the first run's decisions imposed."""
+    """The steps at which two runs split: free, and with the first run's decisions imposed on the second."""
 
     # free, imposed: steps of the two splits; None for one that was not seen
     free: int | None
@@ -61,11 +61,11 @@ class Delay:
 
 @cache
 def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
-    """Return the stages of the sequential sign test: number of pairs, and number that must agree, at each.
+    """Return, for each stage of the sequential sign test, the number of pairs and how many must agree.
 
     The error probability is spent in proportion to the number of pairs (Lan and DeMets, Biometrika 70, 659,
-    1983): the exact probability that fair coin tosses stop the test with a given result by some stage is at
-    most the error times the fraction of pairs used by this stage.
+    1983). For fair coin tosses, the probability that the test has stopped with a given result by some stage
+    is at most the error probability times the fraction of pairs used.
 
     Args:
         pairs: largest number of pairs of runs.
@@ -108,7 +108,7 @@ class Count:
 
     @property
     def needed(self) -> tuple[int, int] | None:
-        """The current or next stage of the sign test (pairs, pairs that must agree); None after the last."""
+        """Current or next stage of the sign test: number of pairs, and how many must agree, or None."""
         return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
 
     @property
@@ -121,14 +121,14 @@ class Count:
 
     @property
     def majority(self) -> bool | None:
-        """Whether all pairs of a first small group, or more than half of all pairs, are delayed, or None."""
+        """Whether the majority of pairs is delayed; None if too few pairs were run to decide this."""
         if self.later > self.most / 2 or self.later == self.pairs >= _ALIKE:
             return True
         return False if self.not_later > self.most / 2 or self.not_later == self.pairs >= _ALIKE else None
 
     @property
     def wanted_for_majority(self) -> int:
-        """Number of further pairs that decide the majority if all agree; 0 if no pair is needed or left."""
+        """Number of further pairs that would decide the majority if all agreed; 0 if none can be run."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -185,7 +185,7 @@ _HALF = 3.0
 
 @dataclass(frozen=True)
 class Dates:
-    """The steps at which the bits, decisions and positions of two runs first differ; None if they do not."""
+    """The first steps at which bits and decisions of two runs differ, and at which the runs split."""
 
     first_bit: int | None  # first step whose state bits differ
     fork: int | None  # first step whose decisions differ
@@ -215,10 +215,10 @@ class Growth:
 
 
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
-    """Return the mean slope of a logarithm, its standard error, and whether it exceeds that of linear growth.
+    """Return the mean slope of a logarithm, its standard error, and whether growth is faster than linear.
 
-    Slope and error, per row, are estimated from blocks of the later rows. The result is NaN, NaN, False if
-    there are too few rows or if the rows are not finite.
+    Slope and standard error, per row, are estimated from blocks of the later rows. The result is NaN, NaN,
+    False if there are too few rows or if the rows are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
@@ -251,7 +251,7 @@ def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
     """Fit the exponential growth rate of the separation of two runs before saturation.
 
     The fit uses steps before the split with a separation between 1e-12 and 0.1 times the tolerance, after the
-    last step below this range. A slope through noise has a low r_squared.
+    last step below this range. A low r_squared indicates a fit to noise.
 
     Args:
         separation: of each step, length; NaN after a run ended.
@@ -336,7 +336,7 @@ class ForkVerdict:
 
     @property
     def wanted(self) -> int:
-        """Number of repeats to run next, at the other displacement if `other` is set; 0 if the test ended."""
+        """Number of repeats to run before the next stage of the test; 0 if no further repeats are needed."""
         if self.other is not None:
             return self.other.wanted_for_majority
         return self.count.wanted if self.count is not None else 0
@@ -513,7 +513,7 @@ class SplitCell:
 
 @dataclass(frozen=True)
 class Share:
-    """Contribution of the decisions or the arithmetic to a split: the delay of the split without them."""
+    """Contribution of decisions or arithmetic to a split: the delay of the split when it is removed."""
 
     what: What  # the difference that is taken away; the other one stays
     reference: Name  # the run that is compared with
@@ -523,7 +523,7 @@ class Share:
 
 
 def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:
-    """Return the splits of all runs (arithmetic, decisions) = (A, A), (B, B), (B, A), (A, B) from A and B.
+    """Return when each combination of arithmetic (of A or B) and decisions (of A or B) splits from A and B.
 
     Args:
         series: separations at each step, length, by the names "B" and those in SERIES; NaN after a run ended.

@@ -18,7 +18,7 @@ _NODES, _FEWER, _AGREE = 200, 100, 1e-3
 
 
 def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> float | None:
-    """Period of the fastest vibration of a configuration, in the user's time unit; None if none is bound.
+    """Period of the fastest vibration, in the user's time unit; None if there is no vibrational mode.
 
     The largest eigenvalue of the mass-weighted Hessian is found by a Lanczos iteration with finite
     differences of forces. Forces are shifted to zero at the cutoff, to avoid jumps when pairs cross the
@@ -57,7 +57,7 @@ def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3
 
 
 def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mapping[str, float] | None:
-    """Tail corrections: contributions of pairs beyond the cutoff to energy and pressure, with g(r) = 1.
+    """Tail corrections of energy and pressure for pairs beyond the cutoff, with g(r) = 1 beyond the cutoff.
 
     Args:
         simulation: the system as objects.

@@ -1,7 +1,7 @@
 """Exact time reversal of a run with a fixed-point (integer) state, from the last step to the first.
 
 Every step is reversed by subtracting the integers that were added in this step, so all states of the forward
-run are recovered bit for bit. The reversed run builds its own neighbor lists, because sums of integers do not
+run are recovered bit for bit. The reversed run can use other neighbor lists, because sums of integers do not
 depend on the order of pairs.
 """
 
@@ -52,14 +52,14 @@ class Stretched(NamedTuple):
 
 @partial(jax.jit, static_argnames=("structure",))
 def _undrifted(leaves, structure, state: EpochState) -> Back:
-    """Return the state of a run before its last drift (the last update of positions)."""
+    """Return the state of a run before the last update of positions."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = jnp.arange(state.x.shape[1])
     return _before(program, program.masses, order, Back(state.step, *state[1:4], state.extra))
 
 
 def _before(program: EpochProgram, masses, order, back: Back) -> Back:
-    """Reverse a drift (an update of positions); return the state of the previous step."""
+    """Reverse an update of positions (a drift), and return the state of the previous step."""
     step = back.step - 1
     x, v, extra = program.integrator.undrift(  # type: ignore[attr-defined]
         back.x, back.v, back.extra, masses, step, order
@@ -71,7 +71,7 @@ def _before(program: EpochProgram, masses, order, back: Back) -> Back:
 
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
 def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord):
-    """Reverse steps until the skin is used up, the record is full or the stored bath must be restored."""
+    """Reverse time steps until the skin is used up, the record is full, or the bath must be restored."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
 
@@ -153,7 +153,7 @@ class BackwardRun:
         self.back: Back = _undrifted(self._leaves, self._structure, end)
 
     def stretches(self) -> Iterator[Stretched]:
-        """Yield groups of consecutive steps, the last group first; `back` is the current reversed state.
+        """Yield groups of consecutive time steps, the last group first.
 
         Raises:
             NumericalError: the thermostat's bath differs from the bath of the forward run.
@@ -188,7 +188,7 @@ class BackwardRun:
         self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
-        """Raise `NumericalError` if the thermostat's bath is not zero where the forward run emptied it."""
+        """Raise `NumericalError` if the thermostat's bath is not zero at a step at which it was emptied."""
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(

@@ -32,7 +32,7 @@ class ReferenceFrame:
 
     @property
     def is_same(self) -> bool:
-        """True if labels, axes and positions are the same in both runs."""
+        """True if atom labels, axes and origin are the same in both runs."""
         return (
             bool((self.labels == np.arange(len(self.labels))).all())
             and bool((self.axes == np.arange(3)).all())
@@ -50,7 +50,7 @@ class ReferenceFrame:
     def positions(
         self, x: Float[np.ndarray, "rows 3 atoms"], by: Float[np.ndarray, "rows 3 3"] | None = None
     ) -> Float[np.ndarray, "rows 3 atoms"]:
-        """Convert positions to the labels and axes of the other run; they are not wrapped into the box.
+        """Convert positions to the labels and axes of the other run, without wrapping into the box.
 
         Args:
             by: deformation of the box since the start for each row; None if the box is fixed.
@@ -86,11 +86,11 @@ class ReferenceFrame:
         return out
 
     def keys(self, own: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """Convert keys of pairs to the atom labels of the other run, and sort the keys."""
+        """Convert integer keys of pairs to the atom labels of the other run, and sort the keys."""
         return np.sort(self.keys_of(*np.divmod(own, len(self.labels))))
 
     def keys_of(self, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """Return the keys of pairs of atoms i, j with the labels of the other run, in the given order."""
+        """Return the keys of pairs of atoms i and j with the labels of the other run, in the given order."""
         atoms = len(self.labels)
         channel, i = np.divmod(i, atoms)
         a, b = self.labels[i], self.labels[j]
@@ -118,7 +118,7 @@ class CrossFlip:
 
 @dataclass(frozen=True)
 class PairFlips(Columns):
-    """Flips (changes of cutoff decisions) of one run as columns, with the atom labels of the first run."""
+    """Changes of cutoff decisions (flips) in one run, as columns with the atom labels of the first run."""
 
     step: Int[np.ndarray, "flips"]  # of the flip
     key: Int[np.ndarray, "flips"]  # i * atoms + j of the pair, i < j
@@ -130,7 +130,7 @@ class PairFlips(Columns):
 
 @dataclass(frozen=True)
 class CrossFlips(Sequence[CrossFlip]):
-    """Sequence of cross-run flips by step, stored as arrays because there may be millions of flips."""
+    """Sequence of `CrossFlip`s, sorted by step and stored as arrays because there may be millions."""
 
     flips: PairFlips  # of either run
     from_b: Bool[np.ndarray, "flips"]  # which of them are the second run's
@@ -177,7 +177,7 @@ class CrossRecorder:
         self.differing: Int[np.ndarray, "pairs"] = np.setxor1d(a, b, assume_unique=True)
 
     def opening(self) -> list[CrossFlip]:
-        """Return the pairs whose decisions differ between the runs at the start, as flips at step 0."""
+        """Return the pairs with decisions that differ between the runs at step 0, as `CrossFlip`s."""
         i, j = np.divmod(self.differing, self.atoms)
         pairs = zip(i.tolist(), j.tolist(), strict=True)
         return [CrossFlip(0, i, j, True, "B", False, np.nan, np.nan) for i, j in pairs]
@@ -185,7 +185,7 @@ class CrossRecorder:
     def take(
         self, first: int, rows: int, a: PairFlips, b: PairFlips
     ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
-        """Return how many pairs differ at each of the next steps, and the flips that change this number.
+        """Return the number of pairs whose decisions differ at each of the next steps, and all changes of it.
 
         Args:
             first: step of the first row.
@@ -211,7 +211,7 @@ class CrossRecorder:
 
 
 def _times_before(keys: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """For each element of an array of keys, count the earlier elements with the same key."""
+    """For each key in an array, count the earlier occurrences of the same key."""
     order, times = np.argsort(keys, kind="stable"), np.empty(len(keys), np.int64)
     times[order] = np.arange(len(keys)) - np.searchsorted(keys[order], keys[order])
     return times

@@ -25,8 +25,7 @@ class Counterfactual:
     """A run with its own arithmetic, on which the cutoff decisions of another run (the leader) are imposed.
 
     Decisions that the run would have made by itself are also computed, and differences are counted. The
-    object is called with each segment of the leader, and keeps the resulting rows until `until` returns the
-    rows.
+    object is called with each segment of the leader; `until` returns the resulting rows.
 
     Args:
         simulation: the run whose arithmetic is used.
@@ -71,7 +70,7 @@ class Counterfactual:
         self._record: EpochRecord | None = None
 
     def __call__(self, segment: Segment) -> None:
-        """Simulate one segment of the leader's steps with the leader's decisions, and keep the rows."""
+        """Simulate the next steps of the leader with its decisions imposed, and keep the resulting rows."""
         if self._over:
             return
         rows = self.follow(segment)
@@ -87,7 +86,7 @@ class Counterfactual:
         return taken(self._ahead, last)
 
     def follow(self, segment: Segment) -> Rows:
-        """Simulate one segment of the leader's steps with the leader's decisions; return the rows."""
+        """Simulate the next steps of the leader with its decisions imposed, and return the resulting rows."""
         parts: list[Rows] = []
         row = 0
         while row < segment.rows and not self.failed:
@@ -146,7 +145,7 @@ class Counterfactual:
         return tuple(leaves), structure
 
     def _list(self, segment: Segment):
-        """Return this run's neighbor list, and the slot of the leader's list for each of its slots."""
+        """Return this run's neighbor list, and the map from its slots to slots of the leader's list."""
         simulation = self.simulation
         if self._own is None:
             home, cell = self.state.x, jax.tree.map(np.asarray, self.state.cells[0])
@@ -161,7 +160,7 @@ class Counterfactual:
 
 
 def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species species"]:
-    """Return the cutoff radius for each channel (group of terms) and pair of species, length."""
+    """Return the cutoff radius for each pair of species and group of potential terms, length."""
     radii = np.array(simulation.decider.r_cut).reshape(simulation.channels, -1)
     count = len(simulation.symbols)
     if radii.shape[1] == 1:
@@ -173,7 +172,7 @@ def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species s
 def _places(
     table: PairTable, led: PairTable, labels: Int[np.ndarray, "atoms"]
 ) -> Int[np.ndarray, "slots atoms"]:
-    """For each slot of a list, return the slot of the same pair in another list (its size if absent)."""
+    """Return, for each slot of a neighbor list, the slot of the same pair in another neighbor list."""
     atoms = len(labels)
     slot, column = np.nonzero(led.index < atoms)
     keys = led.order[column].astype(np.int64) * atoms + led.order[led.index[slot, column]]

@@ -1,4 +1,4 @@
-"""Control of a simulation run by the host: neighbor lists, calls of the compiled loop, and records.
+"""Control of a simulation run: neighbor lists, calls of the compiled time-stepping loop, and records.
 
 The engine builds neighbor lists, starts the compiled loop over steps with one list, and yields its records. A
 record is yielded only after the next loop has been started, so that the caller works on this record while the
@@ -49,7 +49,7 @@ FAILURES = ("blow-up", "runaway", NARROW)
 
 @dataclass(frozen=True)
 class Segment:
-    """Record of consecutive time steps with one neighbor list."""
+    """Record of consecutive time steps that use the same neighbor list."""
 
     first: int  # step of the first row
     rows: int  # number of rows
@@ -85,17 +85,17 @@ class Segment:
         return self.first + self.rows - 1
 
     def rows_of(self, name: str) -> np.ndarray:
-        """Return the rows of a recorded quantity; steps are recomputed if this quantity was not recorded."""
+        """Return a recorded quantity at all steps; if it was not recorded, the steps are recomputed."""
         lacks = self.changes is not None and name in ("x", "v", "images", "bits")
         return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """The simulation box of each row; empty if the box is fixed."""
+        """The simulation box at each step; empty if the box is fixed."""
         return self.record.boxes(self.rows, self.cell.pbc)
 
     def cell_of(self, row: int) -> Cell:
-        """Return the simulation box at the step of a row."""
+        """Return the simulation box at one step of the segment."""
         return self.cells[row] if self.cells else self.cell
 
     @property
@@ -104,7 +104,7 @@ class Segment:
         return self.unsorted("x", self.rows - 1).T if self.closes == "blow-up" else self.state.x_before
 
     def unsorted(self, name: str, row: int) -> np.ndarray:
-        """Return a recorded quantity at one row in the user's order of atoms, shape (atoms, 3)."""
+        """Return a recorded quantity at one step in the user's order of atoms, shape (atoms, 3)."""
         if name == "x" and row == 0:
             return np.asarray(self.start.x).T
         if name == "x" and row == self.rows - 1 and self.closes != "blow-up":
@@ -131,7 +131,7 @@ class Start:
         return np.asarray(self.home, np.float64).T
 
     def check_box(self, simulation: Simulation, which: int = -1) -> None:
-        """Raise `InputError` if the box, by default at the list's build, is too narrow for a list."""
+        """Raise `InputError` if the box of the state is too narrow for cutoff and skin."""
         cell = jax.tree.map(np.asarray, self.state.cells[which])
         check_radius(cell, simulation.r_cut, simulation.rule.skin)
 
@@ -183,7 +183,7 @@ def first_state(simulation: Simulation) -> Start:
 
 
 def room_for(rows: int, per_row: int) -> int:
-    """Return how many rows to allocate for at least `rows` steps: a power of two that fits into memory."""
+    """Return the number of rows to allocate for at least `rows` steps, a power of two."""
     few = max(2, min(_MOST_ROWS, _SMALL_BYTES // per_row))
     return 1 << max(few.bit_length() - 1, rows.bit_length())
 
@@ -257,7 +257,7 @@ class Engine:
         return min(1 << (rows.bit_length() - 1), room_for(int(self.last + 1), per_row))
 
     def take(self, turn: int, words: int) -> EpochRecord:
-        """Return the record buffer for this turn; the buffer is donated to the loop that fills it."""
+        """Return one of two buffers for a record; the buffer is donated to the loop that fills it."""
         rows, held, most = self._room(words), self._records[turn], self.program.most
         self._records[turn] = None
         # as many as a list's life brings, or a large system sorts its atoms several times for one list
@@ -270,11 +270,11 @@ class Engine:
         return empty_record(rows, words, self.simulation.atoms, dtype, self.record, *rest)
 
     def give(self, turn: int, record: EpochRecord) -> None:
-        """Give a record that is no longer used back to the engine as a buffer."""
+        """Return a record to the engine, which uses it again as a buffer."""
         self._records[turn] = record
 
     def segments(self) -> Iterator[Segment]:
-        """Yield segments in the order of steps; the last segment has `closes` "end" or one of FAILURES."""
+        """Yield segments in the order of steps, until the run has ended or failed."""
         here, turn, held = self.start, 0, None
         listed = self._listed(here)
         waiting: Segment | None = None
@@ -295,7 +295,7 @@ class Engine:
                 listed = self._listed(here)
 
     def again(self, start: Start) -> Segment:
-        """Recompute the segment that begins at a given initial state; all bits are the same.
+        """Recompute the segment that begins at a given state, with the same bits.
 
         Args:
             start: state at which a segment of this engine began (`resume_point` of the previous segment).
@@ -375,13 +375,13 @@ class Engine:
         return EpochRecord(*whole)
 
     def _pinned(self, table: PairTable, first: int, words: int) -> tuple[UInt8[np.ndarray, "..."], ...]:
-        """Return imposed decisions for the next steps, and the mask of their slots; empty without pins."""
+        """Return the decisions that are imposed on the next steps, with a mask; empty if there are none."""
         if self.pins is None:
             return ()
         return self.pins.rows(table, first, self._room(words), self.simulation.channels)
 
     def failure(self, outcome: EpochOutcome) -> str:
-        """Return one of FAILURES if the time steps ended in a failure, else an empty string."""
+        """Return the name of the failure in which the time steps ended, else an empty string."""
         _, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
         if not finite:
             return "blow-up"

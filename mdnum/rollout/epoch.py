@@ -35,7 +35,7 @@ class Pin:
     inside: bool = False  # what it is told before the first of them
 
     def at(self, steps: Int[np.ndarray, "steps"]) -> Bool[np.ndarray, "steps"]:
-        """Return the imposed decision at each of the given steps: True if the pair is inside the cutoff."""
+        """Return the imposed decision at each of the given steps, where True means inside the cutoff."""
         turned = np.searchsorted(np.asarray(self.changes, np.int64), steps, side="right")
         return (turned % 2 == 1) ^ self.inside
 
@@ -49,7 +49,7 @@ class Pins:
     def rows(
         self, table: PairTable, first: int, count: int, channels: int = 1
     ) -> tuple[UInt8[np.ndarray, "rows words atoms"], UInt8[np.ndarray, "rows words atoms"]]:
-        """Return packed decisions, and a mask of the imposed ones, for consecutive steps of one list.
+        """Return imposed decisions in packed form, and their mask, for consecutive steps of one list.
 
         No decision can be imposed on a pair that is not in the list, because such a pair is too distant.
 
@@ -127,7 +127,7 @@ class StepInputs(NamedTuple):
 
 
 class EpochRecord(NamedTuple):
-    """Record with one row per time step, with atoms in the order of the neighbor list."""
+    """Record with one row per time step; atoms are in the order of the neighbor list."""
 
     # x, v: positions and full-step velocities, shape (rows, 3, atoms), or (rows, 3, 0) without rows
     x: Float[Array, "rows 3 atoms"]
@@ -222,7 +222,7 @@ def write_row(record: EpochRecord, row, **values) -> EpochRecord:
 def over_rows(
     step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, used: Any, *, backward: bool = False
 ) -> tuple[Any, Any]:
-    """Like `jax.lax.scan`, but only over the first `used` rows, from the last row on if `backward`.
+    """Scan like `jax.lax.scan` over the first `used` rows, in reverse order if `backward` is True.
 
     Buffers have the size of the longest segment, so that one compiled function can be used for all segments.
     A loop over the whole buffer would spend most of its time on empty rows. Outputs of unused rows are zero.

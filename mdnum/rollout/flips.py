@@ -34,7 +34,7 @@ def _mixed(key):
 
 @njit
 def fingerprint_of_bits(bits, index, order):
-    """Return the number and a hash of the pairs inside the cutoff, which do not depend on the list."""
+    """Return number and hash of the pairs inside the cutoff, independent of the order of the list."""
     count, total = 0, np.uint64(0)
     atoms, listed = order.shape[0], index.shape[0] // 8
     for w in range(bits.shape[0]):
@@ -62,7 +62,7 @@ def _fingerprint_of_keys(keys):
 
 @njit
 def _note_rows(before, rows, index, x, v, pairs, ends, count):
-    """Record the `Changes` of decisions between consecutive rows of one neighbor list."""
+    """Record the changes of decisions between consecutive time steps with one neighbor list."""
     held = before.copy()
     for r in range(len(rows)):
         note(held, rows[r], index, x[r], v[r], r, pairs, ends, count)
@@ -71,7 +71,7 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
 # atoms in one place have no radial speed: not a number, as in numpy
 @njit(error_model="numpy")
 def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, narrow, back, first, factor):
-    """Compute the columns of a table of flips from `Changes`; check that margins agree with decisions.
+    """Compute the columns of the table of flips, and check that margins agree with decisions.
 
     Args:
         labels: labels of the sorted atoms. species: species by label. kinds: pair type of two species.
@@ -147,7 +147,7 @@ def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
 
 
 def _noted(before, bits, index, x, v) -> Changes:
-    """Return the changes of decisions in consecutive rows of one list, in the format of the compiled loop."""
+    """Return the changes of decisions in consecutive steps with one list, in the compiled loop's format."""
     room = len(bits) * max(64, bits.shape[2] // 4)
     while True:
         made = np.empty((room, 4), np.int32), np.empty((room, 12), x.dtype), np.zeros(3, np.int64)
@@ -174,8 +174,8 @@ class PairRecorder:
     """Recorder of all flips of pair decisions in a simulation.
 
     A flip is a difference between the decisions for a pair at two consecutive steps, even if the neighbor
-    list was rebuilt in between. A pair that the old list missed enters when the new list contains the pair,
-    and a pair beyond the range of the new list leaves.
+    list was rebuilt in between. A pair that was missing in the old list enters with the new list, and a pair
+    that is beyond the range of the new list leaves.
 
     Args:
         simulation: the system as objects.
@@ -232,11 +232,11 @@ class PairRecorder:
         return np.concatenate([one.bounds_at(x[[row]]) for row, one in enumerate(each)])
 
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
-        """Number of pairs at each step of a segment whose decision could be reversed by rounding errors."""
+        """Number of pairs with a decision that rounding errors could reverse, at each step of a segment."""
         return np.bincount(self.doubtful(segment).step - segment.first, minlength=segment.rows)
 
     def doubtful(self, segment: Segment) -> AmbiguousPairs:
-        """Return the pairs whose decision could be reversed by rounding errors, sorted by step."""
+        """Return the pairs with a decision that rounding errors could reverse, sorted by step."""
         parts = [AmbiguousPairs.none()]
         bounds, table, dtype = self.bounds(segment), segment.table, np.dtype(self.simulation.decider.dtype)
         # almost always no pair comes that close; where one does, the host looks again
@@ -261,11 +261,11 @@ class PairRecorder:
         """Return the flips of a segment, sorted by step, i and j (user's labels, i < j; see `type_of`).
 
         Distance, margin and radial speed refer to the step of the flip. The margin has the same bits as in
-        the decision of the run.
+        the run.
 
         Raises:
-            MdnumError: a flip was recorded for one atom of a pair only, or a margin contradicts its decision,
-                so the arithmetic of the compiled program differs from that of the host.
+            MdnumError: a flip was recorded for only one atom of a pair, or a margin contradicts its decision
+                because compiled arithmetic differs from numpy.
         """
         table, changes = segment.table, segment.changes
         replaced = self._replace(segment)
@@ -323,7 +323,7 @@ class PairRecorder:
         )  # fmt: skip
 
     def caused_by_box(self, ledger: FlipTable) -> Bool[np.ndarray, "flips"]:
-        """Return which flips would not occur in the previous step's box, for the same motion of atoms."""
+        """Return a mask of the flips that a change of the box caused."""
         root, inclusive = self._rule
         # the same margin, at the distance in that box
         change = ledger.by_box if root else ledger.by_box * (2 * ledger.distance - ledger.by_box)
@@ -331,7 +331,7 @@ class PairRecorder:
         return (margin >= 0 if inclusive else margin > 0) != ledger.entered
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
-        """Return the keys of the pairs inside the cutoff at the last step of a neighbor list, if it ended."""
+        """Return the keys of the pairs inside the cutoff at the last step of the previous neighbor list."""
         if self._held_segment is not None:
             table, bits, _ = self._held_segment
             self._held_keys = _keys(self.simulation, table, np.asarray(bits))
@@ -345,7 +345,7 @@ class PairRecorder:
         return 2 * float(segment.leap) < rule.skin and self._held_segment[2] == int(segment.inside)
 
     def _replace(self, segment: Segment) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return flips caused by a new list whose decisions at the previous step differ from the old list."""
+        """Return the flips at the change of lists: pairs on which the old and the new list disagree."""
         self.missed = 0
         if not segment.opens or (self._held_segment is None and self._held_keys is None):
             return None
@@ -371,7 +371,7 @@ class PairRecorder:
 def pair_keys(
     i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], atoms: int
 ) -> Int[np.ndarray, "pairs"]:
-    """Return one sorted integer for each pair i < j; i includes the channel of a decision (see `type_of`)."""
+    """Return one integer key for each pair i < j, sorted; for i see `Simulation.type_of`."""
     return np.sort(i.astype(np.int64) * atoms + j)
 
 
@@ -404,19 +404,19 @@ def _write_keys(bits, index, order, place, keys):
 
 
 def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.ndarray, "pairs"]:
-    """Return the keys of the pairs that were inside the cutoff in a run, at one row of a segment."""
+    """Return the keys of the pairs that were inside the cutoff at one step of a run."""
     return _keys(simulation, segment.table, bits_of(segment, row))
 
 
 def bits_of(segment: Segment, row: int) -> UInt8[np.ndarray, "words atoms"]:
-    """Return the packed decisions at one row of a segment; the last row needs no recomputation of steps."""
+    """Return the packed decisions at one step of a segment, without recomputation for the last step."""
     if row == segment.rows - 1 and segment.held is not None and segment.closes != "blow-up":
         return np.asarray(segment.held)
     return segment.rows_of("bits")[row]
 
 
 def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "pairs"]:
-    """Return the keys of all pairs inside the cutoff from a new search, with the arithmetic of the run."""
+    """Return the keys of all pairs inside the cutoff, from a new search with the arithmetic of the run."""
     decider = simulation.decider
     table = simulation.verlet_list(skin=0.0).build(np.asarray(wrapped, np.float64), simulation.cell)
     _, _, i, j = table.listed(simulation.channels)

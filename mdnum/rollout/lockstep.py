@@ -1,8 +1,8 @@
 """Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other imposed.
 
-Each free run has the same bits as a run by itself, because it has its own neighbor lists and compiled loop;
-only the step counter is shared. Cutoff decisions are compared by the flips of both runs. Therefore the cost
-does not depend on the number of pairs, and only pairs with different decisions are stored.
+Each free run has the same bits as a single run, because neighbor lists and compiled loops are separate.
+Decisions are compared by means of the flips of both runs. Therefore the cost does not depend on the number of
+pairs, and only pairs with different decisions are stored.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
 def beside(
     leader: Track, runs: Sequence[Track | Counterfactual]
 ) -> Iterator[list[Float[np.ndarray, "rows"]]]:
-    """Yield the separations of runs from a leading run, one segment of this run at a time."""
+    """Yield the separations of several runs from a leading run, one segment at a time."""
     while leader.segment() is not None:
         rows = leader.until(end := leader.ready)
         yield [separation_of(rows, run.until(end)) for run in runs]
@@ -95,7 +95,7 @@ def beside(
 def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
     """Return the largest distance between the same atoms in two runs at each step; NaN after run b has ended.
 
-    Positions are compared relative to the box; distances are minimum-image distances in the first run's box.
+    Positions are scaled to the box of the first run, and distances are minimum-image distances in this box.
     """
     out = np.full(0 if a is None else len(a), np.nan)
     if a is not None and b is not None:

@@ -1,4 +1,4 @@
-"""Molecular dynamics as a `Program`: runs for comparison, with imposed decisions or perturbed starts."""
+"""Molecular-dynamics simulation with the interface `Program`, by which two runs are compared."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class MdProgram:
 
     @property
     def imposable(self) -> str | None:
-        """None if decisions can be imposed on this simulation, else the reason why this is not possible."""
+        """Reason why decisions cannot be imposed on this simulation; None if imposing is possible."""
         if self.simulation.imposable:
             return None
         return "a many-body potential decides inside its energy function"
@@ -151,7 +151,7 @@ class MdProgram:
         return programs
 
     def decision(self, other: MdProgram, flips: Sequence[CrossFlip], separation: float) -> Decision:
-        """Return the decision at a fork: of all pairs that differ, the pair nearest to its cutoff."""
+        """Return the decision at a fork, for the pair nearest to its cutoff among all pairs that differ."""
         differing = [flip for flip in flips if flip.differs]
         flip = min(differing, key=lambda flip: abs(flip.margin) if np.isfinite(flip.margin) else np.inf)
         if np.isfinite(flip.margin):
@@ -182,7 +182,7 @@ class MdProgram:
         return Number(name, here, unit, at, parameters.is_positive(simulation, name))
 
     def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
-        """Return the decisions of a run (see `Program.history`); default loss: `squared_displacement`."""
+        """Return all decisions of a run and its loss, by default the mean squared displacement."""
         marks: list[np.uint64] = []
         segment = None
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
@@ -220,7 +220,7 @@ class MdProgram:
         return Differing(nearest)
 
     def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], Simulation, np.ndarray]:
-        """Return, for a step of a run, the keys of pairs inside, the simulation in its box, and positions."""
+        """Return the pairs inside the cutoff, the simulation in its box, and positions at a step of a run."""
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             if segment.last >= step:
                 row = step - segment.first

@@ -414,7 +414,7 @@ def _fresh(simulation: Simulation, layout: Layout, out, steps, save_every, progr
 
 
 def _finished(path: Path, steps: int | None, given: Simulation | None) -> RunResult | None:
-    """Return the result that a folder already contains if the run is complete, else None."""
+    """Return the result in a folder if the run in this folder is complete, else None."""
     folder = RunFolder.open(path)
     summary = folder.summary
     if summary.get("status") != "complete" or not folder.has_checkpoint():

@@ -1,4 +1,4 @@
-"""Summary of a run: totals, check of the energy jumps, and checks of the neighbor lists."""
+"""Summary of a run: totals, and checks of the energy and of the neighbor lists."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class LineFit:
 
 @dataclass
 class RunTally:
-    """Totals over all recorded time steps up to the current step."""
+    """Sums and extreme values over all time steps up to the current step."""
 
     step: int = -1
     entered: int = 0
@@ -316,7 +316,7 @@ class EnergyBudget:
     def check(
         self, step: int, positions: Float[np.ndarray, "atoms 3"], potential: float, cell: Cell | None = None
     ) -> dict:
-        """Check the energy at one step; return the quantities computed for this (`Simulation.numbers`).
+        """Check the energy at one step; return the quantities that `Simulation.numbers` computes.
 
         Args:
             step: the step.
@@ -384,7 +384,7 @@ class Epoch:
 
     @classmethod
     def of(cls, segment: Segment) -> Epoch:
-        """Return the initial statistics of the neighbor list that is used in a segment."""
+        """Return the statistics of a new neighbor list, before its first step."""
         table = segment.table
         return cls(
             segment.epoch, segment.built, table.pairs, table.slots, table.occupancy, 1e3 * table.build_seconds

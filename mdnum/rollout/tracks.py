@@ -19,7 +19,7 @@ from mdnum.systems.simulation import Simulation
 
 @dataclass(frozen=True)
 class Rows:
-    """Consecutive steps of a run, with the atom labels and axes of the first run of a comparison."""
+    """Consecutive time steps of a run, with the atom labels and axes of the first run in a comparison."""
 
     first: int  # step of the first row
     # x, v: wrapped positions and full-step velocities, shape (rows, 3, atoms), float64
@@ -58,7 +58,7 @@ class Rows:
         return replace(self, x=x, v=v, cells=frame.boxes(self.cells, self.box))
 
     def cut(self, count: int) -> tuple[Rows, Rows]:
-        """Split the rows into the first `count` rows and the remaining ones."""
+        """Split the rows into the first `count` rows and the remaining rows."""
 
         def part(rows: slice, **changed: Any) -> Rows:
             columns = {name: getattr(self, name) for name in _COLUMNS}
@@ -69,7 +69,7 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: list[Rows]) -> Rows:
-        """Join consecutive groups of rows into one group."""
+        """Concatenate consecutive groups of rows."""
         if len(parts) == 1:
             return parts[0]
         columns = {name: [getattr(part, name) for part in parts] for name in _COLUMNS}
@@ -86,7 +86,7 @@ _COLUMNS = ("x", "v", "energy", "nearest", "overridden", "furthest")
 
 
 def taken(ahead: list[Rows], last: int) -> Rows | None:
-    """Remove all rows up to a step from a list of rows, and return these rows; None if there are none."""
+    """Remove all rows up to a step from a list, and return the removed rows; None if there are none."""
     parts: list[Rows] = []
     while ahead and ahead[0].first <= last:
         rows = ahead.pop(0)
@@ -98,7 +98,7 @@ def taken(ahead: list[Rows], last: int) -> Rows | None:
 
 
 class Track:
-    """A run whose segments are read in the order of time steps.
+    """Reader of a run, which returns time steps and flips in order.
 
     Args:
         simulation: the run.

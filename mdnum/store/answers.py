@@ -2,8 +2,8 @@
 
 A command with many tests (`audit`, `conform`) keeps its options and results in one dataclass of plain values.
 The file is written at once if a result should not be lost, and otherwise about once per second. A resumed
-command restores all values with their types, and runs the tests that have no result. Tables are created from
-the results.
+command restores all values with their types, and runs the tests that have no result. Tables in the folder are
+created from the results.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Answers(Generic[T]):
         self._before, self._began, self._due = state.seconds, monotonic(), 0.0
 
     def save(self, urgent: bool = True) -> None:
-        """Save the state of a command for resuming; if not urgent, the save is skipped after a recent one."""
+        """Save the state of a command for resuming; a save that is not urgent may be skipped."""
         now = monotonic()
         self.state.seconds = self._before + now - self._began
         if urgent or now >= self._due:

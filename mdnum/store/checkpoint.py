@@ -26,7 +26,7 @@ _META, _STORE = "mdnum meta", "mdnum store"
 def write(
     path: Path, state: Mapping[str, Any], store: Mapping[str, Any], beside: Mapping[str, list[str]]
 ) -> None:
-    """Write the checkpoint file, and list this file and the files written since then in the manifest.
+    """Write a checkpoint file, and list this file and new part files in the manifest.
 
     Args:
         state: state of the run: arrays, and values that JSON can represent.
@@ -45,7 +45,7 @@ def write(
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the state and the file lengths that were given to `write`.
+    """Return the state and the lengths of files that are stored in a checkpoint.
 
     Raises:
         FolderError: the checkpoint is damaged, or it is compressed (mdnum does not compress checkpoints).

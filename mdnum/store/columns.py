@@ -16,7 +16,7 @@ _DECLARED: Mapping[str, Mapping[str, Sequence[str]]] = beside(__file__)
 
 
 def meaning(table: str, column: str, own: Mapping[str, Mapping[str, Any]] | None = None) -> Sequence[str]:
-    """Return the unit (in terms of quantities) and the description of a column; empty if undeclared."""
+    """Return the unit (such as "energy/length") and the description of a column; empty if unknown."""
     if own is not None:
         said = _found(own.get(table, {}), column)
         return (_found(_DECLARED["columns"], said) if isinstance(said, str) else said) or ("", "")

@@ -56,7 +56,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def opened(path: Path, mode: Literal["rb", "r+b", "ab"] = "rb") -> BinaryIO:
-    """Open a file in a run folder; raise an error for links and for anything that is not a regular file.
+    """Open a file in a run folder; raise an error for a link or anything else than a regular file.
 
     Args:
         mode: "r+b" and "ab" write in place, so a file with a second name (a hard link) is also rejected.
@@ -207,7 +207,7 @@ class Manifest:
 
 
 def digest_of(data: bytes | memoryview) -> str:
-    """Return the hash digest of bytes."""
+    """Return the hash digest of the given bytes."""
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 

@@ -83,9 +83,9 @@ class RunFolder:
     """The folder of a run on disk.
 
     Rows, frames and log lines can be appended at any time, and become permanent with the next checkpoint. A
-    killed run is resumed from its last checkpoint: `resume()` removes later data and returns the state, so
-    that the result is the same as without the kill. Use `create` for a new run, and `open` to read or resume
-    an existing run.
+    killed run is resumed from its last checkpoint by `resume`, which removes later data and returns the
+    state, so that the result is the same as without the kill. Use `create` for a new run, and `open` to read
+    or resume an existing run.
     """
 
     def __init__(self, path: Path, layout: Layout | None = None):
@@ -191,7 +191,7 @@ class RunFolder:
         return self._layout
 
     def read_as(self, layout: Layout) -> None:
-        """Use the current layout of a command to read a folder that an earlier version wrote."""
+        """Read a folder that an earlier version wrote with the current layout of the command."""
         self._layout = layout
 
     @property
@@ -234,8 +234,8 @@ class RunFolder:
         """Return True if the last checkpoint is so old that a new one is due.
 
         The interval between checkpoints is at least 2 s, 1 % of the run's duration, and fifty times the
-        duration of the last checkpoint. A kill therefore loses about 1 % of a run, and a run of days has a
-        thousand part files, not a hundred thousand.
+        duration of the last checkpoint. Therefore a kill loses about 1 % of a run, and a run of days has only
+        about a thousand part files.
         """
         now = time.monotonic()
         due = now - self._written >= max(2.0, 0.01 * (now - self._began), 50 * self._cost)
@@ -308,7 +308,7 @@ class RunFolder:
         self.close()
 
     def flush(self, *last: str) -> None:
-        """Write all appended rows; tables in `last` are written last, so that a kill leaves no extra rows."""
+        """Write all appended rows; the tables in `last` are written after all other tables."""
         for name in sorted(self._streams, key=last.count):
             self._streams[name].flush()
 
@@ -339,7 +339,7 @@ class RunFolder:
             self._list_files()
 
     def write_provenance(self, provenance: Mapping[str, Any]) -> None:
-        """Write provenance.json; called when the folder contains all input files of the run."""
+        """Write provenance.json, when the folder contains all input files of the run."""
         self._write_json("provenance.json", provenance)
         if self._owner:
             names = {entry.name for entry in self.path.iterdir() if not entry.name.startswith(".")}
@@ -455,7 +455,7 @@ class RunFolder:
         return {key: as_numpy(table[key]) for key in table.column_names if key not in unknown}
 
     def rows(self, name: str) -> int:
-        """Return the number of rows that `table` returns for a table."""
+        """Return the number of rows of a table."""
         stream = self._reader(name)
         if stream.parts() and self.has_checkpoint():
             # series and flips of an unfinished run agree with one another only at a checkpoint
@@ -545,9 +545,9 @@ class RunFolder:
 
         Raises:
             FolderError: the folder is damaged or unfinished, or has no manifest; or its digests match, but it
-                has contents that mdnum does not write. The message then names a line of mdnum's code. If this
-                object wrote the folder and the folder is intact, the exception is a bug of mdnum and is
-                raised unchanged.
+                has contents that mdnum does not write. In the latter case, the message names a line of
+                mdnum's code. An exception for an intact folder that this object wrote is a bug of mdnum, and
+                is raised unchanged.
         """
         try:
             yield
@@ -591,7 +591,7 @@ class RunFolder:
     # -- inside ----------------------------------------------------------------------------------
 
     def _usable(self) -> list[str]:
-        """Return the file names in a folder in which a run can begin; raise an error for any other folder."""
+        """Return the names of files in a new run folder; raise an error if the folder contains a run."""
         there = self.path.iterdir() if self.path.is_dir() else ()
         present = sorted(entry.name for entry in there if entry.name != _LOCK)
         if present and not _came_to_nothing(self.path, present):
@@ -751,7 +751,7 @@ def restoring(path: Path) -> Iterator[None]:
 
 
 def expect(right: object, seen: str) -> None:
-    """Raise an error if a condition for a restored value is false; for use inside `restoring`.
+    """Raise an error if a restored value does not meet a condition; for use inside `restoring`.
 
     Raises:
         ValueError: the condition is false.

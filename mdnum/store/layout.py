@@ -1,4 +1,4 @@
-"""Layout of a run folder, which is declared by the command that creates it and stored in the manifest."""
+"""Layout of a run folder: declared by the command that creates the folder, and stored in the manifest."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Layout:
         return tuple(name for name in self.tables if not name.endswith("?"))
 
     def keeps(self, name: str) -> bool:
-        """Return True if a file that is not a table belongs to the folder, so that its digest is checked."""
+        """Return True if a file other than a table belongs to the layout, so that its digest is checked."""
         fixed = ("summary.json", self.resumes_from)
         return name in fixed or any(fnmatchcase(name, pattern) for pattern in self.further.split())
 

@@ -148,7 +148,7 @@ class TableStream:
             self.flush()
 
     def look_up(self, of: str, columns: Mapping[str, Any]) -> None:
-        """Declare columns with values that are looked up by a column of indices when rows are written.
+        """Declare columns with values that are looked up from a column of indices when rows are written.
 
         Args:
             of: name of the column of indices.
@@ -367,13 +367,13 @@ class _Writing:
 
 
 def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Concatenate tables with the same columns; a text is the value of a column in all rows."""
+    """Concatenate tables with the same columns; a single text represents a column with equal rows."""
     columns = {name: [part[name] for part in parts] for name in parts[0]}
     return {name: one[0] if isinstance(one[0], str) else np.concatenate(one) for name, one in columns.items()}
 
 
 def _repeats(values: Any, value: Any) -> bool:
-    """Return True if a column given by one text or by a broadcast array has a value in all rows."""
+    """Return True if a column is a single text or a broadcast array with a given value in all rows."""
     if isinstance(values, np.ndarray) and values.strides == (0,):
         values = values[0]
     return value is not None and np.ndim(values) == 0 and bool(values == value)

@@ -36,7 +36,7 @@ def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = Non
 
 
 class _Package(ModuleType):
-    """Module type in which `build` and `build_ball` are functions, not the submodules of the same name."""
+    """Module type that ensures that `build` and `build_ball` are functions, not submodules of these names."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         # Python binds an imported submodule to its package; here that would hide the function of its name

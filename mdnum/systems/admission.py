@@ -1,8 +1,8 @@
 """Classification and validation of a user's energy function by trial calls before the simulation.
 
-A signature does not reveal whether positions are fractional, whether lattice vectors are rows or columns, or
-whether the function uses the given box. A wrong guess gives plausible energies. Therefore the function is
-called at the first configuration, with equivalent neighbor lists and slightly different boxes.
+The signature of a function does not reveal whether positions are fractional, whether lattice vectors are rows
+or columns, or whether the box is used. Wrong assumptions give plausible energies. Therefore the function is
+tested at the first configuration, with equivalent neighbor lists and slightly different boxes.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def admitted(simulation: Simulation) -> Simulation:
 
 
 def _of_a_part(simulation: Simulation) -> Trial | None:
-    """Classify the energy function with a few atoms of a large structure; return None if inconclusive."""
+    """Classify the energy function with a few atoms of a large structure; return None if this fails."""
     if simulation.atoms <= _ENOUGH or simulation.model.start is not None:
         return None
     try:
@@ -87,7 +87,7 @@ def _examine(trial: Trial) -> None:
 
 
 def _resolve(trial: Trial) -> None:
-    """Find which box the function uses, and whether its positions are real or fractional."""
+    """Find which box argument the energy function uses, and whether its positions are real or fractional."""
     how = trial.call.how
     words = ("cell",) if how.native else how.keywords
     paired, periodic = ((trial.inside < trial.n).any(), trial.pbc.any())
@@ -115,7 +115,7 @@ def _resolve(trial: Trial) -> None:
 
 
 def _keep(trial: Trial, box: str) -> None:
-    """Store how the energy function uses the box, and by which keywords; check that energies are finite."""
+    """Store how the energy function uses the box, and which keywords it needs; energies must be finite."""
     how = trial.call.how
     trial.learn(box=box)
     energy, forces = trial.there()
@@ -141,7 +141,7 @@ def _keep(trial: Trial, box: str) -> None:
 class _Moved:
     """Changes of the energy when the atom with the most neighbors is moved by a lattice vector.
 
-    In a sheared box, only the pairs that keep their nearest image are used.
+    Energies in the sheared box include only pairs that have the same nearest image in both boxes.
     """
 
     def __init__(self, trial: Trial):
@@ -156,12 +156,12 @@ class _Moved:
         self.whole = np.where(whole, near, n).astype(np.int32)
 
     def by(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
-        """Return positions after the atom was moved by each vector, and finally the original positions."""
+        """Return positions with the atom moved by each vector, followed by the original positions."""
         x, moved = self.trial.x, np.arange(self.trial.n) == self.central
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 
     def takes_images(self) -> bool:
-        """Return True if a move by a lattice vector in this convention does not change the energy."""
+        """Return True if moving an atom by a lattice vector in this convention keeps the energy."""
         if not self.unchanged(self.trial.cell):
             return False
         # of a fractional function units are lattice vectors, and perhaps these are whole numbers of units
@@ -169,7 +169,7 @@ class _Moved:
         return call.how.fractional or not self.unchanged(np.eye(3) * call.length)
 
     def unchanged(self, vectors, cell=None) -> bool:
-        """Return True if the energy remains the same when the atom is moved by any of the vectors."""
+        """Return True if moving the atom by any of the given vectors does not change the energy."""
         trial, idx = self.trial, self.idx
         none = np.nan_to_num(trial.energy(idx=np.full_like(idx, trial.n)))
         *moved, x = self.by(vectors)
@@ -179,7 +179,7 @@ class _Moved:
         return all(abs(trial.energy(x, idx, cell) - energy) <= allowed for x in moved)
 
     def follows(self) -> bool:
-        """Return True if the energy is also invariant under the lattice vectors of a slightly sheared box."""
+        """Return True if moving an atom by a lattice vector of a sheared box does not change the energy."""
         trial = self.trial
         cell = trial.cell + trial.cell @ _SHEAR
         energy, push = trial.energy(idx=self.whole), np.abs(trial.there(idx=self.whole)[1]).max()
@@ -303,7 +303,7 @@ def _at_the_cutoff(trial: Trial) -> None:
         toward = np.concatenate(displacement(trial.box, trial.x[[i]], trial.x[[j]])) / r[i, slot]
 
         def crossing(factor: float, i=i, j=j, toward=toward, r=r[i, slot]) -> tuple[float, float]:
-            """Return the contribution of the pair to the energy, and its largest to a force component."""
+            """Return the contribution of the pair to the energy, and its largest force component."""
             x = trial.x.copy()
             x[j] += toward * (r_cut * factor - r)
             listed = trial.within(trial.idx, x, r_cut)
@@ -385,7 +385,7 @@ def _adds(trial: Trial) -> bool:
 def _reach(trial: Trial) -> tuple[float | None, float]:
     """Return the largest distance at which a listed pair has a force, and the largest distance tested.
 
-    The first value is None if the pair has no force at any distance that is tested.
+    The first value is None if the pair has no force at any tested distance.
     """
     r_cut, (listed, placed, third) = trial.model.r_cut, _threes(trial)
     furthest = min(2 * r_cut, 0.49 * trial.width if trial.pbc.any() else np.inf)
@@ -408,7 +408,7 @@ def _reach(trial: Trial) -> tuple[float | None, float]:
 
 
 def second_derivative(simulation: Simulation) -> str:
-    """Return the first operation with a second derivative of the energy that is not finite, or ""."""
+    """Return the first operation that makes second derivatives infinite or NaN, or "" if all are finite."""
     if not isinstance(simulation.model, EnergyFunction):
         return ""
     with jaxmd.standard_promotion():

@@ -25,7 +25,7 @@ MethodName = Literal["unrolled", "implicit", "frozen", "event-aware", "smoothed"
 
 
 def _numbers(value: Any) -> Any:
-    """Validate a number or an array of numbers; a union type would report each mistake twice."""
+    """Validate a number or an array of numbers; a union type would report each error twice."""
     for item in value if isinstance(value, list | tuple) else (value,):
         if isinstance(item, bool) or not isinstance(item, int | float):
             raise PydanticKnownError("float_type")
@@ -128,7 +128,7 @@ class _Contact(TomlTable):
 
 
 class PenaltyContact(_Contact):
-    """A spring that pushes the ball while it is below the floor."""
+    """A spring that pushes the ball upward while the ball is below the floor."""
 
     kind: Literal["penalty"]
     k: Positive = Field(description="stiffness per mass (1/s²)")
@@ -179,25 +179,25 @@ class _Tolerance(TomlTable):
 
 
 class SumRule(_Tolerance):
-    """The solver stops when the sum of residuals, in the order of precision.reduction, is below tol."""
+    """The solver stops when the sum of the residuals of all balls is below the tolerance tol."""
 
     rule: Literal["sum"]
 
 
 class PerInstanceRule(_Tolerance):
-    """The solver stops for each ball separately, when the residual of this ball is below tol."""
+    """The solver stops separately for each ball, when the ball's residual is below the tolerance tol."""
 
     rule: Literal["per-instance"]
 
 
 class MaximumRule(_Tolerance):
-    """The solver stops when the largest residual of all balls is below tol."""
+    """The solver stops when the largest residual of all balls is below the tolerance tol."""
 
     rule: Literal["maximum"]
 
 
 class RelativeRule(_Tolerance):
-    """The solver stops when the sum of residuals, relative to the initial sum, is below tol."""
+    """The solver stops when the sum of residuals, divided by the initial sum, is below the tolerance tol."""
 
     rule: Literal["relative"]
 
@@ -213,7 +213,7 @@ Stop = Annotated[SumRule | PerInstanceRule | MaximumRule | RelativeRule | FixedR
 
 
 class IntegratorTable(TomlTable):
-    """The integration method, the time step and the number of steps."""
+    """Integration method, time step, and number of time steps."""
 
     kind: Literal[
         "explicit-euler", "semi-implicit-euler", "velocity-verlet", "implicit-midpoint", "event-located"
@@ -245,7 +245,7 @@ class BallPrecision(TomlTable):
 
 
 class LossTable(TomlTable):
-    """The quantity whose gradient is computed."""
+    """The loss function (a scalar quantity) whose gradient is computed."""
 
     kind: Literal["final-height", "mean-height", "residual-penetration"] = Field(
         default="final-height",
@@ -269,7 +269,7 @@ class GradientTable(TomlTable):
 
 
 def _changes(value: Any) -> Any:
-    """Flatten the nested tables that TOML makes of dotted keys; return tables of changes with dotted keys."""
+    """Convert nested TOML tables of changed keys to flat tables with dotted keys."""
     if not isinstance(value, Mapping):
         return value
     return {name: flat(table) if isinstance(table, Mapping) else table for name, table in value.items()}
@@ -302,7 +302,7 @@ class BallSpec(TomlTable):
 
     @property
     def balls(self) -> int:
-        """Number of balls that the file describes."""
+        """Number of balls that the system file describes."""
         start = self.start
         if start.boundary is not None:
             return start.boundary.terms + 1

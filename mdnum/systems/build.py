@@ -54,7 +54,7 @@ def interaction(potential: Mapping[str, Any], cutoff: Mapping[str, Any] | None) 
 
 
 def model_of(spec: schema.SystemSpec | schema.Interaction, atoms: Atoms, folder: Path) -> Any:
-    """Create the potential that tables describe: `CutPotential`, `Channels`, or a many-body potential.
+    """Create the potential that tables describe (a `CutPotential`, `Channels` or a many-body potential).
 
     Args:
         folder: folder of the files that the tables name.
@@ -88,7 +88,7 @@ def _pair_model(tables: schema.Interaction, atoms: Atoms, folder: Path, own: tup
 
 
 def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any] | None = None) -> Simulation:
-    """Build a simulation from a system.
+    """Build a simulation from a system, given by name, by file or as a loaded object.
 
     Example:
         >>> mdnum.build("argon/liquid-864", {"cutoff.kind": "switched"})
@@ -129,7 +129,7 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
 
 
 def again(folder: Path, given: Simulation | None = None) -> Simulation:
-    """Recreate the simulation that ran in a folder.
+    """Recreate the simulation that was run in a run folder.
 
     Args:
         given: the simulation; required if it was made from objects, of which the folder holds only a

@@ -1,4 +1,4 @@
-"""Execution of Python code that a system file refers to, which needs the user's explicit permission."""
+"""Execution of Python files to which a system file refers, if the user has given explicit permission."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ALLOWED: ContextVar[bool] = ContextVar("allowed", default=False)
 
 @contextmanager
 def allow_code(allow: bool = True) -> Iterator[None]:
-    """Allow the execution of Python code that a system file refers to.
+    """Allow the execution of Python files to which a system file refers.
 
     Example:
         >>> mdnum.allow_code()
@@ -34,7 +34,7 @@ def allow_code(allow: bool = True) -> Iterator[None]:
 
 
 def is_allowed() -> bool:
-    """Return True if Python code that a system file refers to may be executed in this context."""
+    """Return True if Python files to which a system file refers may be executed in this context."""
     return _ALLOWED.get()
 
 
@@ -51,7 +51,7 @@ def parts(place: str, folder: Path, where: str = "potential.function") -> tuple[
 
 
 def function(place: str, folder: Path, where: str = "potential.function") -> Callable[..., Any]:
-    """Execute a Python file that a system file or an option refers to, and return the named function.
+    """Execute a Python file that is given in a system file or an option, and return the named function.
 
     Args:
         place: text such as "mine.py:morse", relative to folder.

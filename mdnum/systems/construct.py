@@ -210,7 +210,7 @@ def _integrator(
 
 
 def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -> Mapping[str, Any]:
-    """Return the options of an integrator in system-file units; validate them if it is built in."""
+    """Return the options of an integrator in system-file units; options of built-in ones are validated."""
     if kind not in (INTEGRATORS[one] for one in INTEGRATORS.shipped):
         return numbers
     table = {key: one.item() if hasattr(one, "item") else one for key, one in numbers.items()}
@@ -259,7 +259,7 @@ def cut(
     *,
     where: str = "",
 ) -> CutPotential:
-    """Combine a pair potential with its cutoff, with one radius per pair type; for arguments see `Cut`.
+    """Truncate a pair potential, with one cutoff radius per pair type; for arguments see `Cut`.
 
     Args:
         weights: weights of the atoms, if any. where: prefix of parameter names in messages.
@@ -327,7 +327,7 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
 
 
 def common(terms: Mapping[str, Term]) -> Cut:
-    """Return a cutoff with the comparison (such as r < r_cut) that all terms have in common.
+    """Return a cutoff whose comparison (such as r < r_cut) is the same for all terms.
 
     Raises:
         InputError: there are no terms, or the terms have different comparisons.
@@ -378,7 +378,7 @@ def _is_array(value: Any) -> bool:
 
 
 def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, "types"]:
-    """Return one number per pair type, from a single number or from numbers by pair of species.
+    """Return an array with one number per pair type, from a single number or numbers by pair of species.
 
     Raises:
         InputError: the number of a pair is missing or not finite.
@@ -399,7 +399,7 @@ def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, 
 
 
 def by_species(value: Mapping[str, Any], symbols: Sequence[str], what: str) -> Float[np.ndarray, "species"]:
-    """Return one number per chemical species, in the order of the chemical symbols.
+    """Return an array with one number per chemical species, in the order of the chemical symbols.
 
     Raises:
         InputError: the number of a species is missing or not finite.
@@ -435,7 +435,7 @@ def assembled(
     steps: int,
     save_every: int,
 ) -> Simulation:
-    """Create a simulation from its components; the other arguments are attributes of `Simulation`.
+    """Create a simulation from components; arguments not listed are attributes of `Simulation`.
 
     Args:
         atoms: the structure, with momenta unless velocities are drawn.

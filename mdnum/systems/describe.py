@@ -1,4 +1,4 @@
-"""Description of a simulation as plain tables, for its run folder, its digest and comparisons.
+"""Conversion of a simulation to plain tables, which are stored, hashed and compared.
 
 The tables have the keys of a system file, even if the simulation was made from objects.
 """
@@ -58,7 +58,7 @@ def program(simulation: Simulation) -> dict[str, Any]:
 
 
 def described(simulation: Simulation) -> dict[str, Any]:
-    """Describe the objects of a simulation, with its name and a digest of the state at step 0."""
+    """Return a description of a simulation's objects, with its name and a digest of the initial state."""
     formula = simulation.structure.get_chemical_formula()
     return {
         "name": simulation.name,
@@ -82,7 +82,7 @@ def write(simulation: Simulation, folder: Path) -> None:
 
 
 def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return comparable tables of two simulations, from their system files if both have a system file."""
+    """Return tables of two simulations for comparison, from system files if both simulations have one."""
     files = [one.origin.system for one in (a, b)]
     if a.file is not None and None not in files:
         first, second = (one.spec.model_dump(mode="json") for one in files if one is not None)
@@ -91,12 +91,12 @@ def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any
 
 
 def reduction_word(reduction: Any) -> str:
-    """Return the name of a summation order in system files; if it has none, its Python representation."""
+    """Return the name of a summation order in system files, or its Python representation without a name."""
     return next((word for word, known in BY_NAME.items() if known == reduction), repr(reduction))
 
 
 def plain_leaf(leaf: Any) -> Any:
-    """Represent an array by a number, by a list of up to 64 numbers, or by a digest if it is larger."""
+    """Represent an array by a number, by a list of at most 64 numbers, or by a digest."""
     array = np.asarray(leaf)
     if array.size == 1:
         return array.reshape(()).item()
@@ -168,7 +168,7 @@ def _leaves(tree: Any) -> dict[str, Any]:
 
 
 def _code(function: Any) -> dict[str, Any]:
-    """Return the source of a user's function and a digest of it (of the bytecode, if there is no source)."""
+    """Return source code and digest of a user's function (a digest of bytecode, if there is no source)."""
     if function is None:
         return {}
     try:

@@ -44,12 +44,12 @@ class Evaluation:
 
     @property
     def i(self) -> Int[np.ndarray, "pairs"]:
-        """First atoms of the pairs inside the cutoff."""
+        """Index of the first atom of each pair inside the cutoff."""
         return self._pairs[0]
 
     @property
     def j(self) -> Int[np.ndarray, "pairs"]:
-        """Second atoms of the pairs inside the cutoff."""
+        """Index of the second atom of each pair inside the cutoff."""
         return self._pairs[1]
 
     @property
@@ -83,7 +83,7 @@ class Evaluator:
         cell: Float[np.ndarray, "3 3"] | None = None,
         stress: bool = True,
     ) -> Evaluation:
-        """Compute energy, forces, stress and pairs of a configuration.
+        """Compute energy, forces, stress and the pairs inside the cutoff of a configuration.
 
         Args:
             positions: positions, length; default the structure's.
@@ -119,7 +119,7 @@ class Evaluator:
         return float(energy), found
 
     def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
-        """Return the simulation in the cell, wrapped positions, neighbor list, and positions in its order."""
+        """Return the simulation in a cell, wrapped positions, neighbor list, and positions in list order."""
         check_not_forked()
         own = self.simulation
         same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
@@ -131,7 +131,7 @@ class Evaluator:
         return here, wrapped, table, tables, jax.device_put(x)
 
     def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
-        """Return the neighbor list; rebuild it first if pairs inside the cutoff could be missing."""
+        """Return the neighbor list, which is rebuilt if pairs inside the cutoff could be missing."""
         if self._kept is not None:
             table, tables, reference, reference_cell = self._kept
             if self._verlet.consumed(wrapped, here.cell, reference, reference_cell) <= 1.0:

@@ -141,12 +141,12 @@ class System:
 
     @property
     def species(self) -> tuple[str, ...]:
-        """Chemical symbols present, sorted."""
+        """Chemical symbols of the species in the structure, sorted."""
         return structures.species_of(self.atoms)[0]
 
     @property
     def draw(self) -> structures.Draw:
-        """How the velocities of step 0 are created."""
+        """Settings by which the velocities of step 0 are drawn."""
         dynamics, drawn = self.spec.dynamics, not self.atoms.has("momenta")
         return structures.Draw(float(dynamics.temperature), dynamics.seed, dynamics.remove_drift, drawn)
 
@@ -158,7 +158,7 @@ class System:
 
     @property
     def ignored(self) -> list[str]:
-        """Columns of the structure file that look like velocities; empty if the velocities are read."""
+        """Columns of the structure file that look like velocities; empty if velocities are read from it."""
         structure = self.spec.structure
         return structures.ignored(structure, self.folder) if structure.velocities == "file" else []
 
@@ -194,7 +194,7 @@ class System:
         return {file for one in self.spec.interactions.values() for file in self._files(one.potential)}
 
     def to_toml(self, *, beside: bool = True) -> str:
-        """Return the text of the system file with every default written out.
+        """Return the text of the system file, with all default values included.
 
         Args:
             beside: True if the text is stored in the folder that write() creates. The text then refers to the
@@ -278,7 +278,7 @@ class BallSystem:
         return BallSystem(self.name, spec, self.path, {**self.variants, name: variant})
 
     def for_steps(self, steps: int) -> BallSystem:
-        """Return this system with another number of steps; a list of accelerations is shortened or extended.
+        """Return this system with another number of steps, and with one control acceleration per step.
 
         Args:
             steps: number of steps of a run, at least 1.
@@ -296,7 +296,7 @@ class BallSystem:
         return replace(self, spec=self.spec.model_copy(update=update))
 
     def to_toml(self, *, beside: bool = True) -> str:
-        """Return the text of the system file with every default written out; `beside` has no effect."""
+        """Return the text of the system file, with all default values; `beside` has no effect."""
         return toml.dump({"name": self.name, **self.spec.model_dump(exclude_none=True)})
 
     def write(self, folder: str | Path) -> Path:
@@ -307,7 +307,7 @@ class BallSystem:
 
 
 def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> BallSpec:
-    """Return the tables of a system with some keys changed, after validation.
+    """Change some keys in the tables of a system, and return the validated tables.
 
     Raises:
         InputError: the changed system cannot be run.

@@ -2,11 +2,12 @@
 
 A parameter is a number or an array of numbers, and its name is a path. Paths are keys of a system file
 ("potential.sigma", "cutoff.radius", "dynamics.timestep") or lead to a component of a potential
-("potential.layers.0.weight"). A single entry of an array is also a parameter: "potential.pairs.Ni-P.sigma" as
-in system files, "position.17.x", "velocity.17.x", or path and indices, "potential.layers.0.weight.3.2".
+("potential.layers.0.weight"). A single array entry is also a parameter, such as "potential.pairs.Ni-P.sigma"
+(as in system files), "position.17.x", "velocity.17.x" or "potential.layers.0.weight.3.2" (a path with
+indices).
 
-`dynamics.temperature` is the temperature of drawn velocities, which scale with its square root, and of the
-thermostat; it does not change velocities of the structure. `velocity.scale` scales any velocities.
+`dynamics.temperature` is the temperature of the thermostat and of drawn velocities, which scale with its
+square root; velocities of the structure do not change. `velocity.scale` scales any velocities.
 `cutoff.radius` also moves the onset if the cutoff does not switch. `box.scale` scales the box and all
 positions.
 """
@@ -88,7 +89,7 @@ def parameters(simulation: Simulation) -> dict[str, Parameter]:
 
 
 def names(simulation: Simulation) -> tuple[str, ...]:
-    """Return the paths of all parameters, excluding single entries."""
+    """Return the paths of all parameters, without paths of single array entries."""
     model, draw = simulation.model, simulation.draw
     if simulation.pairwise:
         found = list(pair_leaves(model))
@@ -100,7 +101,7 @@ def names(simulation: Simulation) -> tuple[str, ...]:
 
 
 def numbers(simulation: Simulation) -> tuple[str, ...]:
-    """Return the paths of all scalar parameters, excluding single coordinates and weights."""
+    """Return the paths of all scalar parameters, without single coordinates and weights."""
     file = simulation.origin.system
     # as its file has it the radius would move along with sigma
     ends = [] if file is None else [one.cutoff for one in file.spec.interactions.values()]
@@ -134,7 +135,7 @@ def is_positive(simulation: Simulation, name: str) -> bool:
 
 
 def by(simulation: Simulation, name: str) -> str:
-    """Return "pair type", "species" or "atom" if a parameter has one entry for each of them, else ""."""
+    """Return "pair type", "species" or "atom" if a parameter has one entry for each, otherwise ""."""
     if name.startswith("initial.") or is_weight(name):
         return "atom"
     if not _is_typed(simulation, name) or simulation.pair_types == 1:
@@ -198,8 +199,8 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
     """Return the arrays of pair potentials and their cutoffs by path.
 
     `shared` includes arrays that do not depend on the pair type, `species` includes arrays with one entry per
-    species. The path `cutoff.radius` is the radius of all terms if all radii agree. Otherwise each term has
-    its own path, and terms with equal radii refer to the same array.
+    species. The path `cutoff.radius` is the radius of all terms if all radii agree. If radii differ, each
+    term has its own path, and terms with equal radii refer to the same array.
     """
     found: dict[str, Any] = {}
     for part in model.parts:
@@ -218,7 +219,7 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
 
 
 def shared_radius(model: Any, name: str) -> tuple[str, ...]:
-    """Return all terms that share the cutoff radius of the term in a path; empty if the term is alone."""
+    """Return all terms that share the cutoff radius to which a path refers; empty if only one term has it."""
     table, term, key = (*name.split(".", 2), "", "")[:3]
     if table != "terms" or key != "cutoff.radius":
         return ()
@@ -289,7 +290,7 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
 
 
 def _heated(simulation: Simulation, new: float) -> Simulation:
-    """Set the temperature of drawn velocities; if they were changed after the draw, scale them."""
+    """Set the temperature of drawn velocities; velocities that were changed after the draw are scaled."""
     old = simulation.draw
     heated = replace(simulation, draw=replace(old, temperature=new))
     if not (old.temperature and old.drawn) and "temperature" in simulation.integrator.numbers():
@@ -337,7 +338,7 @@ def entry(simulation: Simulation, name: str) -> Entry:
 
 
 def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
-    """Return the paths of entries for single species or pairs of species; empty for a single species."""
+    """Return the paths of entries for each species or pair of species; empty if there is one species."""
     if not simulation.pairwise or simulation.pair_types == 1:
         return {}
     single = _by_species(simulation)
@@ -383,7 +384,7 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
 
 
 def changed(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
-    """Return the simulation with other values of system-file keys or parameters, after validation.
+    """Change values of system-file keys or parameters; return the new, validated simulation.
 
     A simulation from a system file is rebuilt from this file with the new values. If a parameter has no key
     in system files, the new simulation does not have a file.

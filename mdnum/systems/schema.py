@@ -92,7 +92,7 @@ class PairPotentialTable(TomlTable):
 
     @property
     def constants(self) -> tuple[str, ...]:
-        """Names of the constants of one pair."""
+        """Names of the constants of the potential for one pair of species."""
         return tuple(key for key in type(self).model_fields if key not in ("kind", "pairs"))
 
 
@@ -172,7 +172,7 @@ def _kinds(*tables: type[TomlTable]) -> list[str]:
 
 
 def _other_than(*tables: type[TomlTable]) -> Any:
-    """Return the type of the key `kind` for tables whose kind is not one of the built-in kinds."""
+    """Return the type of the key `kind` in tables of potentials or integrators from other packages."""
     return Field(json_schema_extra={"not": {"enum": [*_kinds(*tables)]}})
 
 
@@ -196,7 +196,7 @@ class OtherTable(PairPotentialTable):
 
     @property
     def constants(self) -> tuple[str, ...]:
-        """Names of the constants of one pair."""
+        """Names of the constants of the potential for one pair of species."""
         return tuple(field.name for field in fields(loaded(_POTENTIALS)[self.kind]))
 
     @model_validator(mode="after")
@@ -212,7 +212,7 @@ def _check_names(given: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def _or_other(tables: Sequence[type[TomlTable]], other: type[TomlTable], registry: str) -> Any:
-    """Return a union of tables selected by kind, with a further table for kinds from other packages."""
+    """Return a union type of tables selected by kind, including a table for kinds from other packages."""
     tags = dict(zip(_kinds(*tables), tables, strict=True))
 
     def kind_of(value: Any) -> Any:
@@ -259,17 +259,17 @@ class CutoffTable(TomlTable):
 
     @property
     def switches(self) -> bool:
-        """True if this kind of cutoff has an onset."""
+        """True if this kind of cutoff has a switching function, which begins at the onset."""
         return _switches(self.kind)
 
     @property
     def base(self) -> float | None:
-        """Reference length of the onset of switching: the radius, as a length or a multiple of sigma."""
+        """Cutoff radius with which the onset is compared, as a length or a multiple of sigma."""
         return self.radius if self.radius is not None else self.in_sigma
 
     @staticmethod
     def foreign_keys(table: Mapping[str, Any]) -> set[str]:
-        """Return the keys that do not apply to the kind of cutoff in a table."""
+        """Return the keys of a cutoff table that do not apply to the kind of cutoff in this table."""
         kind = table.get("kind")
         return set() if _switches(kind) else {"onset"}
 
@@ -391,7 +391,7 @@ class _Dynamics(TomlTable):
 
 
 class NVETable(_Dynamics):
-    """Constant energy, with velocity Verlet."""
+    """Dynamics at constant energy with the velocity Verlet integrator."""
 
     kind: Literal["nve"]
     temperature: NonNegative = Field(
@@ -401,7 +401,7 @@ class NVETable(_Dynamics):
 
 
 class LangevinTable(_Dynamics):
-    """Constant temperature, with Langevin dynamics (BAOAB)."""
+    """Constant temperature with Langevin dynamics (the BAOAB integrator)."""
 
     kind: Literal["langevin"]
     temperature: NonNegative = Field(description="of the bath, and of drawn velocities (K or ε/k)")
@@ -620,7 +620,7 @@ class SystemSpec(TomlTable):
 
     @property
     def interactions(self) -> dict[str, Interaction]:
-        """Potentials and cutoffs by term; the name "" stands for a potential without terms."""
+        """Potential and cutoff of each term, by name; a single potential has the name ""."""
         if self.terms is None:
             return {"": Interaction(self.potential, self.cutoff)}
         return {name: Interaction(one.potential, one.cutoff) for name, one in self.terms.items()}
@@ -638,7 +638,7 @@ class SystemSpec(TomlTable):
 
     @property
     def resolved(self) -> SystemSpec:
-        """Tables of the file, in which defaults that depend on other keys are filled in."""
+        """Tables of the system file, including default values that depend on other keys."""
         update: dict[str, Any] = {"neighbors": self.neighbors.model_copy(update={"skin": self.skin})}
         update["cutoff"] = _with_onset(self.cutoff)
         if self.terms is not None:
@@ -650,7 +650,7 @@ class SystemSpec(TomlTable):
 
     @staticmethod
     def follow(data: dict[str, Any], values: Mapping[Key, Any]) -> None:
-        """If temperature or seed is changed, set velocities to be drawn, so that the change has an effect."""
+        """If the temperature or the seed is changed in an NVE system, let velocities be drawn again."""
         structure, dynamics = data.get("structure"), data.get("dynamics")
         if not isinstance(structure, dict) or not isinstance(dynamics, dict) or dynamics.get("kind") != "nve":
             return

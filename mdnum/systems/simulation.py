@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Origin:
-    """The source of a simulation: its name, description and system file."""
+    """The origin of a simulation: its name, description and system file."""
 
     name: str  # what it is called
     about: str = ""  # a sentence for people
@@ -148,7 +148,7 @@ class Simulation:
 
     @property
     def imposable(self) -> bool:
-        """True if decisions can be imposed; an energy function that applies the cutoff ignores them."""
+        """True if cutoff decisions can be imposed; not if the energy function itself applies a cutoff."""
         return self.pairwise or self.model.trusts_list
 
     @property
@@ -173,7 +173,7 @@ class Simulation:
 
     @cached_property
     def force(self) -> PairForce | ManyBodyForce:
-        """Function that computes forces and cutoff decisions for a neighbor list, for use inside jit."""
+        """Function that computes forces and cutoff decisions from positions and a list, inside jit."""
         # kept for later calls, so it must hold no tracer even where its first use is inside a jit
         with jax.ensure_compile_time_eval():
             parts = (self.model, self.cell, self.decider, self.policy, self.reduction)
@@ -215,7 +215,7 @@ class Simulation:
         describe.write(self, Path(folder))
 
     def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-        """Return the unwrapped positions and the velocities of step 0, as the state represents them."""
+        """Return the unwrapped positions and the velocities of step 0, rounded as in the state."""
         if self.fixed_point is None:
             return self.positions, self.velocities
         scheme, masses = self.propagator, jnp.asarray(self.masses)
@@ -235,7 +235,7 @@ class Simulation:
         return len(self.decider.r_cut) // self.channels
 
     def type_of(self, i, j) -> Int[np.ndarray, "..."]:
-        """Return the index of a pair's cutoff radius: its pair type plus an offset for the channel.
+        """Return an index of the pair's cutoff radius, which depends on species and group of terms.
 
         Args:
             i: index of the first atom, plus the number of atoms times the index of the channel.
@@ -246,21 +246,21 @@ class Simulation:
         return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
 
     def first_atoms(self, i: Any) -> dict[str, Any]:
-        """Return the first atom of each decision, and its term if there are several; for i see `type_of`."""
+        """Return the first atom of each decision, and the term if terms have separate decisions."""
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """Return the term of each decision type as a table column; empty if all terms share one decision."""
+        """Return a table column with the term of each decision; empty if all terms share decisions."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])
         return {"terms": names[kind // self.pair_types]}
 
     def pair_of(self, i: int, j: int) -> dict[str, Any]:
-        """Return the atoms of a pair, and the term if terms have separate radii; for i see `type_of`."""
+        """Return the atoms of a pair as a table row, and the term if terms have separate decisions."""
         return {key: np.asarray(one).item() for key, one in self.first_atoms(i).items()} | {"j": int(j)}
 
     def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
@@ -298,7 +298,7 @@ class Simulation:
 
     @property
     def lists(self) -> tuple[Any, ...]:
-        """Settings that determine the neighbor lists and their order; equal values give equal lists."""
+        """Settings that determine the neighbor lists: systems with equal values have equal lists."""
         return self.rule, self.builder
 
     def verlet_list(self, skin: float | None = None) -> VerletList:
@@ -344,7 +344,7 @@ class Simulation:
 
     @property
     def apart(self) -> Simulation:
-        """The same system with separate cutoff decisions for each term, even if terms have equal radii."""
+        """The same system with separate decisions for each term, even if terms have equal cutoff radii."""
         return self.with_model(Channels.of_terms(self.model.terms, apart=True))
 
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
@@ -356,7 +356,7 @@ class Simulation:
         return self._ended(lambda _: made)
 
     def _ended(self, change: Callable[[Cutoff], Cutoff]) -> Simulation:
-        """Return the system with a changed cutoff for every term."""
+        """Return the system with the cutoffs of all terms changed by a function."""
 
         def ended(term: CutPotential) -> CutPotential:
             made, onset = change(term.cutoff), term.r_onset
@@ -379,7 +379,7 @@ class Simulation:
         return replace(self, policy=policy, decider=decider, fixed_point=None)
 
     def in_row(self, cell: Cell | None) -> Simulation:
-        """Return the system in the box of a step; unchanged if the integrator keeps the box constant."""
+        """Return the system with the box at a given step; unchanged if the box is constant."""
         return self.with_cell(jax.tree.map(np.asarray, cell)) if self.integrator.moves_cell else self
 
     def with_cell(self, cell: Cell) -> Simulation:

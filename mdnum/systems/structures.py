@@ -95,7 +95,7 @@ def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, 
 
 
 def species_of(atoms: Atoms) -> tuple[tuple[str, ...], Int64[np.ndarray, " atoms"]]:
-    """Return the chemical symbols present, sorted, and the index of each atom's symbol."""
+    """Return the sorted chemical symbols in a structure, and the index of each atom's symbol."""
     from ase.data import chemical_symbols
 
     numbers, place = np.unique(atoms.numbers, return_inverse=True)
@@ -105,7 +105,7 @@ def species_of(atoms: Atoms) -> tuple[tuple[str, ...], Int64[np.ndarray, " atoms
 
 
 def ignored(structure: schema.FileStructure | schema.BuilderStructure, folder: Path) -> list[str]:
-    """Return the columns of a structure file that have names like velocities but are not read as such."""
+    """Return the names of columns that look like velocities but are not read as velocities."""
     if isinstance(structure, schema.BuilderStructure):
         return []
     return ignored_velocities(_read(folder / structure.file, structure.index).arrays)
@@ -309,7 +309,7 @@ def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> No
 def _nearest(
     atoms: Atoms, within: float
 ) -> tuple[Float64[np.ndarray, " atoms"], Int64[np.ndarray, " atoms"], int]:
-    """Find the nearest periodic neighbor of each atom, and the number of pairs, within a given distance."""
+    """Find the nearest neighbor of each atom within a distance, and the number of pairs within it."""
     from scipy.spatial import KDTree
 
     count = len(atoms)
@@ -335,7 +335,7 @@ def nearest_distance(atoms: Atoms, within: float) -> float:
 def with_images(
     atoms: Atoms, reach: float
 ) -> tuple[Float64[np.ndarray, "places 3"], Int64[np.ndarray, " places"]]:
-    """Return positions of atoms and of images up to 2 `reach` outside the box, and the atom of each one."""
+    """Return positions of all atoms and of their images near the box, and the atom of each position."""
     from mdnum.md.cell import complete
 
     cell = complete(atoms.cell.array, atoms.pbc)

@@ -1,9 +1,9 @@
 """Reading and writing system files in TOML format, error messages with line numbers, and overrides.
 
-The standard library reads TOML, but neither writes TOML nor records the line of a key. This module does both
-for the tables of a system file. A table whose keys depend on its kind is a union of pydantic models, selected
-by a key such as `kind` or `rule`; `models` finds the model of a key in such unions. Each error message is one
-line with the value found, the expected value and the line of the file.
+The standard library reads TOML, but does not write TOML and does not record the line of a key. This module
+adds both functions for system files. A table whose keys depend on its kind is a union of pydantic models,
+selected by a key such as `kind` or `rule`; `models` finds the model of a key in such unions. Each error
+message is one line with the value found, the expected value and the line of the file.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def _dotted_prefix(text: str) -> tuple[Key, int]:
 
 
 def line_of(text: str, key: Key) -> int | None:
-    """Return the line (from 1) that sets a key or starts its innermost table; None if there is neither."""
+    """Return the line (from 1) that sets a key or starts its table; None if there is no such line."""
     best: tuple[int, int] | None = None
     table: Key = ()
     for number, line in enumerate(text.splitlines(), start=1):
@@ -271,12 +271,12 @@ class TomlTable(BaseModel):
 
 
 def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
-    """Create the validation error for a value that cannot be run, with the dotted key of this value."""
+    """Create the validation error for an invalid value, with the dotted key of this value."""
     return PydanticCustomError("unusable", "{said}", {"said": message, "remedy": remedy, "key": key})
 
 
 def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
-    """Return the possible models of the table at a key, best match first; empty if the key has no table."""
+    """Return the possible pydantic models of the table at a key, best match first; empty for a value."""
     found, table = [root], data
     for part in key:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}
@@ -297,7 +297,7 @@ def _models_in(annotation: Any) -> Iterator[type[TomlTable]]:
 
 
 def _chosen(options: Sequence[type[TomlTable]], table: Any) -> type[TomlTable] | None:
-    """Select the model of a union that matches the contents of a table."""
+    """Return the pydantic model in a union that matches the contents of a table."""
     tag = _tag_of(options)
     given = table.get(tag) if tag and isinstance(table, Mapping) else None
     if tag and isinstance(given, str):
@@ -498,7 +498,7 @@ def read_overrides(overrides: Mapping[str, Any] | None) -> dict[Key, Any]:
     """Parse overrides from dotted keys to values; text is parsed as a TOML value.
 
     Raises:
-        InputError: a key is not a dotted key.
+        InputError: a key is not a valid dotted key.
     """
     changes = {dotted(key): value for key, value in (overrides or {}).items()}
     return {key: scalar(value) if isinstance(value, str) else value for key, value in changes.items()}

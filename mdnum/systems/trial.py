@@ -1,7 +1,7 @@
 """Trial calls of a user's energy function at one configuration, with equivalent neighbor lists.
 
-One compiled function computes energy and derivatives; another computes only the energy, for a list with more
-padding. Both are compiled with few optimizations, because classification needs only a few dozen calls.
+One compiled function computes energy and derivatives, and another computes only the energy, with more padding
+in the list. Both functions are compiled with few optimizations, because only a few dozen calls are needed.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Trial:
     # --- the programs ---------------------------------------------------------------------------------
 
     def _lists(self) -> None:
-        """Find the format of the function's own neighbor list, whether it has self-pairs, and parameters."""
+        """Find the format of the function's neighbor list, whether it has self-pairs, and the parameters."""
         model, lists, own = self.model, self.model.lists, None
         if lists is not None:
             for x in (self.x / self.call.length, self.x @ np.linalg.inv(self.cell)):
@@ -130,7 +130,7 @@ class Trial:
             self.model = replace(model, parameters=model.start(key, x, own))
 
     def bare(self, parameters, x, idx, real, cell, box, strain, code):
-        """Return the energy in the function's own unit, for positions and a box in its own convention."""
+        """Call the energy function with arguments in its convention; return the energy in its unit."""
         call, model = self.call, self.model
         neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
         if call.how.images:
@@ -138,7 +138,7 @@ class Trial:
         return call.bare(parameters, x, neighbor, {"cell": cell, "box": box, "perturbation": strain})
 
     def arguments(self, idx=None, x=None, cell=None, code=0) -> tuple[Any, ...]:
-        """Convert real positions and a box to arguments of `bare`, with the convention found so far."""
+        """Convert positions and box to arguments of the energy function, in its calling convention."""
         call, how = self.call, self.call.how
         idx, x, cell = (
             own if one is None else one for one, own in ((idx, self.inside), (x, self.x), (cell, self.cell))
@@ -200,7 +200,7 @@ class Trial:
     # --- calling it -----------------------------------------------------------------------------------
 
     def there(self, x=None, idx=None, cell=None, code=0) -> tuple[float, Float[np.ndarray, "atoms 3"]]:
-        """Compute energy and forces in the simulation's units; for arguments see `arguments`."""
+        """Compute energy and forces in the units of the simulation; for arguments see `arguments`."""
         how, call, cell = self.call.how, self.call, self.cell if cell is None else cell
         energy, (slope, *_) = self.slopes(*self.arguments(idx, x, cell, code))
         honest = how.fractional and not how.real_slope
@@ -208,7 +208,7 @@ class Trial:
         return float(energy) * call.unit, -np.asarray(slope) @ by_x * call.unit
 
     def energy(self, x=None, idx=None, cell=None) -> float:
-        """Compute only the energy, for a list with more padding, in a quarter of the time of `there`."""
+        """Compute only the energy, which takes a quarter of the time of energy and forces."""
         idx = self._padded(self.inside if idx is None else idx)
         return float(self._alone[0](*self.arguments(idx, x, cell))) * self.call.unit
 
@@ -232,7 +232,7 @@ class Trial:
         return np.sqrt(sum(c * c for c in d))
 
     def culprit(self, idx) -> str:
-        """Return the first operation whose result is not finite in the energy or its derivative."""
+        """Return the first operation with an infinite or NaN result in the energy or its derivative."""
         return named(first_not_finite(jax.value_and_grad(self.bare, 1), *self.arguments(idx)))
 
 
