@@ -34,8 +34,7 @@ _TERMS = 14
 def growth(a: Rate) -> Rate:
     """Return (exp(a) - 1) / a = Σ aᵏ / (k + 1)! for a number or (3, 3) matrix a with norm up to 0.5.
 
-    For matrices, the characteristic polynomial is used, so that the result is differentiable even if
-    eigenvalues are equal.
+    For matrices, the characteristic polynomial is used, which is differentiable if eigenvalues are equal.
     """
     if a.ndim == 0:
         total = jnp.zeros(())
@@ -314,8 +313,8 @@ class CellRescaling(Barostat):
     def _forces(self, v, at):
         """Return √V, the force on √V, and the traceless part of the excess pressure tensor (see `excess`).
 
-        The force on √V is the derivative of k_B T times the logarithm of the density of √V, V^(1/2) exp(-(U +
-        K + p V) / k_B T).
+        The force on √V is the derivative of k_B T times the logarithm of the density of √V, √V exp(-(U + K +
+        p V) / k_B T).
         """
         root, excess = jnp.sqrt(volume(at.cell)), self.excess(v, at)
         part = trace(excess) / 3

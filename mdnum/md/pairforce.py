@@ -86,7 +86,7 @@ class PairForce(eqx.Module):
 
     @property
     def law(self) -> CutPotential | Guarded:
-        """The potential in the arithmetic of the policy: sixteen-bit types are rounded at every operation."""
+        """The potential in the precision policy's arithmetic, rounded at every operation for 16-bit types."""
         model = self.model.typed
         return Guarded(model, self.zero, rounded) if self._short else model
 

@@ -234,7 +234,7 @@ class PairFunction(PairPotential):
         return energy, slope * (0.5 / r)
 
     def energy(self, r2: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the energy at squared distances, the first value of `evaluate`."""
+        """Return the energy at squared distances, equal to the first value of `evaluate`."""
         parameters = self.typed.leaves | self.shared
         return self.function(r2 if self._of_square else jnp.sqrt(r2), **parameters)
 
@@ -434,7 +434,7 @@ class CutPotential(eqx.Module):
 class Channels(eqx.Module):
     """Sum of potentials with different cutoff radii, with one decision per pair and radius.
 
-    Decisions are numbered by pair type, plus the number of pair types in all previous channels.
+    Decisions are numbered consecutively over the pair types of all channels.
     """
 
     parts: tuple[CutPotential, ...]

@@ -33,7 +33,7 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
     """Return numerical values as a numpy array, without a copy if possible.
 
     Raises:
-        InputError: the numbers have an unexpected dtype, floats have fewer than 32 bits, or the values have
+        InputError: the numbers have an unexpected dtype, floats are narrower than 32 bits, or values have
             units.
     """
     if hasattr(values, "value_in_unit"):

@@ -190,8 +190,8 @@ def _walk(stream, atoms, whole, small):
     """Return the number of bits occupied by the coordinates of `atoms` atoms; -8 if the stream is invalid.
 
     The coordinates of an atom occupy `whole` bits, followed by a flag. If the flag is set, the next five bits
-    contain the number of following atoms that are stored as differences of `small` bits each, and the change
-    of `small`.
+    contain the number of following atoms stored as differences of `small` bits each, and the change of
+    `small`.
     """
     at, done, run = 0, 0, 0
     most = 8 * stream.shape[0]

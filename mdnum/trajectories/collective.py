@@ -41,8 +41,7 @@ class Collective:
             x: positions of a sample of the atoms, which represents all atoms.
             atoms: number of all atoms.
             side: length of the shortest lattice vector; 0 without a periodic direction.
-            far: smallest displacement between two frames that counts as large in this box, length; 0 without
-                a box.
+            far: smallest displacement between two frames that counts as large, length; 0 without a box.
         """
         now, least, last, alike = spreads(x), self.least, self.last, self.alike
         share, axis, value = _most_alike(x)
@@ -110,8 +109,7 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
 def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
     """Return (fraction of the atoms with the most frequent coordinate value, axis of the coordinate, value).
 
-    The fraction of the second most frequent value is subtracted; in a crystal, both values are equally
-    frequent.
+    The fraction of the second most frequent value is subtracted; in a crystal, both are equally frequent.
     """
     ordered = np.sort(x, axis=0)
     repeated = np.count_nonzero(ordered[1:] == ordered[:-1], axis=0)

@@ -2,8 +2,8 @@
 
 Rounding to three decimals changes every coordinate by up to half a unit of the third decimal. The decision
 whether a pair is inside a cutoff is uncertain if the pair distance deviates from the cutoff by less than the
-rounding error of a distance. `infer` finds the decimal grid of the coordinates, so that the precision need
-not be documented.
+rounding error of a distance. `infer` finds the decimal grid of the coordinates, so that no documented
+precision is needed.
 
 Rounding of coordinates shifts a crossing to another frame, hides a short visit, or makes a pair near the
 cutoff cross it. The affected flips cannot be identified from one file, but their number is estimated by

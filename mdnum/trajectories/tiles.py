@@ -7,8 +7,7 @@ decisions are processed further. If float32 cannot decide a pair, or the margin 
 squared distance is computed (`search.exact_square`).
 
 Tiles remain valid as long as all atoms of each cluster stay inside an enlarged bounding box of the cluster.
-Coordinates are unwrapped from frame to frame, so that wrapping of atoms in the file does not invalidate
-tiles.
+Coordinates are unwrapped from frame to frame, so that wrapping in the file does not invalidate tiles.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ computed from MDAnalysis's box are silently wrong:
 In a PDB file with many models, MDAnalysis loses boxes outside the models. Programs write CRYST1 once in the
 header (OpenMM), before each model (GROMACS), or inside each model. MDAnalysis reads a model from its MODEL
 record to the next MODEL record. A box before the first model is therefore never read, and a box between two
-models is assigned to the first of them.
+models is assigned to the first instead of the second.
 """
 
 from __future__ import annotations
