@@ -1,12 +1,12 @@
 """Reverse-mode derivatives of a simulation at its recorded states and decisions.
 
 With jax.value_and_grad, the forward pass rounds differently from an ordinary run, and after some thousand
-steps makes other decisions. Here, the run is made first, by the same program as every other run.
+steps makes other decisions. In this module, an ordinary run is made and recorded first.
 
 A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
 times that vector. For a pair potential, J times a vector is a sum over neighbors, like the forces, and
-requires no scatter operation. For any other energy, J times a vector is a tangent evaluation of the gradient
-of the energy. The operations of a step need not be stored.
+requires no scatter operation. For any other energy, J times a vector is the tangent of the energy's gradient.
+Reverse mode then needs no record of the operations within a step.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
     def with_shared(r2, along, inside, types, weights):
         """Compute the slope of each slot, and cotangents of r², of slot parameters and of shared parameters.
-        For a neural network, one reverse pass for all cotangents is cheaper than two.
+        A single reverse pass computes all cotangents, which is cheaper than two for a neural network.
         """
         ended, slots, onto = through(r2, along, inside, types, weights)
 
@@ -152,8 +152,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
     def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
-        """Return, for each neighbor slot, the terms of positions, forces, scale and wanted parameters (in
-        this order), and for a block of slots, the terms of parameters that all pairs share.
+        """Return the contributions of neighbor slots to cotangents: one per slot for positions, forces, scale
+        and parameters of its pair type (in this order); one per block of slots for shared parameters.
         """
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
@@ -227,8 +227,8 @@ def _differences(cell, own, other):
 
 
 def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
-    """Sum the terms of each atom's neighbor slots, which depend on differences between the two atoms of a
-    pair; also sum the terms of parameters that all pairs share.
+    """Sum contributions of all neighbor slots to the cotangents, which depend on differences between the
+    atoms of a pair, for each atom; sum contributions to shared parameters over all atoms.
     """
 
     def pair(own, other, types, inside):
@@ -306,8 +306,8 @@ class AdjointCarry(NamedTuple):
 
     A trace is an `AdjointCarry` with the cotangents at every step, without those of the first frame. Row k of
     a trace belongs to the state (x, half-kicked v) at the beginning of step first + k, without the
-    contribution of the cutoff crossings that lead to this state. Atoms are in the order of the neighbor list.
-    Unused rows at the end of a trace are undefined.
+    contribution of the cutoff crossings that lead to this state. Atoms in a trace are in the order of the
+    neighbor list. Unused rows at the end of a trace are undefined.
     """
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
@@ -451,10 +451,10 @@ def transposed(
 ):
     """Propagate cotangents backward through a stretch of steps with one neighbor list.
 
-    Returns cotangents at the beginning of the stretch, weights of its crossings, and cotangents of every
-    step. JAX transposes the part of a step between two force evaluations. For a linear `KickDrift`
-    integrator, the derivative of a step does not depend on the forces, which therefore need not be recorded;
-    `pull_back` computes forces for derivatives with respect to the integrator's parameters.
+    Returns cotangents at the beginning of the stretch, weights of crossings, and cotangents of every step.
+    JAX transposes the part of a step between two force evaluations. For a linear `KickDrift` integrator, the
+    derivative of a step does not depend on the forces, which therefore need not be recorded; `pull_back`
+    computes forces for derivatives with respect to the integrator's parameters.
     """
     loss, origin, around, onto_total, pace = looking
     order, moves = tables.order, integrator.moves_cell

@@ -2,9 +2,9 @@
 
 The derivative of an average with respect to a parameter has up to three contributions. First, the observable
 in each frame changes at fixed positions. Second, if the observable jumps when a pair enters the cutoff, the
-average changes with the cutoff radius by the jump times the density of pairs at the cutoff. Derivatives at
-fixed decisions lack the contribution of the jumps. Third, with a thermostat, the statistical weight
-exp(-U/kT) of each frame changes.
+average changes with the cutoff radius by the jump times the density of pairs at the cutoff; derivatives at
+fixed decisions lack this contribution. Third, with a thermostat, the statistical weight exp(-U/kT) of each
+frame changes.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def density(
 
     The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
     of the width; extrapolation from three widths, each half of the previous width, removes the second and
-    fourth powers. Of all extrapolations, the result is the one from the widest kernels that agrees with all
+    fourth powers. The result is the extrapolation from the widest kernels that agrees with all extrapolations
     from narrower kernels within twice the standard error of the difference.
 
     Args:
@@ -322,7 +322,7 @@ class Reweighting(Method):
     The derivative is the sum of the explicit derivative (see `BoundaryTerm`) and of the response of the
     weights, which is minus the covariance of the loss and the derivative of the energy, divided by kT.
 
-    Error: statistical; `details` contains a standard error from block averages. This standard error is large
+    Error: statistical; `details` contains a standard error from block averages. The standard error is large
     for few independent frames, and covers only the variation within the run. Source: Thaler and Zavadlav,
     Nature Communications 12, 6884 (2021).
     """

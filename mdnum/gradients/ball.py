@@ -5,7 +5,7 @@ fixed (frozen), or the loss averaged over random parameters (randomized). Method
 another model are in `ball_contacts`.
 
 JAX returns a derivative of 0.0 both if the run did not use a parameter and if the derivative underflowed or
-was clamped to zero. The function `dependence` distinguishes the two cases.
+was clamped to zero; the function `dependence` distinguishes the two cases.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def dependence(
 ) -> dict[str, Dependence]:
     """Determine whether a scalar loss depends on each parameter, in the branches and iterations that ran.
 
-    The test sets the tangent of a parameter to NaN. The NaN propagates through every operation that has a
+    The test sets the tangent of a parameter to NaN. This NaN propagates through every operation that has a
     derivative, even a derivative of zero, and through no other operation.
 
     Args:
@@ -167,8 +167,8 @@ def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str
 
 
 def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
-    """Return the program with loops in place of the custom derivative rule of `stopping.elementwise`. A zero
-    in the Jacobian of the rule would not show whether a loop has zero slope or did not run.
+    """Return the program with loops in place of the custom derivative rule of `stopping.elementwise`. From
+    the rule alone, a loop with zero slope cannot be distinguished from a loop that did not run.
     """
 
     def run(*inputs):
@@ -322,7 +322,7 @@ class RandomizedSmoothing(BallMethod):
 
     The estimate includes the effect of jumps of the loss, where iteration counts or contacts change. Each
     noise sample is used with both signs, so that a constant in the loss does not add to the variance. The
-    same seed gives the same result, bit for bit.
+    same random seed gives the same result, bit for bit.
     """
 
     # standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0)

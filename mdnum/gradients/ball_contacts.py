@@ -45,9 +45,9 @@ class FixedPointRule(eqx.Module):
     """Derivative rule for the contact projection: the derivative of the fixed point of its iteration.
 
     For a ball in contact, the iteration y ← G(y) = y + gain max(0, -y) approaches the fixed point y = 0 from
-    below. At y = 0, dG/dy is discontinuous. The derivative for y < 0 is used, because the iteration
-    approaches y = 0 from below (as for the active set of a complementarity problem). The implicit function
-    theorem, (1 - dG/dy) dy = dG/dgain dgain, gives gain dy = -y dgain for each ball.
+    below. At y = 0, dG/dy is discontinuous; its value for y < 0 is used, because the iteration approaches y =
+    0 from below (as for the active set of a complementarity problem). The implicit function theorem, (1 -
+    dG/dy) dy = dG/dgain dgain, gives gain dy = -y dgain for each ball.
     """
 
     # added to 1 - dG/dy; moves the answer by about regularization / gain, relative
@@ -82,8 +82,8 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """Gradient method: derivative of the fixed point of the projection, by the implicit function theorem.
 
-    The loss uses the iterations that ran. The derivative uses the limit of the iterations, the floor. The
-    method `unrolled` gives a nonzero derivative with respect to k, an artifact of the solver's tolerance.
+    The loss is that of the iterations that ran; the derivative is that of their limit, the floor. The method
+    `unrolled` gives a nonzero derivative with respect to k, an artifact of the solver's tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
@@ -141,8 +141,8 @@ def _with_contact(problem: BallProblem, contact: Any) -> BallProblem:
 class SoftImpact(eqx.Module):
     """Smooth model of an impact: a soft spring that is stiffer while the ball falls than while it rises.
 
-    The stiffness is k while the ball falls and restitution² k while it rises, with smooth transitions between
-    the two values and at the floor. The ball therefore leaves with restitution times its impact speed.
+    The stiffness is k while the ball falls and restitution² k while it rises, with smooth transitions, so
+    that the ball leaves the floor at `restitution` times its impact speed.
 
     Source: latching spring of Walton and Braun (1986), here with smooth transitions.
     """
@@ -189,8 +189,8 @@ class SoftFloor(BallMethod):
         Raises:
             InputError: eps is not positive, or the smooth program does not have the parameter.
 
-        Error: rounding error for the smooth program. With respect to the derivative of the given program, if
-        one exists, there is a bias that decreases with eps.
+        Error: rounding error for the smooth program; also, with respect to the derivative of the given
+        program (if there is one), a bias that decreases with eps.
         """
         eps = _suitable(problem) if self.eps is None else self.eps
         if not eps > 0:
@@ -259,10 +259,10 @@ class ThroughContacts(BallMethod):
     """Gradient method: derivative of the ball's motion in continuous time, including the times of contacts.
 
     Contact is decided at the end of a step. The derivative of the discrete steps therefore lacks the effect
-    that a ball that starts higher arrives later. This method adds the saltation matrix of every contact. If
-    impacts are located within a step, the program's own derivative already contains the saltation matrix. A
-    projection is treated like an impact. The force of a spring without a damper does not jump; for such a
-    spring the result is the same as from the method `unrolled`.
+    that a ball that starts higher arrives later. The saltation matrix of every contact adds this effect. If
+    impacts are located within a step, the program's own derivative already contains the saltation matrix. The
+    method treats a contact by projection like an impact. The force of a spring without a damper does not
+    jump; for such a spring the result is the same as from the method `unrolled`.
     """
 
     name = "event-aware"

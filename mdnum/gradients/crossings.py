@@ -1,10 +1,10 @@
 """Contributions of flips to a gradient through the times at which pairs cross their cutoff (saltation).
 
 A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the momentum of the
-pair differs after the crossing. Derivatives of a program's steps lack the effect of crossing times, however
-short the time step is. This effect is computed in reverse mode by the saltation matrix of mdnum.numerics, for
-the cutoff sphere as threshold. A loss that contains the potential energy or the virial also jumps at a
-crossing: if its frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
+pair differs after the crossing. Derivatives of a program's steps lack the effect of crossing times, even for
+short time steps. In reverse mode, the saltation matrix of mdnum.numerics gives this effect, with the cutoff
+sphere as threshold. A loss that contains the potential energy or the virial also jumps at a crossing: if its
+frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
 
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
 dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.
@@ -209,9 +209,8 @@ def of_energy(
 ) -> Float[Array, "most"]:
     """Compute cotangents of crossing distances for an energy function, with jumps E(with pair) - E(without).
 
-    The jump affects all atoms whose energy depends on the pair. The jump is evaluated with the pair at its
-    cutoff distance. For other pairs that cross in the same step, the decisions at the end of the step are
-    used.
+    The jump affects all atoms whose energy depends on the pair, and is evaluated with the pair at its cutoff
+    distance. For other pairs that cross in the same step, the decisions at the end of the step are used.
 
     Args:
         met: crossings whose `push` is one over the radial speed, negative where the pair leaves.

@@ -3,9 +3,9 @@
 A replica is the same system with different initial velocities and, with a thermostat, different noise.
 Replicas have different neighbor lists and are therefore run one after another on each device.
 
-When a parameter changes, cutoff crossings move to other steps. If the force jumps, the loss then jumps, too;
-between jumps, its slope is the derivative of the steps. The event-aware gradient is the slope across many
-jumps, which a finite difference for comparison must also span.
+When a parameter changes, cutoff crossings move to other steps. If the force jumps at the cutoff, the loss
+then jumps; between jumps, its slope is the derivative of the steps. The event-aware gradient is the slope
+across many jumps; a finite difference for comparison must span many jumps.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class Differentiated(NamedTuple):
 def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
     """Differentiate f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
-    Steps decrease by factors of 1.4, and the extrapolation with the smallest estimated error is returned. The
-    choice balances truncation errors of large steps against noise of small steps.
+    Steps decrease by factors of 1.4, and the extrapolation with the smallest estimated error is returned,
+    which balances truncation errors of large steps against noise of small steps.
 
     Args:
         f: function of one number. x: point. step: the largest step. levels: number of steps.
@@ -94,7 +94,7 @@ def richardson(f: Callable[[float], float], x: float, step: float, levels: int =
 def noise_of(values: Float[np.ndarray, "points"]) -> float:
     """Estimate the standard deviation of noise in function values at small equal spacings.
 
-    Differences of order k cancel the smooth function and amplify the noise by a known factor.
+    Finite differences of order k cancel the smooth function and amplify the noise by a known factor.
 
     Args:
         values: at least 4, so closely spaced that the function is nearly linear over all of them.
@@ -434,8 +434,9 @@ class SmoothedDifferences(Method):
     """Gradient method: mean over replicas of central differences with steps that span many flips.
 
     The two runs of a difference use the same random numbers. Differences with steps h and h/2 are
-    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with those from
-    all narrower steps within twice the standard error: narrower steps have more noise from single flips.
+    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with
+    extrapolations from all narrower steps within twice the standard error, because narrower steps have more
+    noise from single flips.
     """
 
     relative: float = 0.002  # the widest step as a share of the parameter

@@ -2,8 +2,8 @@
 
 A loss computes observations from each frame (and the first frame), sums the observations over frames, and
 computes a number from these sums. Averages, correlations with the start and histograms are losses of this
-form; derivatives also need only one frame at a time. Each loss of the command line is a class in this module
-with a name, a label and a unit.
+form. Derivatives of a loss need only one frame at a time, too. Each loss of the command line is a class in
+this module with a name, a label and a unit.
 """
 
 from __future__ import annotations
@@ -271,7 +271,7 @@ class GreenKuboDiffusion(Loss):
     integral is computed by the trapezoidal rule with a spacing of `every` steps.
 
     Error: of order (every × timestep)² times the slope of the autocorrelation at `until`.
-    Source: the source given for `EinsteinDiffusion`.
+    Source: see the source of `EinsteinDiffusion`.
     """
 
     name, unit = "diffusion-green-kubo", "{length}²/{time}"
@@ -308,7 +308,7 @@ class GreenKuboDiffusion(Loss):
 class RadialDistribution(Loss):
     """Loss computed from the radial distribution function g(r), averaged over frames.
 
-    Each distance is distributed over the four nearest bins with cubic B-spline weights, so that g(r) has two
+    Each pair distance contributes to the four nearest bins with cubic B-spline weights, so that g(r) has two
     continuous derivatives with respect to positions. For N atoms, the computing time of each frame is of
     order N² and the memory of order N.
 

@@ -106,7 +106,7 @@ class Gradient:
         value: the loss of the program that was differentiated.
         gradient: derivatives by full name of the parameter, in the shape of its value; complex for a complex
             loss.
-        notes: warnings about parameters, by name: no dependence, a missing term.
+        notes: warnings by parameter name, such as a missing contribution of flips.
         details: plain values of the method: counts, errors, tables.
         kind: what was differentiated. depends: whether the run used each parameter, if known.
     """

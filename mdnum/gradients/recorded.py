@@ -1,7 +1,7 @@
 """Gradient methods that linearize a recorded run, in reverse mode (cotangents) or forward mode (tangents).
 
-The run is made first, by the same program as every other run. The steps are then linearized at the recorded
-states and decisions; for a reversible run with a fixed-point state, the states are recomputed.
+An ordinary run is made and recorded first. The steps are then linearized at the recorded states and
+decisions; for a reversible run with a fixed-point state, the states are recomputed.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ class Forward(Method):
 class Reversible(Method):
     """Gradient method: derivative of the steps of a fixed-point run, which is reversed instead of stored.
 
-    The forward pass stores only the last state. Rounding to integers is differentiated as the identity.
+    The forward pass stores only the last state; rounding to integers is differentiated as the identity.
 
     Raises:
         NumericalError: the states of the reversed run differ from those of the forward run.

@@ -1,7 +1,7 @@
 """Forward-mode derivatives: tangents of a few parameters along the recorded run.
 
-A tangent is propagated through each step at the recorded state and decisions. Each parameter requires one
-additional force evaluation per step, and no memory beyond that of the recorded run.
+A tangent is propagated through each step at the recorded state and decisions. Each parameter entry requires
+one additional force evaluation per step, and no additional memory.
 """
 
 from __future__ import annotations

@@ -126,8 +126,8 @@ class Pace(NamedTuple):
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the number of frames per time around a step. If a jump just before the step occurs earlier
-        by dt, on average dt times this number of frames change, since frames are taken at whole steps.
+        """Return the number of frames per unit of time around a step: if a jump just before the step occurs
+        earlier by dt, this number times dt frames change on average.
         """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
@@ -224,7 +224,7 @@ class RunTape:
     def jumps_unseen(self) -> tuple[float, float]:
         """Derivatives of the loss with respect to energy and virial of a frame, if gradients do not include
         the jumps of energy and virial at flips, as for losses of a single frame. For equally spaced frames,
-        gradients include the jumps, and the derivatives returned are 0.
+        whose gradients include the jumps, both derivatives are set to 0.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0

@@ -1,13 +1,13 @@
 """Reverse-mode differentiation by JAX through all operations of the steps, like `jax.grad` of the run.
 
-A chunk is a scan over a fixed number of steps with one neighbor list. The number of steps limits the memory
-of reverse mode. When the list expires, the remaining steps of the chunk do nothing, and the host builds the
-next list at the current positions. States between chunks are stored. If memory is insufficient for all
-states, every second state is dropped, and the steps between stored states are run again.
+A chunk is a scan over a fixed number of steps with one neighbor list, which limits the memory of reverse
+mode. When the list expires, the remaining steps of the chunk do nothing, and the host builds the next list at
+the current positions. States between chunks are stored; if memory is insufficient, every second state is
+dropped, and the steps between stored states are run again.
 
 The forward pass of the differentiated program may round differently from an ordinary run, and therefore make
-other decisions; the gradient then belongs to another trajectory. Therefore, the state and the decisions at
-every step are compared with an ordinary run.
+other decisions; the gradient then belongs to another trajectory. Therefore, the states and decisions of all
+steps are compared with those of an ordinary run.
 """
 
 from __future__ import annotations

@@ -59,8 +59,8 @@ class Advice:
         best: the value furthest from the end for which this value and all values in between are within the
             tolerance, or else the end itself.
         undecided: the first value beyond `best` whose comparison is undecided.
-        converged: whether the value next to the end agrees with the end within the tolerance. If not, the end
-            itself may not be converged.
+        converged: whether the value next to the end agrees with the end within the tolerance; if not, the end
+            may not be converged.
     """
 
     key: str

@@ -1,7 +1,7 @@
 """Design of a sweep: the varied choices, their values, and the points (settings with seeds) to run.
 
 A choice is a key of the system file, or a name for several keys that are varied together (`precision`).
-Values are written as in a system file.
+Values of a choice are written as in a system file.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Means over random seeds, and differences between settings, each with its statistical error.
 
-For each run, the mean of a quantity has an error, estimated from its autocorrelation. The scatter of the
-means of several seeds estimates the same variance. The errors from autocorrelation have many degrees of
-freedom, but are too small if a mode relaxes more slowly than the length of a run. Errors from autocorrelation
-are therefore multiplied by one factor, which is determined from the scatter of all seeds of all settings.
+The error of a run's mean is estimated from autocorrelation, and also from the scatter of means over random
+seeds. Errors from autocorrelation have many degrees of freedom, but are too small if a mode relaxes more
+slowly than the length of a run. Errors from autocorrelation are therefore multiplied by one factor, which is
+determined from the scatter of means over all seeds and settings.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
     """Return the mean of one measure at each setting, over runs that differ only in their random seed.
 
     The error of a mean is the error from its runs, times the ratio of the scatter between seeds to the error
-    from the runs. The ratio is one number for all settings of a measure; with more settings, its error
-    decreases. If the error has fewer degrees of freedom than the scatter between the seeds of the setting,
+    from the runs. One such ratio is used for all settings of a measure; more settings make the ratio more
+    precise. If this error has fewer degrees of freedom than the scatter between seeds of a single setting,
     the scatter is used instead.
 
     Args:
@@ -139,9 +139,9 @@ def paired(
     """Return differences from a reference setting, seed by seed if runs with the same seed are correlated.
 
     Runs at constant energy with the same initial velocities may remain correlated. For uncorrelated runs, the
-    scatter of a few differences would be a poor estimate of the error. Runs are therefore compared seed by
-    seed only if the differences between runs with the same seed scatter significantly less, over all
-    comparisons, than differences between independent runs.
+    scatter of few differences is a poor estimate of the error. Runs are therefore compared seed by seed only
+    if the differences between runs with the same seed scatter significantly less, over all comparisons, than
+    differences between independent runs.
 
     Args:
         raw: results of `difference` for each comparison of one measure. by_seed: the differences of each

@@ -1,7 +1,7 @@
-"""Commands of mdnum (called verbs). Each verb has its own module and a function in the package `mdnum`.
+"""Commands of mdnum, called verbs; each verb has a module, and a function in the package `mdnum`.
 
 Each verb is declared in its module (see `mdnum.verbs.frame`) and in the text file of the same name;
-`__init__.toml` explains the tables in text files. Commands and kinds of folders are listed in no other file.
+`__init__.toml` explains the tables in text files. No other file lists commands and kinds of output folders.
 The module of a verb is imported when the verb is first used.
 """
 

@@ -1,6 +1,6 @@
 """`mdnum audit`: tests of whether an ASE calculator is safe to run and to differentiate.
 
-The checks of `mdnum.audit.checks.CHECKS` run in order, and each result is saved in the folder at once. If an
+The checks of `mdnum.audit.checks.CHECKS` run in order, and each result is saved in the output folder. If an
 audit is interrupted, the completed results are in the folder, and the remaining checks can be run later. A
 check returns codes of findings with values; audit.toml contains the sentences for these codes.
 """
@@ -63,8 +63,8 @@ def audit(
     """Test whether a calculator is safe to run and to differentiate.
 
     The number of calls of the calculator is limited, independent of its speed: about 6,000 calls for one
-    element, and at most 12,000. Calls that are needed for a verdict come first. If an audit is interrupted,
-    the results of the completed checks are in its folder.
+    element, and at most 12,000. Calls of the calculator that are needed for a verdict come first. If an audit
+    is interrupted, the results of the completed checks are in its folder.
 
     Example:
         >>> mdnum.audit_calculator(ase.calculators.emt.EMT(), "copper.xyz").verdict

@@ -206,8 +206,8 @@ def compared(
 def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """Return the run's deviations from the closed form, or None if no closed form exists.
 
-    A closed form exists for a ball above the floor under a constant downward acceleration, with an impact or
-    a projection (the ball with restitution) or a sharp penalty (the ball on a spring).
+    The motion of a ball has a closed form if the ball starts above the floor, the acceleration is constant
+    and downward, and the contact is an impact, a projection or a sharp penalty (a spring).
 
     Args:
         gradient: derivatives by each method; they are compared if the loss is a height.

@@ -131,8 +131,8 @@ def structure_findings(system: System) -> Iterator[Finding]:
 def temperature_findings(start: float, requested: float, atoms: int, unit: str) -> Iterator[Finding]:
     """Yield a warning if the temperature of the velocities differs greatly from the requested temperature.
 
-    A factor of up to three gives no warning, since an ideal crystal loses half of its kinetic energy at
-    first. For few atoms, a difference within the statistical scatter gives no warning.
+    A ratio of up to three gives no warning, since an ideal crystal loses half of its kinetic energy at first.
+    For few atoms, a difference within the statistical scatter gives no warning.
     """
     ratio = start / requested if requested > 0 else 1.0
     if 1 / _OTHER <= ratio <= _OTHER or abs(ratio - 1) <= 5 * math.sqrt(2 / (3 * atoms)):

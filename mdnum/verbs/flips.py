@@ -421,8 +421,8 @@ def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
     """Yield (part, number of parts, history): the flips of one neighbor rule, pair by pair, in parts.
 
-    The table of flips is ordered by frame and may be larger than memory. Each part contains all flips of some
-    of the pairs. The table is read once for each group of parts that fit into memory together.
+    The table of flips is ordered by frame and may be larger than memory. Each part therefore contains all
+    flips of some of the pairs, and the table is read once for each group of parts that fits into memory.
     """
     from mdnum.trajectories.history import History
 

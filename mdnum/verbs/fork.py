@@ -1,7 +1,7 @@
 """`mdnum fork`: the step at which two runs that differ in one numerical choice diverge, and the cause.
 
 For molecular dynamics and for a ball, `fork` varies one numerical choice and `fork_screen` each choice in
-turn; `fork_folders` compares or replays two finished runs. `fork_benign` compares ensembles of runs.
+turn; `fork_folders` compares or replays two finished runs; `fork_benign` compares ensembles of runs.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def fork_screen(
 ) -> Outcome:
     """Run a system once per choice, and rank the choices by the step at which decisions first differ.
 
-    For a choice that matters, `fork` also runs the second run with decisions of the first.
+    For a choice that matters, the function `fork` also tests whether a flip is the cause of divergence.
 
     Example:
         >>> mdnum.fork_screen("argon/crystal-108", steps=200)

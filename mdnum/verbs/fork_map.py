@@ -1,4 +1,4 @@
-"""`mdnum fork map`: parameter values at which decisions change. `mdnum fork forecast`: first changes."""
+"""`mdnum fork map` and `mdnum fork forecast`: decisions that change with a parameter or the start."""
 
 from __future__ import annotations
 

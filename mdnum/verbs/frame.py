@@ -2,12 +2,12 @@
 
 The module of a verb contains its function (options → output folder), `judge` (view of the folder → findings
 and a headline) and `page` (view → sections). The sentences of findings and pages are in a text file with the
-name of the module. The module declares the verb once:
+name of the module. A module declares its verb in one line:
 
     KINDS = {"flips": Verb(judge, page)}
 
-where "flips" is the kind of output folder, declared in the text file under [kinds.flips]. The functions judge
-and page read results only from the folder, so a page can be written again later.
+where "flips" is the kind of output folder, declared in the text file under [kinds.flips]. The functions
+`judge` and `page` read only the folder, so a page can be written again later.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class Interrupted(KeyboardInterrupt):
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether control-C was pressed; a second press raises KeyboardInterrupt.
 
-    Python delivers signals only to the main thread. In other threads, the function always returns False.
+    Python delivers signals only to the main thread; in other threads the function always returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():

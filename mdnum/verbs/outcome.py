@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 class Outcome:
     """Return value of every command: a summary and a verdict, with methods that read tables and figures.
 
-    An outcome can be pickled, and returned by the workers of a pool. Tables, figures and the page are read
-    from the output folder on first use, so the folder must not be moved.
+    An outcome can be pickled and returned by worker processes. Tables, figures and the page are read from the
+    output folder on first use, so the folder must not be moved.
 
     Example:
         >>> outcome = mdnum.run("argon/crystal-108", steps=200)

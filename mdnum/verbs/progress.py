@@ -29,7 +29,7 @@ _OUTERMOST = threading.Lock()
 def reported(progress: Wanted) -> Iterator[Progress | None]:
     """Context manager: yield the function that receives reports of progress, or None.
 
-    If `progress` is a function, this function is used. None gives a bar, except in a command called by
+    If `progress` is a function, this function is used; None gives a bar, except in a command called by
     another command and in the workers of a pool; True always gives a bar, False gives no bar.
     """
     from multiprocessing import parent_process

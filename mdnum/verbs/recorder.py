@@ -35,8 +35,8 @@ class Recorder:
     """Recorder of flips, and of pairs that are missing from the neighbor list, for any simulation loop.
 
     The results are the same as from `mdnum.flips` for a file with the recorded frames. Decisions (pair inside
-    or outside the cutoff) are computed from the positions in float64. Decisions that are uncertain because
-    the positions are in float32 are marked.
+    or outside the cutoff) are computed from the positions in float64. Decisions that are uncertain because of
+    rounding of the positions to float32 are marked.
 
     Example:
         >>> with mdnum.Recorder(8.5, box=box, fractional=True, out="runs/mine") as rec:

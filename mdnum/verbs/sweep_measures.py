@@ -1,7 +1,7 @@
 """Measures of a sweep that require further runs: divergence of two runs, and gradients.
 
-These measures are added to `mdnum.sweeps.measures.MEASURES` here, because the package `sweeps` must not
-import forks and gradients.
+The measures are defined here, not in `mdnum.sweeps.measures`, because the package `sweeps` must not import
+forks and gradients.
 """
 
 from __future__ import annotations

@@ -223,7 +223,7 @@ def _meaning(
 
 @result
 class GradientDiagnosis:
-    """Results on whether and how far a gradient can be trusted. Results that were not requested are None.
+    """Results on whether and how far a gradient can be trusted; results that were not requested are None.
 
     Attributes:
         horizon: number of steps. names: full names of the parameters. value: value of the loss.

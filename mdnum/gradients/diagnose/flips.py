@@ -3,7 +3,7 @@
 The contribution of a crossing is a product of two factors. The first factor, from a reverse pass, is the
 derivative of the loss with respect to the cutoff of one crossing alone, including the effect of all later
 flips. The second factor, from tangents without flips, is the distance by which the cutoff moves ahead of the
-pair. The contributions of all flips therefore sum exactly to the total contribution of flips.
+pair. The contributions of single flips therefore sum exactly to the total contribution of all flips.
 
 A decision boundary is a value of a parameter at which the decision on a pair changes, between two adjacent
 floats. Between two boundaries all runs make the same decisions, and loss and gradient are smooth functions of
@@ -42,7 +42,7 @@ _FIRST, _FACTOR = 1e-12, 8.0
 class FlipTerms:
     """Contributions of all flips to the derivative with respect to each number, largest first.
 
-    A number is a scalar parameter, or one entry of an array parameter such as "potential.sigma[1]".
+    A number here means a scalar parameter, or one entry of an array parameter ("potential.sigma[1]").
     """
 
     # a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the decision,

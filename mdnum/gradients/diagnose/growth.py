@@ -157,7 +157,7 @@ def growth(
         InputError: a parameter does not exist, or flips were requested without a pair potential.
         NumericalError: the run blew up.
 
-    Error: the error of the reverse pass. Horizons below T belong to later starts on the same trajectory.
+    Error: the error of the reverse pass; horizons below T belong to later starts on the same trajectory.
     """
     names = parameters.resolve(problem.simulation, names)
     watch = GrowthWatch(problem.simulation, names, problem.steps)
@@ -399,7 +399,7 @@ def spectrum(
 ) -> Spectrum:
     """Compute singular values of the Jacobian of the whole run, and finite-time Lyapunov exponents.
 
-    Decisions are fixed to the recorded decisions: the effect of flips on a perturbation is not included.
+    Decisions are fixed to the recorded decisions, so the effect of flips on perturbations is not included.
 
     Args:
         values: number of singular values. extra: additional vectors, for faster convergence.

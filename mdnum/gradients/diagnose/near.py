@@ -2,8 +2,8 @@
 
 A pair that turns back just outside its cutoff causes no flip. If the pair came slightly closer, it would
 enter and leave at a radial speed near zero, and the contribution of each crossing to the gradient would be
-proportional to the inverse of this speed. Conversely, the contribution of a pair that passes the cutoff by
-little could vanish after a small change. All turning points near the cutoff are therefore examined, on either
+proportional to the inverse of this speed. Conversely, if a pair passes the cutoff by little, a small
+perturbation can remove its contribution. All turning points near the cutoff are therefore examined, on either
 side and also between two steps.
 
 Near the turning point the distance is r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth

@@ -4,8 +4,8 @@ A gradient ceases to be trusted in five cases. (1) Another precision gives a dif
 rounding errors have grown. (2) Half the time step gives a different gradient. (3) A pair turned around so
 close to its cutoff that another time step could add or remove a flip with a relevant contribution. (4) A
 decision was so close to its threshold that rounding determined the decision. (5) Gradients from other starts
-of the same system scatter by more than their mean. The five limits are independent; if one limit is not
-examined, the verdict remains undecided.
+of the same system scatter by more than their mean. If one of the five limits was not examined, the verdict on
+a gradient is undecided.
 
 The gradients for all horizons are computed from one run and one pass of tangents.
 """
@@ -248,9 +248,9 @@ class Trust(Judgment):
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
     """Return a simulation with different rounding for comparison, and the formats narrower than float64.
 
-    If the given run uses formats narrower than float64, the comparison uses float64 throughout. No hardware
+    If the given run uses formats narrower than float64, the run for comparison is in float64. No hardware
     format is wider than float64: a float64 run is compared with a run whose start is shifted by one rounding
-    error. The shifted start shows the effect of rounding on the gradient up to a factor of order one.
+    error. The shift shows how rounding affects the gradient, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -530,8 +530,8 @@ def last_below(
 ) -> tuple[int, bool]:
     """Return the last horizon before values exceed a limit at two successive horizons, and whether they do.
 
-    A single value beyond the limit is ignored (except at the last horizon), because the relative error is
-    large where a gradient changes sign.
+    A single value beyond the limit is ignored (except at the last horizon), because relative errors are large
+    where a gradient changes sign.
     """
     beyond = ~(np.max(np.stack(list(values.values())), axis=0) <= limit)
     lasting = beyond & np.append(beyond[1:], True)
@@ -547,8 +547,8 @@ def last_agreeing(
     """Return the longest horizon with all values below a limit, and whether a longer horizon exists.
 
     Disagreement at shorter horizons is ignored: the relative error due to the time step may decrease again,
-    and for few flips a change of a single flip is a large part of the gradient. Agreement at a single
-    horizon, with disagreement at adjacent horizons, is regarded as chance.
+    and for few flips a change of a single flip is a large part of the gradient. Agreement at one horizon with
+    disagreement at adjacent horizons is regarded as chance.
     """
     within = np.max(np.stack(list(values.values())), axis=0) <= limit
     if len(within) > 1:
