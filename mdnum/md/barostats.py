@@ -34,7 +34,7 @@ _TERMS = 14
 def growth(a: Rate) -> Rate:
     """Return (exp(a) - 1) / a = Σ aᵏ / (k + 1)! for a number or (3, 3) matrix a with norm up to 0.5.
 
-    For matrices, the characteristic polynomial is used, which is differentiable if eigenvalues are equal.
+    For matrices, the characteristic polynomial is used, which is differentiable even for equal eigenvalues.
     """
     if a.ndim == 0:
         total = jnp.zeros(())

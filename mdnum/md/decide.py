@@ -115,7 +115,7 @@ class PairDecider:
         return bounds
 
     def _bounds(self, seen: Float[np.ndarray, "rows 3"] | None) -> list:
-        """Return `bounds` by pair type, for coordinates up to the maximum of reach and given magnitudes."""
+        """Return margin bounds by pair type, for coordinates up to the maximum of `reach` and `seen`."""
         bound = squared_distance_bound if self.space == "r2" else distance_bound
         given = self.reach, np.dtype(self.dtype), np.dtype(self.state), seen
         return [

@@ -46,7 +46,7 @@ class StillingerWeber(ManyBody):
 
     @property
     def r_cut(self) -> Any:
-        """Cutoff radius, the product a sigma, length."""
+        """Cutoff radius (the product of a and sigma), length."""
         return self.a * self.sigma
 
     def energy(self, positions, neighbor, cell):

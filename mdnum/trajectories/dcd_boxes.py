@@ -1,7 +1,7 @@
 """Interpretation of the six box numbers in a DCD file, which may follow one of three conventions.
 
-DCD files do not record the convention of the box. The numbers are lengths and cosines of the angles (NAMD,
-VMD, LAMMPS, MDAnalysis since 2.10), lengths and angles in degrees (CHARMM before version 22, OpenMM,
+DCD files do not record the convention of the box. The six numbers are lengths and cosines of the angles
+(NAMD, VMD, LAMMPS, MDAnalysis since 2.10), lengths and angles in degrees (CHARMM before version 22, OpenMM,
 MDAnalysis before 2.10), or a symmetric matrix of lattice vectors (CHARMM since 22). With a wrong box, atoms
 overlap across the boundary, and atoms that are wrapped between frames seem to leap. If several conventions
 avoid overlaps and leaps, the version number in the header decides: all programs except CHARMM write 24.

@@ -372,7 +372,7 @@ def unrounded(variance: float, size: float) -> float:
 
     If a displacement is n + f steps with integer n and 0 <= f < 1, rounding adds size² f (1 - f) to the mean
     square over all starting points. For normally distributed displacements of variance v, the mean of this
-    addition is, by a Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
+    term is, by a Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
     """
     low, high, k = 0.0, variance, np.arange(1, 200)
     for _ in range(60):

@@ -127,7 +127,7 @@ def exact_square(x, home, i, j, n0, n1, n2, vectors):
 
 @njit
 def _settle(x, atoms, kind, square, radius, bound, found):
-    """Decide the pairs that wrapped coordinates left undecided; return the smallest |margin|.
+    """Decide, from stored coordinates, the pairs left undecided; return the smallest |margin|.
 
     In a directed search, the squared distances from wrapped coordinates in `found.value` are replaced by the
     squared distances from stored coordinates.

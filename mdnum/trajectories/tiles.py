@@ -47,7 +47,7 @@ class Tiled(NamedTuple):
 
 
 class _Numbers(NamedTuple):
-    """Data for the exact computation of squared distances at one frame."""
+    """Data from which exact squared distances are computed at one frame."""
 
     positions: Float[np.ndarray, "atoms 3"]
     home: Int[np.ndarray, "atoms 3"]  # lattice vectors that have been taken off each atom
