@@ -23,7 +23,7 @@ TERMS = np.array([LARGE, SMALL, SMALL, SMALL, SMALL], np.float16)
 
 
 def solve(penetrations: np.ndarray, reduction: Reduction) -> BallRun:
-    """One step of balls at rest below the floor: only the solver has something to decide. All in float16."""
+    """Make one step of balls at rest below the floor in float16; only the solver makes decisions."""
     stop = GlobalSum(TOL, 25, reduction)
     world = World.create(
         Projection(k=0.5, alpha=0.5, stop=stop),
@@ -35,7 +35,7 @@ def solve(penetrations: np.ndarray, reduction: Reduction) -> BallRun:
 
 
 def run() -> Demo:
-    """Both orders, every reduction, and what jnp.sum makes of it."""
+    """Compute the sum in both orders, with every reduction, and with jnp.sum."""
     orders = {"large first": TERMS, "small first": TERMS[::-1]}
     histories = {name: running_sum_table(terms) for name, terms in orders.items()}
     runs = {name: solve(terms, BY_NAME["sequential"]) for name, terms in orders.items()}

@@ -1,4 +1,4 @@
-"""A batch whose penetrations sum to the tolerance: the dtype of the sum decides whether the loop runs."""
+"""Penetrations sum to the tolerance, so the dtype of the sum decides whether a solver iterates."""
 
 from __future__ import annotations
 
@@ -31,21 +31,22 @@ FORMATS = ("bfloat16", "float16")
 
 
 def boundary_batch(dtype: str, tol: float = TOL, small: int = SMALL) -> tuple[float, np.ndarray]:
-    """Penetrations that sum to a tolerance in exact arithmetic and stay below it in a narrow one.
+    """Return penetrations that sum to a tolerance exactly, but to less than the tolerance in a narrow dtype.
 
-    One is the float below the tolerance, the others share the gap: each is less than half a unit in the last
-    place of the first, so that a sum in this dtype which starts with the first never notices them.
+    The first penetration is the number just below the tolerance. The other penetrations share the difference:
+    each is less than half a unit in the last place of the first, so a sum in this dtype that starts with the
+    first penetration does not change.
 
     Args:
         dtype: a name such as "bfloat16".
         tol: m, rounded to the dtype.
-        small: how many share the gap; a power of 2 keeps the sum exact.
+        small: number of penetrations that share the difference; a power of 2 keeps the sum exact.
 
     Returns:
-        the tolerance as rounded, and the penetrations in float64, shape (small + 1,).
+        the rounded tolerance, and the penetrations in float64, shape (small + 1,).
 
     Raises:
-        InputError: the gap, or its share, is no number of the dtype.
+        InputError: the dtype cannot represent the difference or a share of the difference.
     """
     kind = ALL[dtype]
     limit = np.asarray(tol, kind)[()]
@@ -60,10 +61,10 @@ def boundary_batch(dtype: str, tol: float = TOL, small: int = SMALL) -> tuple[fl
 
 
 def problem(dtype: str, policy: RolePrecision, reduction: Reduction = Sequential()) -> BallProblem:
-    """The batch on the boundary of a dtype, four steps without gravity.
+    """Return the problem of a batch at the boundary of a dtype, with four steps without gravity.
 
     Args:
-        dtype: whose boundary the batch lies on.
+        dtype: dtype of the boundary at which the batch lies.
         policy: dtype by role.
         reduction: order of the residual's sum.
     """
@@ -74,9 +75,10 @@ def problem(dtype: str, policy: RolePrecision, reduction: Reduction = Sequential
 
 
 def policies(dtype: str) -> dict[str, RolePrecision]:
-    """The three that are compared: wide, narrow with a narrow sum, narrow with a wide sum.
+    """Return the three compared policies: wide, narrow with a narrow sum, narrow with a wide sum.
 
-    All take the loss in float32 of what positions they have: a loss of sixteen bits would be rounded itself.
+    All policies compute the loss in float32 from their positions, because a loss of sixteen bits would be
+    rounded.
     """
     wide = "float32"
     return {
@@ -88,7 +90,7 @@ def policies(dtype: str) -> dict[str, RolePrecision]:
 
 @dataclass(frozen=True)
 class Row:
-    """One run: its record and its derivative by the gain."""
+    """Record of one run, and the derivative of its loss with respect to the gain."""
 
     dtype: str
     name: str
@@ -102,12 +104,12 @@ class Row:
 
     @property
     def contact(self) -> int | None:
-        """First step (from 1) in which a ball touches the floor; None where none does."""
+        """First step (from 1) in which a ball touches the floor; None if no ball touches it."""
         touched = self.run.first_contact[self.run.first_contact > 0]
         return int(touched.min()) if len(touched) else None
 
     def data(self) -> dict[str, Any]:
-        """Plain values for `--json`."""
+        """Return plain values for `--json`."""
         assert self.run.history is not None
         first = self.run.history[0].astype(np.float64)
         return {
@@ -125,7 +127,7 @@ class Row:
 
 
 def measure(dtype: str) -> list[Row]:
-    """The three runs of one narrow dtype."""
+    """Make the three runs for one narrow dtype."""
     rows = []
     for name, policy in policies(dtype).items():
         posed = problem(dtype, policy)
@@ -135,7 +137,7 @@ def measure(dtype: str) -> list[Row]:
 
 
 def exact(dtype: str) -> tuple[list[float], float]:
-    """Losses of no iteration and of one, and the derivative by the gain of one, in exact arithmetic."""
+    """Return the exact losses after 0 and 1 iterations, and the derivative with respect to the gain."""
     _, depths = boundary_batch(dtype)
     squares = sum(Fraction(float(depth)) ** 2 for depth in depths) / len(depths)
     share = 1 - Fraction(ALPHA) * Fraction(K)
@@ -143,7 +145,7 @@ def exact(dtype: str) -> tuple[list[float], float]:
 
 
 def run() -> Demo:
-    """Three precisions in two formats, and loss scaling for the one whose derivative underflows."""
+    """Compare three precisions in two formats, and loss scaling for the run whose derivative underflows."""
     rows = {dtype: measure(dtype) for dtype in FORMATS}
     half = rows["float16"][2]
     posed = problem("float16", policies("float16")[half.name])
@@ -255,7 +257,7 @@ def run() -> Demo:
 
 
 def _sums(dtype: str) -> tuple[RunningSum, RunningSum]:
-    """The residual's sum in float32 and in the narrow dtype."""
+    """Return the sum of the residual in float32 and in the narrow dtype."""
     _, depths = boundary_batch(dtype)
     return tuple(running_sum_table(depths, Sequential(), ALL[kind]) for kind in ("float32", dtype))  # type: ignore[return-value]
 

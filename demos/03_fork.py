@@ -1,4 +1,4 @@
-"""Two rollouts one ulp apart whose first contact differs by one step."""
+"""Two runs with initial heights one ulp apart, whose first contacts differ by one step."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ STIFFNESS = 2000.0
 
 
 def adjacent(world: World, low: float, high: float, steps: int) -> tuple[float, float, int]:
-    """Neighboring start heights whose first contacts are at different steps, by bisection over the floats.
+    """Find neighboring initial heights whose first contacts are at different steps, by bisection over floats.
 
     Args:
-        world: what the ball does.
+        world: the world of the ball.
         low, high: heights with different first contacts, m.
-        steps: of each run.
+        steps: number of steps of each run.
 
     Returns:
-        the two heights, and how many runs it took.
+        the two heights, and the number of runs of the search.
     """
 
     def first(y0: float) -> int:
@@ -53,7 +53,7 @@ def adjacent(world: World, low: float, high: float, steps: int) -> tuple[float, 
 
 
 def run() -> Demo:
-    """Find the pair, and see what separates it: the flip, or what is done about it."""
+    """Find the pair of heights, and determine whether the flip separates the two runs."""
     reset = World.create(Impact(restitution=0.8, rest_speed=0.0), SemiImplicitEuler(H))
     spring = World.create(Penalty(STIFFNESS), SemiImplicitEuler(H))
     low, high, runs = adjacent(reset, LOW, HIGH, STEPS)

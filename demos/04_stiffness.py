@@ -44,10 +44,10 @@ Numbers = float | Float[np.ndarray, "..."]
 
 
 def step_matrix(scheme: str, z: Numbers, zeta: Numbers = 0.0) -> Float[np.ndarray, "... 2 2"]:
-    """One step of the contact phase, in the state (sqrt(k) y, v).
+    """Return the matrix of one step of the contact phase, for the state (sqrt(k) y, v).
 
-    For velocity Verlet v is the velocity of the half step, which is what its damping force sees; its steps
-    then are those of semi-implicit Euler in the other order.
+    For velocity Verlet v is the velocity at the half step, from which the damping force is computed; the
+    steps then equal those of semi-implicit Euler in the other order.
 
     Args:
         scheme: a name in SCHEMES.
@@ -73,14 +73,14 @@ def step_matrix(scheme: str, z: Numbers, zeta: Numbers = 0.0) -> Float[np.ndarra
 
 
 def spectral_radius(scheme: str, z: Numbers, zeta: Numbers = 0.0) -> Float[np.ndarray, "..."]:
-    """Largest eigenvalue of a contact step, by magnitude; stable where it is at most 1."""
+    """Return the largest magnitude of the eigenvalues of a contact step; at most 1 if stable."""
     return np.asarray(np.max(np.abs(np.linalg.eigvals(step_matrix(scheme, z, zeta))), axis=-1))
 
 
 def limit(scheme: str, zeta: float = 0.0) -> float:
-    """The largest h sqrt(k) with a stable contact phase, in closed form; infinite for the implicit midpoint.
+    """Return the largest h sqrt(k) with a stable contact, in closed form; infinite for the implicit midpoint.
 
-    From the conditions |trace| <= 1 + det and det <= 1 on the characteristic polynomial.
+    The limit follows from the conditions |trace| <= 1 + det and det <= 1 on the characteristic polynomial.
     """
     step_matrix(scheme, 0.0)
     if zeta < 0:
@@ -95,17 +95,18 @@ def limit(scheme: str, zeta: float = 0.0) -> float:
 def bounce_growth(
     scheme: str, z: float, zeta: float = 0.0, flight_steps: int = 90, phases: int = 64
 ) -> float:
-    """Expected growth of derivatives in one bounce, by eigenvalues: the mean of log(spectral radius).
+    """Return the expected growth of derivatives in one bounce: the mean of log(spectral radius).
 
-    The mean is over the phase of the step in which the ball enters the floor; for each the contact steps are
-    counted, and their matrix is multiplied by that of the flight. Gravity in contact is neglected.
+    The mean is over the phase of the step in which the ball enters the floor. For each phase the contact
+    steps are counted, and their matrix is multiplied by the matrix of the flight. Gravity during contact is
+    neglected.
 
     Args:
         flight_steps: steps between contacts, 2 s / (g h).
-        phases: of the entry, equally spaced.
+        phases: phases of the entry, equally spaced.
 
     Returns:
-        growth exponent per bounce (natural logarithm), infinite where the ball never leaves.
+        growth exponent per bounce (natural logarithm); infinite if the ball never leaves the floor.
     """
     step = step_matrix(scheme, z, zeta)
     flight = np.array([[1.0, z * flight_steps], [0.0, 1.0]])
@@ -126,17 +127,17 @@ def bounce_growth(
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """What balls and their derivatives did, over h sqrt(k) and damping ratio, up to several step counts.
+    """Energies and derivatives of balls over h sqrt(k) and damping ratio, up to several numbers of steps.
 
     Attributes:
         scheme: name.
         z: h sqrt(k), shape (columns,).
         zeta: damping ratio, shape (rows,).
-        steps: at which the largest values so far were noted, shape (times,).
+        steps: steps at which the largest values so far were recorded, shape (times,).
         energy: largest E / E(0) so far, shape (times, rows, columns).
-        gradient: largest |dy / dy0| so far, same shape; infinite once it is not finite.
-        exact: the largest |dy / dy0| so far of the exact undamped motion, over all columns, shape (times,).
-        forward_bound, gradient_bound: beyond which "not bounded" is said.
+        gradient: largest |dy / dy0| so far, same shape; infinite after a value that is not finite.
+        exact: largest |dy / dy0| so far of the exact undamped motion, over all columns, shape (times,).
+        forward_bound, gradient_bound: bounds above which a value counts as "not bounded".
     """
 
     scheme: str
@@ -171,25 +172,25 @@ def measure(
     forward_bound: float = 10.0,
     gradient_bound: float = 1e6,
 ) -> StabilityMap:
-    """Drop balls on each stiffness and damping, and follow their energy and their derivative.
+    """Drop balls for each stiffness and damping, and record their energies and derivatives.
 
-    A single start may by luck sit on an island where nothing grows, so a few are dropped and the largest
-    values count.
+    A single initial height may lie in an interval in which nothing grows, so several balls are dropped and
+    the largest values are kept.
 
     Args:
         scheme: a name in SCHEMES.
         z: h sqrt(k).
         zeta: damping ratios; only 0 when None.
-        steps: to make, a multiple of times.
-        times: how often the largest values so far are noted.
+        steps: number of steps, a multiple of times.
+        times: number of times at which the largest values so far are recorded.
         h: time step, s.
-        starts: heights at the start, m.
+        starts: initial heights, m.
         gravity: m/s².
-        forward_bound: on E / E(0).
-        gradient_bound: on |dy / dy0|.
+        forward_bound: bound on E / E(0).
+        gradient_bound: bound on |dy / dy0|.
 
-    Error: the derivative is that of the program, by forward mode; it is compared with bounds that lie orders
-    of magnitude away.
+    Error: the derivative is that of the program, by forward mode; the bounds are orders of magnitude away
+    from typical values.
     """
     zeta = np.zeros(1) if zeta is None else np.asarray(zeta, np.float64)
     z = np.asarray(z, np.float64)
@@ -210,7 +211,7 @@ def measure(
 
 
 def _exact(y0: float, gravity: float, k: float, steps: np.ndarray, h: float) -> np.ndarray:
-    """Largest |dy/dy0| of the exact motion up to each number of steps, on a grid of times."""
+    """Return the largest |dy/dy0| of the exact motion up to each number of steps, on a grid of times."""
     t = np.linspace(0, steps[-1] * h, 20 * len(steps) + 1)[1:]
     slope = np.abs(ExactPenalty(y0, 0.0, gravity, k).height(t).gradient["y0"])
     return np.maximum.accumulate(slope)[19::20]
@@ -220,7 +221,7 @@ def _exact(y0: float, gravity: float, k: float, steps: np.ndarray, h: float) -> 
 def _follow(
     world: World, k: Array, damping: Array, y0: Array, length: int, times: int
 ) -> tuple[Array, Array]:
-    """Largest energy over the first one, and largest derivative, so far; the balls y0 for each k."""
+    """Return the largest relative energy and the largest derivative, for balls y0 and each k."""
 
     def one(k, damping):
         here = world.with_values({"k": k, "damping": damping})
@@ -257,20 +258,20 @@ def _follow(
 def measured_limit(
     scheme: str, zeta: float = 0.0, *, dtype: str = "float64", steps: int = 2000, most: float = 4.0
 ) -> float:
-    """The largest h sqrt(k) at which a ball held in contact does not run away, found by running it.
+    """Measure the largest h sqrt(k) at which the displacement of a ball held in contact stays bounded.
 
-    Contact is imposed on the ball in every step, and it starts off its equilibrium; "runs away" means that
-    it is `GROWTH` times as far off within the steps. So what is found is where the spectral radius to the
-    power of the steps reaches that, a little above the limit: some 1e-6 for semi-implicit Euler without
-    damping, whose eigenvalues part as a square root, some 1e-3 with damping, and sqrt(2 log(GROWTH) / steps)
+    Contact is imposed on the ball in every step, and the ball starts away from its equilibrium. The motion
+    counts as unbounded if the displacement from equilibrium grows by a factor of `GROWTH` within the steps.
+    The result is therefore slightly above the limit: by some 1e-6 for semi-implicit Euler without damping,
+    whose eigenvalues separate as a square root, by some 1e-3 with damping, and by sqrt(2 log(GROWTH) / steps)
     for undamped explicit Euler, whose limit is 0.
 
     Args:
-        dtype: of all roles.
+        dtype: dtype of all roles.
         most: upper end of the search.
 
     Returns:
-        the limit, `most` where there is none below, 0 where there is none above 1e-3.
+        the limit; `most` if there is no limit below it, 0 if there is no limit above 1e-3.
     """
     low, high = 1e-3, most
     policy = RolePrecision(**dict.fromkeys(("state", "arithmetic", "decision", "accumulate", "loss"), dtype))
@@ -290,7 +291,7 @@ def measured_limit(
 
 @eqx.filter_jit
 def _held(world: World, k: Array, damping: Array, steps: int) -> Any:
-    """Whether balls held in contact run away; one for each k."""
+    """Return for each k whether the motion of a ball held in contact is unbounded."""
 
     def one(k, damping):
         here = world.with_values({"k": k, "damping": damping})
@@ -322,7 +323,7 @@ QUIET = 0.6
 
 
 def run() -> Demo:
-    """Drop balls on floors of growing stiffness; follow their energy and their derivative."""
+    """Drop balls on floors of increasing stiffness, and record their energies and derivatives."""
     z = np.geomspace(0.02, 3.0, 48)
     zeta = np.concatenate([[0.0], np.geomspace(0.003, 1.0, 19)])
     wide = measure("semi-implicit-euler", z, zeta, steps=STEPS, times=20, h=H)
@@ -492,7 +493,7 @@ def run() -> Demo:
 
 
 def _alone(scheme: str, z: list[float]) -> list[float]:
-    """Largest E / E(0) of a ball dropped from 1 m within 600 steps of 0.01 s, undamped."""
+    """Return the largest E / E(0) of an undamped ball dropped from 1 m, within 600 steps of 0.01 s."""
     made = measure(scheme, np.array(z), steps=600, times=1, h=H, starts=(1.0,))
     return [float(x) for x in made.energy[-1, 0]]
 

@@ -1,4 +1,4 @@
-"""The number of solver iterations along the gain: a sawtooth with jumps between adjacent floats."""
+"""The number of solver iterations jumps between adjacent gains, so the loss is a sawtooth."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ LOW, HIGH, POINTS = 0.48, 0.53, 101
 
 @dataclass(frozen=True)
 class Side:
-    """One projection: what it leaves of a penetration, and how.
+    """Remaining penetration after one projection, with its derivative and its iterations.
 
     Attributes:
-        at: the gain.
-        loss, gradient: the penetration that is left, m, and its derivative by the gain, iterations held.
-        iterations: of the solver.
-        residuals: at every stop decision, m.
+        at: gain of the solver.
+        loss, gradient: remaining penetration, m, and its derivative with respect to the gain at a fixed
+        number of iterations.
+        iterations: number of solver iterations.
+        residuals: residual at every stopping decision, m.
     """
 
     at: float
@@ -35,13 +36,13 @@ class Side:
     residuals: np.ndarray
 
     def residual(self, iteration: int) -> float:
-        """At the stop decision of an iteration."""
+        """Residual at the stopping decision of an iteration."""
         return float(self.residuals[iteration])
 
 
 @dataclass(frozen=True)
 class Tooth:
-    """Two adjacent floats with different numbers of iterations, and how many runs it took to find them."""
+    """Two adjacent floats with different numbers of iterations, and the number of runs of the search."""
 
     below: Side
     above: Side
@@ -49,23 +50,23 @@ class Tooth:
 
     @property
     def iteration(self) -> int:
-        """Of the stop decision that comes out differently."""
+        """Iteration of the stopping decision that differs between the two gains."""
         return min(self.below.iterations, self.above.iterations)
 
     def margin(self, side: Side) -> float:
-        """Tolerance minus residual at that decision."""
+        """Tolerance minus residual at the differing decision."""
         return TOL - side.residual(self.iteration)
 
 
 @cache
 def relaxation() -> BallProblem:
-    """One ball below the floor, one projection, the penetration that it leaves."""
+    """Return the problem of one ball and one projection; the loss is the remaining penetration."""
     world = World.create(Projection(0.5, ALPHA, GlobalSum(TOL, 200)), SemiImplicitEuler(1.0), gravity=0.0)
     return BallProblem(world, np.array([-DEPTH]), 0.0, 1, ResidualPenetration(1))
 
 
 def side(k: float) -> Side:
-    """The projection at a gain."""
+    """Return the result of the projection for a gain."""
     problem = relaxation().with_values({"k": k})
     run = problem.run(history=True)
     loss, slope = problem.value_and_grad(["k"])
@@ -74,7 +75,7 @@ def side(k: float) -> Side:
 
 
 def teeth(low: float, high: float) -> list[tuple[float, float, int]]:
-    """Every pair of adjacent floats with different counts that bisection meets, with the runs it took."""
+    """Find pairs of adjacent gains with different numbers of iterations, and the number of runs."""
 
     @cache
     def count(k: float) -> int:
@@ -96,12 +97,12 @@ def teeth(low: float, high: float) -> list[tuple[float, float, int]]:
 
 
 def exact(n: int) -> float:
-    """The gain at which n iterations leave exactly the tolerance, in real arithmetic."""
+    """Return the gain for which n exact iterations leave a penetration equal to the tolerance."""
     return (1 - (TOL / DEPTH) ** (1 / n)) / ALPHA
 
 
 def run() -> Demo:
-    """Find the boundaries; say what happens at the one nearest 0.5."""
+    """Find the boundaries between numbers of iterations, and describe the boundary nearest to 0.5."""
     grid = [side(k) for k in np.linspace(LOW, HIGH, POINTS)]
     cells = [
         pair

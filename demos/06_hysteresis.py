@@ -1,4 +1,4 @@
-"""A gap between two thresholds: its effect on fluctuating decisions, and its cost."""
+"""Hysteresis, a gap between two thresholds: its effect on fluctuating decisions, and its cost."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ORDERS = ("sequential", "reversed")
 
 
 def shaken(lift: float | None) -> BallRun:
-    """Balls at rest on a spring under a random acceleration (seeded, m/s²).
+    """Simulate balls at rest on a spring under a random acceleration (m/s², with a fixed seed).
 
     Args:
         lift: height at which a contact ends, m; None for 0.
@@ -46,11 +46,11 @@ def shaken(lift: float | None) -> BallRun:
 
 
 def pressed(order: Reduction, gap: float | None) -> BallRun:
-    """Balls at rest on a hard floor; their penetrations are summed in float16 and compared with their mean.
+    """Simulate balls at rest on a hard floor, whose penetrations are summed in float16 for the stopping rule.
 
     Args:
-        order: of the sum.
-        gap: the solver starts above gap * tol; None to start at tol.
+        order: order of the sum.
+        gap: the solver starts at residuals above gap * tol; None to start at tol.
     """
     control = WAVER * np.random.default_rng(1).normal(size=(PRESSED_STEPS, PRESSED))
     tol = float(np.float16(TOL))
@@ -65,12 +65,12 @@ def pressed(order: Reduction, gap: float | None) -> BallRun:
 
 
 def flips(starts: np.ndarray) -> int:
-    """How often a decision differs from the one before, along the leading axis."""
+    """Count the decisions that differ from the previous decision along the leading axis."""
     return int(np.sum(starts[1:] != starts[:-1]))
 
 
 def run() -> Demo:
-    """Flips of both channels with one threshold and with two."""
+    """Count the flips of contacts and of stopping decisions with one threshold and with two thresholds."""
     contact: dict[float, BallRun] = {0.0: shaken(None)} | {lift: shaken(lift) for lift in LIFTS}
     rows = {lift: len(one.contacts) for lift, one in contact.items()}
     stop = {gap: [pressed(parse(order), gap) for order in ORDERS] for gap in (None, *GAPS)}
@@ -174,7 +174,7 @@ def _falls(rows: dict[float, int]) -> bool:
 
 
 def _leaves(run: BallRun) -> float:
-    """The lowest height at which a contact ended, m."""
+    """Return the lowest height at which a contact ended, m."""
     rows = ~run.contacts.entered
     return float(np.min(run.height[run.contacts.step[rows] - 1, run.contacts.subject[rows, 0]]))
 

@@ -32,21 +32,21 @@ AWAY = -1.0
 
 
 class LeftOf(eqx.Module):
-    """Mean penetration that is left of the first balls of a batch, m, summed over steps."""
+    """Mean remaining penetration of the first balls of a batch, m, summed over steps."""
 
     balls: int = eqx.field(static=True)
 
     def step(self, state, record, dtype):
-        """What this step leaves of them."""
+        """Return the mean remaining penetration of one step."""
         return jnp.mean(record.left[: self.balls].astype(dtype))
 
     def end(self, state, steps, total):
-        """The sum."""
+        """Return the sum over steps."""
         return total
 
 
 def rules() -> dict[str, Any]:
-    """The rules that are compared."""
+    """Return the stopping rules that are compared."""
     return {
         "global sum": GlobalSum(TOL, CAP),
         "maximum": Maximum(TOL, CAP),
@@ -56,18 +56,18 @@ def rules() -> dict[str, Any]:
 
 
 def batch(rule: Any, depths: tuple[float, ...]) -> BallProblem:
-    """Balls below the floor and one projection; the loss is of the balls of `BATCH` only."""
+    """Return the problem of balls and one projection; the loss includes only the balls of `BATCH`."""
     world = World.create(Projection(K, ALPHA, rule), SemiImplicitEuler(1.0), gravity=0.0)
     return BallProblem(world, -np.array(depths), 0.0, 1, LeftOf(len(BATCH)))
 
 
 def counts(run: BallRun) -> np.ndarray:
-    """Iterations that each ball of the batch went through."""
+    """Return the number of solver iterations of each ball of the batch."""
     return np.broadcast_to(run.iterations[0], (run.balls,))[: len(BATCH)]
 
 
 def run() -> Demo:
-    """Each rule with the stranger away and below the floor."""
+    """Compare each stopping rule with the additional ball above and below the floor."""
     found: dict[str, dict[str, Any]] = {}
     for name, rule in rules().items():
         alone, joined = (batch(rule, (*BATCH, depth)) for depth in (AWAY, STRANGER))
@@ -186,7 +186,7 @@ _SIZES = np.array([1.0, 10.0, 100.0])
 
 
 def _growth() -> dict[str, list[int]]:
-    """Iterations of the first of so many equal balls; under a rule for each they are those of any batch."""
+    """Return the iterations of the first of several equal balls."""
     shared = [batch(GlobalSum(TOL, CAP), (0.45,) * int(size)).run(keep=False) for size in _SIZES]
     own = batch(PerInstance(TOL, CAP), (0.45,) * (len(BATCH) + 1)).run(keep=False).iterations[0]
     return {

@@ -1,4 +1,4 @@
-"""The derivative of a solver's iterations differs from that of its fixed point."""
+"""The derivative of a solver's iterations differs from the derivative of its fixed point."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ CONDITION = 1e4
 
 @dataclass(frozen=True)
 class Memory:
-    """Bytes of temporaries of a compiled gradient through a projection of so many iterations.
+    """Bytes of temporary arrays in a compiled gradient through a projection with a number of iterations.
 
     Attributes:
-        iterations: of the projection.
-        unrolled: reverse mode over the iterations, which keeps something of each.
-        carried: tangents carried along in the loop, as mdnum's own unrolled derivative does it (possible
-            because each ball's result depends on that ball only).
+        iterations: number of iterations of the projection.
+        unrolled: reverse mode over the iterations, which stores data of each iteration.
+        carried: tangents propagated in the loop, as in mdnum's unrolled derivative (possible because the
+            result of each ball depends on that ball only).
         implicit: a linear solve at the fixed point.
         value: the loss alone.
     """
@@ -48,11 +48,11 @@ class Memory:
 
 
 def memory(iterations: Sequence[int], balls: int = 1000) -> list[Memory]:
-    """Temporaries of value and gradient by gain and start, as the compiler plans them (nothing is run).
+    """Return the compiler's temporary memory for value and gradient with respect to gain and initial height.
 
     Args:
-        iterations: counts to compile for.
-        balls: in the batch, float64.
+        iterations: numbers of iterations for which the gradient is compiled.
+        balls: number of balls in the batch, float64.
     """
     rows = []
     for count in iterations:
@@ -78,13 +78,13 @@ def _once(gain, y):
 
 
 def unrolled(gain: Float[Array, ""], y: Float[Array, "balls"], count: int) -> Float[Array, ""]:
-    """Mean square of what a projection leaves, by a scan that reverse mode tapes."""
+    """Return the mean square of the remaining penetration, by a scan whose steps reverse mode stores."""
     y, _ = jax.lax.scan(lambda y, _: (_once(gain, y), None), y, None, length=count)
     return jnp.mean(y**2)
 
 
 def carried(gain: Float[Array, ""], y: Float[Array, "balls"], count: int) -> Float[Array, ""]:
-    """The same, with tangents carried along in the loop."""
+    """Return the mean square of the remaining penetration, with tangents propagated in the loop."""
 
     def run(inputs, rest):
         y, gain = inputs
@@ -95,7 +95,7 @@ def carried(gain: Float[Array, ""], y: Float[Array, "balls"], count: int) -> Flo
 
 
 def implicit(gain: Float[Array, ""], y: Float[Array, "balls"], count: int) -> Float[Array, ""]:
-    """The same iterations with the derivative of their fixed point."""
+    """Return the mean square of the remaining penetration, with the derivative of the fixed point."""
     contact = y < 0
     ended = jax.lax.stop_gradient(_loop(gain, y, count))
     y = FixedPointRule().attach(jnp.where(contact, ended, y), jnp.broadcast_to(gain, y.shape), contact)
@@ -109,12 +109,12 @@ def _loop(gain, y, count):
 
 @dataclass(frozen=True)
 class Accuracy:
-    """A derivative of a fixed point whose linear system is stopped early.
+    """Error of a fixed-point derivative whose linear solve is stopped early.
 
     Attributes:
-        tolerance: of the linear solve.
-        regularization: added to the diagonal.
-        error: of the derivative, relative to the exact one.
+        tolerance: tolerance of the linear solve.
+        regularization: number added to the diagonal.
+        error: error of the derivative, relative to the exact derivative.
     """
 
     tolerance: float
@@ -130,13 +130,14 @@ def accuracy(
     unknowns: int = 200,
     seed: int = 0,
 ) -> list[Accuracy]:
-    """How the tolerance and the regularization of the backward solve enter a derivative.
+    """Measure how the tolerance and the regularization of the backward solve affect a derivative.
 
-    The fixed point is x = x - A (x - p c), with A symmetric, its eigenvalues spread evenly in the logarithm
-    from 1 / condition to 1: x = p c, dx/dp = c, whatever A is. What the solve leaves is all the error.
+    The fixed point is x = x - A (x - p c), with a symmetric A whose eigenvalues are spaced evenly in the
+    logarithm from 1 / condition to 1. For any A, x = p c and dx/dp = c, so the residual of the solve is the
+    only error.
 
     Args:
-        tolerances, regularizations: every pair is tried.
+        tolerances, regularizations: values; every pair is tested.
         condition: largest over smallest eigenvalue of A.
     """
     random = np.random.default_rng(seed)
@@ -170,15 +171,15 @@ def solve(
     regularization: float | Float[Array, ""] = 0.0,
     max_iter: int = 200,
 ) -> Float[Array, "unknowns"]:
-    """x of (A + regularization) x = right by conjugate gradients, differentiable both ways.
+    """Solve (A + regularization) x = right by differentiable conjugate gradients.
 
     Args:
-        matvec: A, symmetric and positive definite.
-        tolerance: of the residual, relative to the right-hand side.
-        regularization: added to the diagonal of A; moves the answer by about regularization / smallest
-            eigenvalue, relative.
+        matvec: product with A, which is symmetric and positive definite.
+        tolerance: tolerance of the residual, relative to the right-hand side.
+        regularization: number added to the diagonal of A; the relative change of x is about regularization /
+            smallest eigenvalue.
 
-    Error: at most tolerance times the condition number, relative.
+    Error: relative error of at most tolerance times the condition number.
     """
 
     def matrix(x):
@@ -197,12 +198,12 @@ def fixed_point_tangent(
     tangents: tuple[Any, ...],
     **options: Any,
 ) -> Float[Array, "unknowns"]:
-    """dx of x = update(x, *parameters), by the implicit function theorem: (1 - dG/dx) dx = dG/dp dp.
+    """Return dx for x = update(x, *parameters) by the implicit function theorem: (1 - dG/dx) dx = dG/dp dp.
 
     Args:
-        update: G; 1 - dG/dx symmetric and positive definite at x.
-        x: a fixed point. At a point that is only near one, the answer is off by about that distance.
-        options: of `solve`.
+        update: the function G; 1 - dG/dx must be symmetric and positive definite at x.
+        x: a fixed point; the error of dx is about the distance of x from the exact fixed point.
+        options: options of `solve`.
     """
     _, right = jax.jvp(lambda *given: update(x, *given), parameters, tangents)
 
@@ -213,11 +214,11 @@ def fixed_point_tangent(
 
 
 def relaxation(tol: float, derivative: FixedPointRule | None = None) -> BallProblem:
-    """A ball below the floor and one projection: the loss is the penetration that is left.
+    """Return the problem of a ball below the floor and one projection; the loss is the remaining penetration.
 
     Args:
-        tol: of the projection, m.
-        derivative: of the fixed point, or None for that of the iterations.
+        tol: tolerance of the projection, m.
+        derivative: derivative of the fixed point, or None for the derivative of the iterations.
     """
     contact = Projection(K, ALPHA, GlobalSum(tol, 200), derivative=derivative)
     world = World.create(contact, SemiImplicitEuler(1.0), gravity=0.0)
@@ -225,7 +226,7 @@ def relaxation(tol: float, derivative: FixedPointRule | None = None) -> BallProb
 
 
 def run() -> Demo:
-    """Gain derivatives against the tolerance; then memory and accuracy of the two ways."""
+    """Compare derivatives with respect to the gain, and the memory and accuracy of both methods."""
     runs = [relaxation(tol).run(keep=False) for tol in TOLERANCES]
     counts = [int(run.iterations[0]) for run in runs]
     ran = [relaxation(tol).value_and_grad(["k"]) for tol in TOLERANCES]

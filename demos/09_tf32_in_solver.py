@@ -23,16 +23,16 @@ Vector = Float[Array, "n"]
 
 
 class Solution(NamedTuple):
-    """Where conjugate gradients ended.
+    """Result of a conjugate gradient solve.
 
     Attributes:
         x: the solution.
-        iterations: products made.
-        residual: of the recurrence, relative to the right-hand side.
-        reason: a code of `Reason`: tolerance, cap or not finite.
-        history: residual of the recurrence at every stop decision, shape (max_iter + 1,), NaN beyond; shape
-            (0,) unless asked for.
-        true_history: |b - A x| / |b| with the product that was given for it, likewise.
+        iterations: number of matrix products.
+        residual: residual of the recurrence, relative to the right-hand side.
+        reason: a code of `Reason`: tolerance, iteration limit or not finite.
+        history: residual of the recurrence at every stopping decision, shape (max_iter + 1,), NaN after the
+            last; shape (0,) if not requested.
+        true_history: |b - A x| / |b|, computed with `true_product`, at every stopping decision.
     """
 
     x: Vector
@@ -53,15 +53,16 @@ def conjugate_gradients(
 ) -> Solution:
     """Solve A x = b for a symmetric positive definite A, starting from zero.
 
-    Not differentiable in reverse mode: the number of iterations is decided while it runs.
+    The solver is not differentiable in reverse mode, because the number of iterations is determined at run
+    time.
 
     Args:
-        product: v -> A v, in the arithmetic under study.
-        b: right-hand side; its dtype is that of all vectors and dot products.
+        product: function v -> A v, in the arithmetic under study.
+        b: right-hand side; its dtype is used for all vectors and dot products.
         tol: stop when the residual of the recurrence is below tol * |b|.
-        max_iter: the cap; it may be traced where no histories are kept.
-        true_product: v -> A v to measure the true residual with, in any wider dtype; histories are kept only
-            with it.
+        max_iter: largest number of iterations; it may be traced if no histories are stored.
+        true_product: function v -> A v in a wider dtype, with which the true residual is measured; without it
+            no histories are stored.
 
     Source: Hestenes & Stiefel, J. Res. NBS 49, 409 (1952).
     """
@@ -116,26 +117,26 @@ _HALVINGS = 12
 
 
 class ColumnState(NamedTuple):
-    """Heights of the balls above the places they have in a stack that just touches (m), and velocities."""
+    """Heights of the balls relative to their places in a just touching stack (m), and velocities."""
 
     q: Balls
     v: Balls
 
 
 class ColumnRecord(NamedTuple):
-    """What a step decided.
+    """Decisions of one step.
 
     Attributes:
-        contact: whether ball i pushes on the one below (ball 0 on the floor) at the end of the step.
-        gap: what that decision compared with zero, m.
-        outer: Newton iterations.
-        inner: conjugate gradient iterations, all together.
-        rejected: moves that the line search rejected (and shortened).
-        reason: code of `Reason` that ended the outer loop.
-        residual: largest |gradient| at its last decision, m.
-        recurrence: relative residual that the last inner solve believed it had.
-        true: the relative residual that it had, computed in float64.
-        inner_reason: code that ended the last inner solve.
+        contact: whether ball i pushes on the ball below (ball 0 on the floor) at the end of the step.
+        gap: distance that the contact decision compares with zero, m.
+        outer: number of Newton iterations.
+        inner: total number of conjugate gradient iterations.
+        rejected: number of moves that the line search rejected (and shortened).
+        reason: code of the `Reason` for the end of the outer loop.
+        residual: largest |gradient| at the last decision of the outer loop, m.
+        recurrence: relative residual of the last inner solve according to its recurrence.
+        true: true relative residual of the last inner solve, computed in float64.
+        inner_reason: code of the reason for the end of the last inner solve.
     """
 
     contact: Bool[Array, "balls"]
@@ -151,17 +152,17 @@ class ColumnRecord(NamedTuple):
 
 
 class Column(eqx.Module):
-    """The column as a program.
+    """Parameters of the simulation of a falling column of balls.
 
     Attributes:
         h: time step, s.
         k: stiffness of a contact per mass, 1/s².
         gravity: m/s².
-        tol: the outer loop stops when every component of the gradient is below, m.
+        tol: the outer loop stops when every component of the gradient is below this value, m.
         inner_tol: relative residual at which conjugate gradients stop.
-        code: place of the format of the inner matrix products in FORMATS; not static, so that all formats
+        code: index of the format of the inner matrix products in FORMATS; not static, so that all formats
             share one compiled program.
-        max_outer, max_inner: caps.
+        max_outer, max_inner: largest numbers of iterations.
         balls: how many.
     """
 
@@ -188,15 +189,16 @@ class Column(eqx.Module):
         max_outer: int = 30,
         max_inner: int = 400,
     ) -> Column:
-        """A column with its numbers checked and cast.
+        """Create a column, with its parameters checked and converted.
 
         Args:
             balls: how many.
-            format: of the inner matrix products, one of FORMATS; with "float64" everything is float64.
+            format: format of the inner matrix products, one of FORMATS; with "float64" all numbers are
+            float64.
             h, k, gravity, tol, inner_tol, max_outer, max_inner: see the class.
 
         Raises:
-            InputError: a number out of range, or no such format.
+            InputError: a number is out of range, or the format is unknown.
         """
         if format not in FORMATS:
             raise InputError(f"unknown format {format!r}; known are {', '.join(FORMATS)}")
@@ -214,32 +216,32 @@ class Column(eqx.Module):
 
     @property
     def dtype(self) -> np.dtype:
-        """Of everything but the inner products."""
+        """Dtype of all numbers except the inner matrix products."""
         return np.dtype(self.h.dtype)
 
     @property
     def format(self) -> str:
-        """Name of the format of the inner products."""
+        """Name of the format of the inner matrix products."""
         return FORMATS[int(self.code)]
 
     @property
     def condition(self) -> float:
-        """Condition number of the linear system with every contact closed."""
+        """Condition number of the linear system if all contacts are closed."""
         jacobian = np.eye(self.balls) - np.eye(self.balls, k=-1)
         stiff = float(self.h) ** 2 * float(self.k)
         return float(np.linalg.cond(np.eye(self.balls) + stiff * jacobian.T @ jacobian))
 
     def start(self, q: Any, v: Any = 0.0) -> ColumnState:
-        """The state at step 0: heights above the touching stack, m, and velocities, m/s."""
+        """Return the state at step 0: heights relative to the touching stack, m, and velocities, m/s."""
         q = jnp.broadcast_to(jnp.asarray(q, self.dtype), (self.balls,))
         return ColumnState(q, jnp.broadcast_to(jnp.asarray(v, self.dtype), (self.balls,)))
 
     def gaps(self, q: Balls) -> Balls:
-        """Distance of each ball to the one below, m; negative where they push."""
+        """Return the distance of each ball from the ball below, m; negative if the two balls push."""
         return q - jnp.concatenate([jnp.zeros(1, q.dtype), q[:-1]])
 
     def _product(self, active: Balls, multiply, dtype):
-        """v -> (I + h²k Jᵀ A J) v with a way to multiply matrices."""
+        """Return the function v -> (I + h²k Jᵀ A J) v, with a given function for matrix products."""
         jacobian = jnp.eye(self.balls, dtype=dtype) - jnp.eye(self.balls, k=-1, dtype=dtype)
         stiff = (self.h * self.h * self.k).astype(dtype)
 
@@ -250,13 +252,13 @@ class Column(eqx.Module):
         return product
 
     def _multiply(self, a, b):
-        """A matrix product in the column's format."""
+        """Return a matrix product in the format of the column."""
         if self.dtype == np.float64:
             return a @ b
         return lax.switch(self.code - 1, [partial(matmul, name=name) for name in FORMATS[1:]], a, b)
 
     def advance(self, state: ColumnState) -> tuple[ColumnState, ColumnRecord]:
-        """One step: the next state, and what was decided on the way."""
+        """Make one step; return the next state and the decisions of the step."""
         stiff = self.h * self.h * self.k
         free = state.q + self.h * state.v - self.h * self.h * self.gravity
 
@@ -267,7 +269,7 @@ class Column(eqx.Module):
             return (q - free) + stiff * (push - above), (gap < 0).astype(q.dtype)
 
         def search(q, direction, before):
-            """The whole move unless it overshoots; then the part of it that ends where the slope is zero."""
+            """Return the move, shortened to the point of zero slope if it overshoots."""
 
             def along(share):
                 return jnp.dot(slope(q + share * direction)[0], direction)
@@ -330,12 +332,12 @@ class Column(eqx.Module):
 
 @dataclass(frozen=True)
 class ColumnRun:
-    """A finished rollout.
+    """Result of a run of the column.
 
     Attributes:
-        column: the program.
+        column: parameters of the run.
         q, v: shape (steps + 1, balls).
-        record: of every step, leading axis steps.
+        record: record of every step, with steps along the leading axis.
     """
 
     column: Column
@@ -345,11 +347,11 @@ class ColumnRun:
 
     @property
     def steps(self) -> int:
-        """How many were made."""
+        """Number of steps."""
         return len(self.q) - 1
 
     def first_difference(self, other: ColumnRun) -> tuple[int, int, float, float] | None:
-        """First step (from 1) and ball whose contact differs, with both gaps; None where none does."""
+        """Return the first step (from 1) and ball whose contact differs, with both gaps; None without any."""
         differ = np.asarray(self.record.contact) != np.asarray(other.record.contact)
         if not differ.any():
             return None
@@ -358,7 +360,7 @@ class ColumnRun:
         return step + 1, ball, first, second
 
     def ended(self) -> dict[str, int]:
-        """How many outer loops ended for which reason."""
+        """Count the outer loops that ended for each reason."""
         codes, counts = np.unique(np.asarray(self.record.reason), return_counts=True)
         return {Reason(code).word: int(n) for code, n in zip(codes, counts, strict=True)}
 
@@ -382,7 +384,7 @@ def simulate_column(column: Column, start: ColumnState, steps: int) -> ColumnRun
 
 
 def in_format(column: Column, format: str) -> Column:
-    """The same column with its inner products in another format."""
+    """Return the column with inner matrix products in another format."""
     numbers = ("h", "k", "gravity", "tol", "inner_tol")
     given = {name: float(getattr(column, name)) for name in numbers}
     caps = {name: int(getattr(column, name)) for name in ("max_outer", "max_inner")}
@@ -397,7 +399,7 @@ BALLS, STEPS, BUDGET = 48, 60, 4
 
 
 def system(condition: float) -> tuple[np.ndarray, np.ndarray]:
-    """A symmetric matrix with eigenvalues from 1 to 1/condition, even in the logarithm; a right-hand side."""
+    """Return a matrix with logarithmically even eigenvalues from 1 to 1/condition, and a right side."""
     rng = np.random.default_rng(0)
     basis, _ = np.linalg.qr(rng.normal(size=(SIZE, SIZE)))
     matrix = (basis * np.logspace(0, -np.log10(condition), SIZE)) @ basis.T
@@ -406,7 +408,7 @@ def system(condition: float) -> tuple[np.ndarray, np.ndarray]:
 
 @jax.jit
 def solve(matrix: Any, b: Any) -> dict[str, Solution]:
-    """Conjugate gradients in float32 with the product in each format; true residuals in float64."""
+    """Solve in float32 with the matrix product in each format; return also true residuals in float64."""
     low = matrix.astype(jnp.float32)
 
     def one(code):
@@ -423,7 +425,7 @@ def solve(matrix: Any, b: Any) -> dict[str, Solution]:
 
 
 def column_runs(max_outer: int) -> dict[str, ColumnRun]:
-    """The falling column in every format, float64 first."""
+    """Simulate the falling column in every format, float64 first."""
     gaps = np.random.default_rng(0).uniform(0, 2e-3, BALLS)
     reference = Column.create(
         BALLS, "float64", k=1e7, tol=1e-6, inner_tol=1e-4, max_outer=max_outer, max_inner=CAP
@@ -433,12 +435,12 @@ def column_runs(max_outer: int) -> dict[str, ColumnRun]:
 
 
 def true_residual(solution: Solution) -> float:
-    """The relative residual that a solution has, as opposed to the one it believes in."""
+    """Return the true relative residual of a solution, in contrast to the residual of the recurrence."""
     return float(solution.true_history[solution.iterations])
 
 
 def run() -> Demo:
-    """The linear solve alone, and inside a contact problem."""
+    """Demonstrate the linear solve alone, and inside a contact problem."""
     hard, easy = (solve(*map(jnp.asarray, system(c))) for c in (HARD, EASY))
     full, short = column_runs(40), column_runs(BUDGET)
     counts = {name: int(one.iterations) for name, one in hard.items()}

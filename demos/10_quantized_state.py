@@ -20,7 +20,7 @@ _SHIFT = 24
 
 
 class LatticeState(NamedTuple):
-    """Height and velocity of every ball, in units of the lattice (m and m/s)."""
+    """Height and velocity of every ball, as integers in units of the fixed-point state (m and m/s)."""
 
     y: Int[Array, "balls"]
     v: Int[Array, "balls"]
@@ -30,9 +30,10 @@ class LatticeBall(eqx.Module):
     """Balls on a spring floor (semi-implicit Euler) with an integer state.
 
     Attributes:
-        h: time step, s, in 2^-24.
-        push: h k, 1/s, in 2^-24.
-        kick: what gravity and control add to the velocity in each step, in units, shape (steps,).
+        h: time step, s, in units of 2^-24.
+        push: h k, 1/s, in units of 2^-24.
+        kick: change of the velocity by gravity and control in each step, in fixed-point units, shape
+        (steps,).
         bits: the unit is 2^-bits m (and m/s).
     """
 
@@ -52,7 +53,7 @@ class LatticeBall(eqx.Module):
         largest: float = 16.0,
         deepest: float = 1.0,
     ) -> LatticeBall:
-        """A program for as many steps as there are controls.
+        """Create the balls for a run with one step per control acceleration.
 
         Args:
             k: stiffness, 1/s².
@@ -60,7 +61,7 @@ class LatticeBall(eqx.Module):
             control: acceleration added in each step, m/s².
             gravity: m/s².
             bits: the unit is 2^-bits m.
-            largest, deepest: speeds (m/s) and penetrations (m) up to these are sure not to overflow.
+            largest, deepest: speeds (m/s) and penetrations (m) up to these values cannot overflow.
 
         Raises:
             InputError: an int64 cannot hold the products.
@@ -79,34 +80,34 @@ class LatticeBall(eqx.Module):
         return cls(**cast, kick=jnp.asarray(kick), bits=bits)
 
     def start(self, y: Any, v: Any = 0.0) -> LatticeState:
-        """Heights (m) and velocities (m/s), rounded to the lattice."""
+        """Return the state for heights (m) and velocities (m/s), rounded to fixed-point numbers."""
         y = np.atleast_1d(np.asarray(y, np.float64))
         units = (np.rint(q * 2.0**self.bits).astype(np.int64) for q in (y, np.broadcast_to(v, y.shape)))
         return LatticeState(*(jnp.asarray(q) for q in units))
 
     def meters(self, y: Int[Any, "..."]) -> Float[np.ndarray, "..."]:
-        """Lattice units as m (or m/s)."""
+        """Convert fixed-point units to m (or m/s)."""
         return np.asarray(y).astype(np.float64) * 2.0**-self.bits
 
     def _pull(self, y, step):
         return self.kick[step] - jnp.where(y < 0, (y * self.push) >> _SHIFT, 0)
 
     def step(self, state: LatticeState, step: Int[Array, ""]) -> LatticeState:
-        """From the state at a step to the next: first the velocity, then the height."""
+        """Return the state after one step: first the velocity changes, then the height."""
         v = state.v + self._pull(state.y, step)
         return LatticeState(state.y + ((v * self.h) >> _SHIFT), v)
 
     def back(self, state: LatticeState, step: Int[Array, ""]) -> LatticeState:
-        """The state at a step from the next one, exactly."""
+        """Return the state before one step, exactly."""
         y = state.y - ((state.v * self.h) >> _SHIFT)
         return LatticeState(y, state.v - self._pull(y, step))
 
     def run(self, start: LatticeState) -> tuple[LatticeState, Bool[Array, "steps balls"]]:
-        """All steps: the last state, and whether each step's ball was in contact when it began."""
+        """Make all steps; return the last state, and the contacts at the beginning of each step."""
         return _forward(self, start)
 
     def rewind(self, end: LatticeState) -> LatticeState:
-        """All steps back: the state that `run` started from."""
+        """Reverse all steps; return the initial state of `run`."""
         return _backward(self, end)
 
 
@@ -134,28 +135,28 @@ SMALL, LARGE = 1e-11, 1e-4
 
 
 def control() -> np.ndarray:
-    """What the balls are shaken with, m/s²: bouncing on it, they forget where they came from."""
+    """Return the accelerations that shake the balls, m/s², so that initial heights are forgotten."""
     return 5.0 * np.sin(7.0 * np.arange(STEPS) * H)
 
 
 def world(shaken: np.ndarray, k: float = K) -> World:
-    """Undamped balls on springs."""
+    """Return the world of undamped balls on springs."""
     return World.create(Penalty(k), SemiImplicitEuler(H), control=shaken)
 
 
 def heights() -> np.ndarray:
-    """Where the balls start, m."""
+    """Return the initial heights of the balls, m."""
     return np.linspace(0.6, 1.1, BALLS)
 
 
 def rounded(x: Any, bits: int, span: float) -> np.ndarray:
-    """Numbers from -span to span in so many bits."""
+    """Return numbers from -span to span, rounded to a number of bits."""
     return np.asarray(np.rint(np.asarray(x) / (2 * span / 2**bits)) * (2 * span / 2**bits))
 
 
 @eqx.filter_jit
 def roll(world: World, y0: Any, scales: Any, half: Any):
-    """Heights and contacts of every step; the state is fake-quantized after each where half is positive."""
+    """Return heights and contacts of every step; with half > 0 the state is rounded in each step."""
 
     def snap(x, scale):
         return jnp.where(half > 0, quantize(x, scale, -half, half - 1), x)
@@ -169,7 +170,7 @@ def roll(world: World, y0: Any, scales: Any, half: Any):
 
 
 def bounced(world: World, y0: np.ndarray, bits: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Heights and contacts, with the state in so many bits (0: as it is)."""
+    """Return heights and contacts, with the state rounded to a number of bits (0 for no rounding)."""
     scales = jnp.asarray([2 * SPAN[name] / 2.0**bits for name in ("y", "v")])
     half = jnp.asarray(2.0 ** (bits - 1) if bits else 0.0)
     y, contact = roll(world, jnp.asarray(y0), scales, half)
@@ -177,13 +178,13 @@ def bounced(world: World, y0: np.ndarray, bits: int = 0) -> tuple[np.ndarray, np
 
 
 def horizon(contact: np.ndarray, reference: np.ndarray) -> float:
-    """First step with another contact, median over the balls; STEPS where half of them have none."""
+    """Return the median over balls of the first step with a different contact, at most STEPS."""
     differ = contact != reference
     return float(np.median(np.where(differ.any(axis=0), differ.argmax(axis=0), STEPS)))
 
 
 def run() -> Demo:
-    """Horizons against bits, and the integer state instead."""
+    """Measure the horizon over the number of bits, and compare with an integer state."""
     shaken, y0 = control(), heights()
     plain = world(shaken)
     reference, contact = bounced(plain, y0)
@@ -283,7 +284,7 @@ def run() -> Demo:
 
 
 def _doubling(a: np.ndarray, b: np.ndarray) -> float:
-    """Steps in which a separation doubles: a line through its logarithm between SMALL and LARGE."""
+    """Return the doubling time of a separation in steps, from a linear fit of its logarithm."""
     largest = np.maximum.accumulate(np.abs(a - b), axis=0)
     # the mean over the balls of the logarithm, as a Lyapunov exponent is one
     mean = np.log2(np.maximum(largest, 2.0**-60)).mean(axis=1)

@@ -1,4 +1,4 @@
-"""Duplicates of a sparse tensor are summed, in the order in which they are stored."""
+"""Duplicate entries of a sparse tensor are summed in the order in which they are stored."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ CONTACTS, PANELS, ORDERS = 96, 6, 1000
 
 
 def contacts() -> tuple[np.ndarray, np.ndarray]:
-    """A load (N, float32) for each contact, and the panel that carries it: coordinates with duplicates."""
+    """Return a load (N, float32) for each contact, and its panel; several loads share a panel."""
     rng = np.random.default_rng(5)
     return rng.permutation(np.arange(CONTACTS) % PANELS), rng.lognormal(0, 1.5, CONTACTS).astype(np.float32)
 
 
 def assembled(panel: np.ndarray, load: np.ndarray) -> dict[str, np.ndarray]:
-    """The load of every panel, shape (orders, panels), in each way of adding and every storage order."""
+    """Return the load of every panel, shape (orders, panels), for each method of summation."""
     storage = np.array(orders(CONTACTS, ORDERS, seed=1))
     # sorted by panel, stably: duplicates stay as they were stored
     within = np.array([order[np.argsort(panel[order], kind="stable")] for order in storage])
@@ -47,7 +47,7 @@ def assembled(panel: np.ndarray, load: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def run() -> Demo:
-    """A thousand storage orders of one sparse vector, and a decision about each panel."""
+    """Sum one sparse vector in a thousand storage orders, with a decision about each panel."""
     panel, load = contacts()
     sums = assembled(panel, load)
     exact = sums["exact sum"][0]

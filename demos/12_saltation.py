@@ -1,4 +1,4 @@
-"""The derivative through an impact: the time of the impact changes, which fixed steps do not show."""
+"""The derivative through an impact includes the change of the impact time, which fixed steps omit."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ STARTS = np.concatenate([[1.0], np.linspace(0.9, 1.1, 31)])
 
 
 def saltated(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
-    """Heights after a number of steps and the derivative of the motion that the steps imitate.
+    """Return heights after a number of steps, and the derivative of the approximated exact motion.
 
-    For an impact reset at the end of a step. Between impacts the tangent is that of the flight; at an impact
-    it is multiplied by the saltation matrix there, with the speed that the program itself arrived with.
+    Impacts are reset at the end of a step. Between impacts the tangent is that of the flight; at an impact it
+    is multiplied by the saltation matrix for the speed at which the simulated ball arrives.
 
     Raises:
-        InputError: for another parameter than y0 or v0.
+        InputError: the parameter is not y0 or v0.
     """
     if name not in ("y0", "v0"):
         raise InputError(f"saltation along {name!r}; expected y0 or v0")
@@ -61,7 +61,7 @@ def _saltated(world: World, y0: Array, steps: Array, name: str) -> tuple[Array, 
 
 
 def run() -> Demo:
-    """Differentiate the height after three impacts by the height at the start, in three ways."""
+    """Differentiate the height after three impacts with respect to the initial height, by three methods."""
     exact = np.array([float(ExactImpact(y).height(TIME).gradient["y0"]) for y in STARTS])
     heights = np.array([float(ExactImpact(y).height(TIME).value) for y in STARTS])
     naive = World.create(Impact(), SemiImplicitEuler(0.01))
@@ -180,7 +180,7 @@ def run() -> Demo:
 
 
 def _history(world: World) -> Plot:
-    """Derivative against time, by all three."""
+    """Return the derivative over time by all three methods."""
     time = np.linspace(0, TIME, 801)
     steps = np.arange(0, 201, 2)
     one = jnp.ones(1)

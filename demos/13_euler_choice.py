@@ -1,4 +1,4 @@
-"""Explicit or semi-implicit Euler: two lines in another order, two programs, two gradients."""
+"""Explicit and semi-implicit Euler differ in the order of two lines, and have different gradients."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class Convergence:
     Attributes:
         h: time steps, s, shape (sizes,).
         value: root mean square error of the height over the batch, m, shape (sizes,).
-        slope: that of its derivative, shape (sizes,).
-        largest: the largest derivative that the program gave, by magnitude, shape (sizes,).
+        slope: root mean square error of the derivative of the height, shape (sizes,).
+        largest: largest magnitude of the derivatives of the program, shape (sizes,).
     """
 
     h: Float[np.ndarray, "sizes"]
@@ -54,7 +54,7 @@ class Convergence:
     largest: Float[np.ndarray, "sizes"]
 
     def order(self, of: str = "value") -> float:
-        """The exponent p of error ~ h^p: the slope of a straight line through the logarithms."""
+        """Return the exponent p of error ~ h^p: the slope of a straight line through the logarithms."""
         return float(np.polyfit(np.log(self.h), np.log(getattr(self, of)), 1)[0])
 
 
@@ -69,12 +69,12 @@ def converge(
     """Run a batch to the same time with several step sizes and compare with the exact motion.
 
     Args:
-        world: the program; its time step is replaced.
-        exact: from a height at the start to the motion that the program approaches.
-        y0: heights at the start, m.
-        time: when heights are compared, s.
+        world: world of the ball; its time step is replaced.
+        exact: function from an initial height to the exact motion.
+        y0: initial heights, m.
+        time: time at which heights are compared, s.
         counts: numbers of steps.
-        name: what heights are differentiated by.
+        name: parameter with respect to which heights are differentiated.
     """
     known = [exact(float(y)).height(time) for y in y0]
     heights = np.array([float(one.value) for one in known])
@@ -195,7 +195,7 @@ def run() -> Demo:
 
 
 def _first(world: World, name: str) -> list[float]:
-    """Height of the first ball and its derivative."""
+    """Return the height of the first ball and its derivative."""
     return [float(np.asarray(x)[0]) for x in arrive(world, jnp.asarray(STARTS), STEPS, name)]
 
 

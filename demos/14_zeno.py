@@ -18,7 +18,7 @@ COUNTS = (1, 7, 60, 500)
 
 
 def run() -> Demo:
-    """Bounce a ball until it lies still: in closed form, with located impacts, and in fixed steps."""
+    """Bounce a ball to rest: in closed form, with located impacts, and with fixed steps."""
     exact = ExactImpact(1.0, 0.0, G, E)
     rest = exact.rest_time()
     limit = float(rest.value)
@@ -150,7 +150,7 @@ def run() -> Demo:
 
 
 def _rest(world: World, y0: float, near: float, count: int) -> float:
-    """Time at which the program's ball lies still, to the last ulp, with so many steps to get there."""
+    """Return the time at which the simulated ball comes to rest, to the last ulp, for a number of steps."""
     low, high = 0.9 * near, 1.1 * near
     while True:
         middle = 0.5 * (low + high)

@@ -24,13 +24,13 @@ SHOWN = {0.0: "bad", 0.01: "second", 0.03: "first", 0.1: "third"}
 
 @dataclass(frozen=True)
 class Landscape:
-    """The loss of one program over the starts.
+    """Loss of one program as a function of the initial height.
 
     Attributes:
-        loss, slope: the loss, m², and the program's derivative of the final height by the start.
+        loss, slope: the loss, m², and the derivative of the final height with respect to the initial height.
         minima: local minima of the loss inside the window.
-        best: the start with the lowest loss, m.
-        rough: standard deviation of the derivative around that of the exact motion.
+        best: initial height with the lowest loss, m.
+        rough: standard deviation of the derivative from the derivative of the exact motion.
     """
 
     loss: np.ndarray
@@ -41,7 +41,7 @@ class Landscape:
 
 
 def run() -> Demo:
-    """Look for the start that ends at a wanted height, on floors of growing softness."""
+    """Find the initial height for a given final height, on floors of increasing softness."""
     motion = [ExactPenalty(float(y), k=K).height(TIME) for y in STARTS[SOME]]
     known = np.array([float(one.gradient["y0"]) for one in motion])
     target = float(ExactPenalty(WANTED, k=K).height(TIME).value)
@@ -196,7 +196,7 @@ def _series(eps: float, values: np.ndarray) -> Series:
 
 
 def _order_of_bias() -> float:
-    """Exponent with which the final height leaves that of the hard floor, without errors of the step."""
+    """Return the order of the bias of the final height relative to a hard floor, without time-step errors."""
     starts = STARTS[::100]
     exact = np.array([float(ExactPenalty(float(y), k=K).height(TIME).value) for y in starts])
     world = World.create(Penalty(K, eps=0.01, smooth=True), BallVerlet(TIME / FINE))

@@ -1,4 +1,4 @@
-"""Repeated runs in new processes: whether their bits are equal, and what this shows."""
+"""Repeated runs in new processes: are their bits equal, and are equal bits correct?"""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _PARTS = ("y", "v", "contact", "iterations", "reason")
 
 
 def fingerprint(run: BallRun) -> str:
-    """SHA-256 of every state and decision of a run, bit for bit.
+    """Return the SHA-256 of all states and decisions of a run, bit for bit.
 
-    Equal fingerprints: the same heights, velocities, contacts and iteration counts, to the last bit.
+    Equal fingerprints mean that heights, velocities, contacts and iteration counts are equal to the last bit.
     """
     digest = hashlib.sha256()
     for name in _PARTS:
@@ -49,7 +49,7 @@ Answers = dict[str, Any]
 
 
 def answers() -> Answers:
-    """Fingerprints and first contacts of mdnum's program and of the plain one, in this process."""
+    """Return fingerprints and first contacts of mdnum's program and of the plain program, in this process."""
     fenced, higher, plain = _fenced(START), _fenced(_next(START)), _plain(STEPS)
     return {
         "fenced": fingerprint(fenced),
@@ -61,7 +61,7 @@ def answers() -> Answers:
 
 
 def run() -> Demo:
-    """Start the processes, do the rest here meanwhile, and compare."""
+    """Start the processes, run the same programs in this process meanwhile, and compare."""
     started = {"another process": _start(""), "an older instruction set": _start(OLD_ISA)}
     here, higher = _fenced(START), _fenced(_next(START))
     plain, _, _ = _plain(STEPS)
@@ -208,10 +208,10 @@ def _fenced(y0: float, steps: int = STEPS) -> BallRun:
 
 
 def _plain(steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same ball in the way it is usually written: the compiler may fuse a product with a sum.
+    """Simulate the same ball with plain code, in which the compiler may fuse a product with a sum.
 
     Returns:
-        heights, velocities and contacts of the states 1..steps.
+        heights, velocities and contacts of the states 1 to steps.
     """
 
     def step(state, _):
@@ -248,10 +248,10 @@ def _start(flags: str) -> subprocess.Popen[str]:
 
 
 def _finish(name: str, process: subprocess.Popen[str]) -> Answers:
-    """What a process found.
+    """Return the results of a process.
 
     Raises:
-        NumericalError: it did not come to an end.
+        NumericalError: the process did not finish.
     """
     try:
         out, err = process.communicate(timeout=_PATIENCE)

@@ -1,4 +1,4 @@
-"""Complex order parameters of a drifting crystal: gradients, what happens near zero, and the branch cut."""
+"""Complex order parameters of a drifting crystal: gradients, behavior near zero, and the branch cut."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NAMES = ("psi6", "S at a Bragg peak", "S at a long wave")
 
 
 def layer() -> tuple[Simulation, tuple[Array, ...]]:
-    """A layer of 64 Lennard-Jones atoms drifting along x; its neighbors, their images, two wave vectors."""
+    """Return a drifting layer of 64 Lennard-Jones atoms, its neighbors, images and two wave vectors."""
     atoms = fcc111("Ar", (8, 8, 1), a=A * np.sqrt(2), vacuum=6.0, orthogonal=True, periodic=True)
     first, second, image = neighbor_list("ijS", atoms, 1.2 * A)
     atoms.set_array("masses", np.ones(64))
@@ -41,14 +41,14 @@ def layer() -> tuple[Simulation, tuple[Array, ...]]:
 
 
 class Order(Loss):
-    """Sum of w z at the last step, a complex number."""
+    """Complex loss: the sum of w z at the last step."""
 
     name = "order"
     w: Array = eqx.field(kw_only=True)  # shape (3,): which of the order parameters
     lattice: tuple[Array, ...] = eqx.field(kw_only=True)  # pairs, images, wave vectors
 
     def z(self, x: Array) -> Array:
-        """The three order parameters, each the mean of unit numbers: of x, shape (3, atoms)."""
+        """Return three order parameters for x, shape (3, atoms): means of numbers of modulus 1."""
         (first, second), image, waves = self.lattice
         d = x[:, second] - x[:, first] + image.T
         angles = [6 * jnp.arctan2(d[1], d[0]), *(waves @ x)]
@@ -59,7 +59,7 @@ class Order(Loss):
 
 
 def cuts(z: np.ndarray, bound: float) -> Ledger:
-    """Crossings of the branch cut of arg z between steps: flips of the sign of Im z where Re z < 0."""
+    """Return the crossings of the branch cut of arg z: sign changes of Im z where Re z < 0."""
     turn = np.diff(np.angle(z))
     step = np.flatnonzero(np.abs(turn) > np.pi) + 1
     above, bounds = Threshold(0.0).decide(-np.imag(z)[step]), np.full(len(step), bound)
@@ -68,7 +68,7 @@ def cuts(z: np.ndarray, bound: float) -> Ledger:
 
 
 def run() -> Demo:
-    """Differentiate psi6 and S by epsilon in the dynamics; then |z| and arg z by themselves."""
+    """Differentiate psi6 and S through the dynamics with respect to epsilon, then |z| and arg z alone."""
     simulation, lattice = layer()
     losses = [Order(w=w, lattice=lattice, first=STEPS) for w in jnp.eye(3, dtype=complex)]
     problems = [Problem(simulation, loss, STEPS) for loss in losses]

@@ -14,7 +14,7 @@ SPEED, STEPS = 4.0, 3000
 
 
 def bounces(y: float) -> dict[str, np.ndarray]:
-    """A ball thrown down from a height: what the solver leaves of a penetration stays where it is left.
+    """Simulate a ball thrown down; each step starts from the penetration left by the solver.
 
     Returns:
         heights (m), iterations and contacts of each step.
@@ -33,7 +33,7 @@ def bounces(y: float) -> dict[str, np.ndarray]:
 
 
 def run() -> Demo:
-    """One stopping decision with both residuals; then the same within a bounce."""
+    """Make one stopping decision with both residuals, then the same decision within a bounce."""
     rule = Projection(K, ALPHA, GlobalSum(TOL, 100))
     world = World.create(rule, SemiImplicitEuler(1.0), gravity=0.0)
     problems = [BallProblem(world, np.array([-s]), 0.0, 1, ResidualPenetration(1)) for s in RESIDUALS]

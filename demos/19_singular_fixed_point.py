@@ -16,19 +16,19 @@ REFUSED, ITERATIONS = 1 / np.sqrt(numerics.unit_roundoff(np.dtype(float))), 1000
 
 
 def update(x: jax.Array, p: jax.Array, spring: jax.Array | float = 0.0) -> jax.Array:
-    """A step towards the rest position of a bead in the well x⁴/4 under a load p, and of a linear spring."""
+    """Return a step toward the rest position under a load p, in the well x⁴/4 with a linear spring."""
     return x - (x**3 + spring * x - p)
 
 
 def implicit(x: float, p: float, added: float = 0.0, spring: float = 0.0) -> float:
-    """dx/dp = dG/dp / (1 - dG/dx + added) at a fixed point x = G(x, p)."""
+    """Return dx/dp = dG/dp / (1 - dG/dx + added) at a fixed point x = G(x, p)."""
     at = jnp.asarray(x), jnp.asarray(p)
     by_x, by_p = jax.grad(lambda x, p: update(x, p, spring), (0, 1))(*at)
     return float(by_p / (1 - by_x + added))
 
 
 def rest(p: float, spring: float) -> float:
-    """Where the bead rests under a load on both springs, by Newton's method."""
+    """Return the rest position of the bead under a load on both springs, by Newton's method."""
     x = np.cbrt(p) + 1.0
     for _ in range(200):
         x -= (x**3 + spring * x - p) / (3 * x * x + spring)
@@ -36,12 +36,12 @@ def rest(p: float, spring: float) -> float:
 
 
 def told(value: float | bool) -> float | bool | str:
-    """A number of a table, infinity in words: a table of plain values has no place for it."""
+    """Return a number for a table, with infinity as text, because tables contain only finite numbers."""
     return "infinite" if value == np.inf else value
 
 
 def run() -> Demo:
-    """Loads ever closer to the singular one; then the same with a stiffness added, in two ways."""
+    """Compute derivatives for loads that approach the singular load, then with added stiffness."""
     at = [float(np.cbrt(p)) for p in LOADS]
     plain = [implicit(x, p) for x, p in zip(at, LOADS, strict=True)]
     exact = [np.inf if p == 0 else p ** (-2 / 3) / 3 for p in LOADS]

@@ -18,17 +18,17 @@ SPEEDS = np.linspace(4.0, 6.0, 401)
 
 
 def heights(v0: Array) -> Array:
-    """Heights of balls thrown up from the floor at each step, as the semi-implicit Euler method has them."""
+    """Return the heights of balls thrown up from the floor, by the semi-implicit Euler method."""
     n = np.arange(1.0, STEPS + 1)[:, None]
     return jnp.asarray(n * H) * v0 - G * H * H * n * (n + 1) / 2
 
 
 @jax.jit
 def missed(v0: Array, width: float) -> tuple[Array, Array]:
-    """Squared difference of the time for which a ball is above the edge from the time wanted, and its slope.
+    """Return the squared error of the time for which a ball is above the edge, and its derivative.
 
     Args:
-        width: each step counts by a sigmoid of this width; 0 counts steps.
+        width: width of the sigmoid by which each step is weighted, m; 0 counts steps.
     """
 
     def loss(v0):
@@ -40,7 +40,7 @@ def missed(v0: Array, width: float) -> tuple[Array, Array]:
 
 
 def run() -> Demo:
-    """One throw with its events; then the throw that is seen for half a second, hard and softened."""
+    """Simulate a throw with its events, and find the throw that is visible for half a second."""
     world = World.create(Impact(), SemiImplicitEuler(H), gravity=G)
     thrown = simulate(world, world.start(0.0, 5.0), STEPS)
     y, rule = thrown.y[:, 0], Threshold(-EDGE, "<", "minus height")

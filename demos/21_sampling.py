@@ -1,4 +1,4 @@
-"""Sampling and rounding can flip the same decision: how to distinguish them, with how many samples."""
+"""Sampling and rounding can flip the same decision: how many samples distinguish them?"""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ RULE = Threshold(TOL, "<", "residual")
 
 
 def residuals(seed: int, count: int) -> Float[np.ndarray, "repeats samples"]:
-    """Penetrations of a rough floor at random places, float16, each repeat from a key of its own."""
+    """Return float16 penetrations of a rough floor at random places, with one key per repeat."""
     random = np.random.default_rng((seed, count))
     return random.uniform(0, 2 * MEAN, (PAIRS, count)).astype(np.float16)
 
 
 def mean(samples: np.ndarray) -> Float[np.ndarray, "repeats"]:
-    """Means by a running sum in float16, in the order of the samples; divided exactly."""
+    """Return means by a running sum in float16, in the order of the samples, with exact division."""
     # numpy rounds every partial sum of accumulate to float16
     return np.add.accumulate(samples, axis=1)[:, -1].astype(float) / samples.shape[1]
 
 
 def exact(samples: np.ndarray) -> Float[np.ndarray, "repeats"]:
-    """Means of the same samples without rounding: float16 is summed exactly in float64."""
+    """Return the means of the same samples without rounding, because float64 sums float16 numbers exactly."""
     return samples.astype(float).sum(axis=1) / samples.shape[1]
 
 
 def run() -> Demo:
-    """Pairs of runs with the key, the order or both changed; then which of the two a flip is due to."""
+    """Compare runs with another random key, another order or both, and determine the cause of each flip."""
     rows = []
     for count in SAMPLES:
         a, b, other = residuals(1, count), residuals(2, count), np.random.default_rng(count)

@@ -1,4 +1,4 @@
-"""Precision, accuracy, stability, conditioning and discretization error of one run, each with its number."""
+"""Precision, accuracy, stability, conditioning and discretization error of one run, each as a number."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HEAD = ("unit roundoff", "rounding error (m)", "discretization error (m)", "h sq
 
 
 def five(worlds: dict[str, World], precision: str, h: float, y0: float) -> tuple[float, ...]:
-    """The numbers of `HEAD` of the height at the end of a run."""
+    """Return the numbers named in `HEAD` for the final height of a run."""
     steps = round(TIME / h)
     known = ExactPenalty(y0, 0.0, 9.81, K, 0.0).height(steps * h)
     exact, slope = float(known.value), float(known.gradient["y0"])
@@ -39,7 +39,7 @@ def five(worlds: dict[str, World], precision: str, h: float, y0: float) -> tuple
 
 
 def run() -> Demo:
-    """The five numbers of one run, and of runs in which one thing is changed."""
+    """Compute the five numbers for one run, and for runs in which one setting is changed."""
     worlds = {name: World.create(Penalty(K), SemiImplicitEuler(1e-3), policy=RolePrecision.all(name))
               for name in ("float64", "float32", "float16")}  # fmt: skip
     found = {what: five(worlds, *changed) for what, changed in CHANGED.items()}
