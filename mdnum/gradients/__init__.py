@@ -1,7 +1,7 @@
 """Gradients of long simulations, with an estimate of the number of steps up to which each can be trusted.
 
 A simulation is differentiated at its recorded states and decisions; changes of decisions (flips) contribute a
-separate term. Gradient methods are subclasses of `Method`, differentiable quantities of `Loss`.
+separate term. Gradient methods are subclasses of `Method`, and losses are subclasses of `Loss`.
 """
 
 from mdnum.gradients.differentiate import differentiable, value_and_grad

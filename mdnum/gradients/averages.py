@@ -1,10 +1,10 @@
 """Derivatives of averages over states, from the frames of one run; the dynamics are not differentiated.
 
-The derivative of an average with respect to a parameter has up to three contributions. First, the observable
-in each frame changes at fixed positions. Second, if the observable jumps when a pair enters the cutoff, the
-average changes with the cutoff radius by the jump times the density of pairs at the cutoff; derivatives at
-fixed decisions lack this contribution. Third, with a thermostat, the statistical weight exp(-U/kT) of each
-frame changes.
+The derivative of an average with respect to a parameter has up to three contributions. First, at fixed
+positions, the value of the observable in each frame changes. Second, if the observable jumps when a pair
+enters the cutoff, the average changes with the cutoff radius by the jump times the density of pairs at the
+cutoff; derivatives at fixed decisions lack this contribution. Third, with a thermostat, the statistical
+weight exp(-U/kT) of each frame changes.
 """
 
 from __future__ import annotations

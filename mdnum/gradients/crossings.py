@@ -163,8 +163,8 @@ def onto_crossings(
         d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
         d(W) = (f r_cut n ⊗ n) dr/s        on the integrator's use of the virial tensor W
 
-    so that the cotangent of dr is f/s n · (v̄_j/m_j - v̄_i/m_i) + f r_cut/s n · S n. Here v̄ is the cotangent
-    of the velocities, and S is the cotangent of the virial tensor in a step, divided by the time step.
+    The cotangent of dr is therefore f/s n · (v̄_j/m_j - v̄_i/m_i) + f r_cut/s n · S n. Here v̄ is the
+    cotangent of v, and S is the cotangent of the virial in a step, divided by the time step.
 
     Args:
         met: the crossings between the previous step and this one.

@@ -46,10 +46,10 @@ class SeedMean:
 def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K, SeedMean]:
     """Return the mean of one measure at each setting, over runs that differ only in their random seed.
 
-    The error of a mean is the error from its runs, times the ratio of the scatter between seeds to the error
-    from the runs. One such ratio is used for all settings of a measure; more settings make the ratio more
-    precise. If this error has fewer degrees of freedom than the scatter between seeds of a single setting,
-    the scatter is used instead.
+    The error of a mean is the error estimated from its runs, multiplied by the ratio of the scatter between
+    seeds to the estimated errors. One such ratio is used for all settings of a measure; more settings make
+    the ratio more precise. If this error has fewer degrees of freedom than the scatter between seeds of a
+    single setting, the scatter is used instead.
 
     Args:
         found: (value, standard error, independent samples) of each run; nan if unknown.

@@ -73,7 +73,7 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def _of_methods(view: View) -> Iterator[Finding]:
-    """Yield findings on results of gradient methods: not finite, zero, unexplained, misleading or missing."""
+    """Yield findings on gradients that are not finite, zero, unexplained, misleading or not available."""
     summary, methods, section = view.summary, view.summary["methods"], "By method"
     where = summary.get("detective") or {}
     variants = []

@@ -40,7 +40,7 @@ _FIRST, _FACTOR = 1e-12, 8.0
 
 @dataclass(frozen=True)
 class FlipTerms:
-    """Contributions of all flips to the derivative with respect to each number, largest first.
+    """Contributions of all flips to the derivative with respect to each parameter entry, largest first.
 
     A number here means a scalar parameter, or one entry of an array parameter ("potential.sigma[1]").
     """

@@ -83,7 +83,7 @@ class GrowthWatch:
         self._scalars = [name for name in self.names if not name.startswith("initial.")]
 
     def __call__(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Process one stretch of steps of the reverse pass."""
+        """Collect data from the cotangents of one stretch of steps of a reverse pass."""
         rows, first = stretch.rows, stretch.first
         onto_x, onto_v = (np.asarray(part, np.float64)[:rows] for part in (trace.x, trace.v))
         v = stretch.v[:rows].astype(np.float64)
@@ -196,7 +196,7 @@ class ScalingWatch:
         self.exponents = np.zeros((steps + 1, _HIGHEST - _LOWEST + 1), np.int32)
 
     def __call__(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Process one stretch of steps of the reverse pass."""
+        """Collect data from the cotangents of one stretch of steps of a reverse pass."""
         for row in range(stretch.rows):
             both = (np.asarray(part[row], np.float64).ravel() for part in (trace.x, trace.v))
             self.put(stretch.first + row, np.concatenate(list(both)))
