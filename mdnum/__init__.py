@@ -1,4 +1,4 @@
-"""mdnum: neighbor-set flips, forks and gradients of cutoff-based molecular dynamics.
+"""Molecular dynamics with a cutoff: changes of neighbor sets, divergence of runs, and gradients.
 
 A simulation is created from Python objects, or from a system file, as follows:
 

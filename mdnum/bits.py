@@ -17,7 +17,7 @@ from mdnum.vectors import lowest_bit
 
 @njit
 def _scan(before, rows, columns, row, slot, column, values):
-    """Record the bits that change between rows while there is space; return the number of all changes."""
+    """Record all bits that change from row to row, up to the buffer size; return the number of changes."""
     at, room = 0, row.shape[0]
     for r in range(rows.shape[0]):
         # the eight slots that the scan is in, and the places of their bytes
@@ -43,15 +43,14 @@ def changes_in_time(
 ) -> tuple[
     Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]
 ]:
-    """Find all decisions that change between consecutive rows of packed decisions for one neighbor list.
+    """Find all changes of decisions (packed bits, one row per time step) for one neighbor list.
 
     Args:
         before: decisions before the first row.
         rows: decisions of each row.
 
     Returns:
-        row, slot, column and new decision (1 yes, 0 no) of every change, sorted by row, slot word, column,
-        bit.
+        row, slot, column and new decision (1 yes, 0 no) of each change, by row, slot word, column and bit.
     """
     count, words, columns = rows.shape
     size = words * columns
@@ -75,13 +74,13 @@ def changes_in_time(
 def set_bits(
     packed: UInt8[np.ndarray, "words columns"],
 ) -> tuple[Int[np.ndarray, "set"], Int[np.ndarray, "set"]]:
-    """Return slot and column of every bit that is set (decision "yes")."""
+    """Return the slot and the column of every set bit in an array of packed bits."""
     _, slots, columns, _ = changes_in_time(np.zeros_like(packed), packed[None])
     return slots, columns
 
 
 def count_set(packed: UInt8[np.ndarray, "..."]) -> int:
-    """Count the bits that are set (decision "yes") in packed bytes."""
+    """Return the number of set bits in an array of packed bits."""
     flat = np.ascontiguousarray(packed).reshape(-1)
     whole = len(flat) // 8 * 8
     return int(np.bitwise_count(flat[:whole].view(np.uint64)).sum(dtype=np.int64)) + int(

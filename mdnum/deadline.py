@@ -65,7 +65,7 @@ class Deadline:
 def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
     """Raise `TimeUp` in the main thread if the block is still running `grace` seconds after the deadline.
 
-    The exception is raised repeatedly, because the block may catch it. Compiled code is not interrupted.
+    The exception is raised repeatedly, because the block may catch one. Compiled code is not interrupted.
     """
     if math.isinf(deadline.left) or threading.current_thread() is not threading.main_thread():
         yield
@@ -84,7 +84,7 @@ def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
 def fewest(
     items: Sequence[T], enough: Callable[[list[T]], bool], spent: Callable[[], bool] = lambda: False
 ) -> list[T]:
-    """Return a subset of items that satisfies a condition; it is minimal unless the search was stopped.
+    """Return a subset of items that satisfies a condition, and that is minimal unless time ran out.
 
     Args:
         items: items that are sufficient together.

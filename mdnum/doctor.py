@@ -5,7 +5,8 @@ no version is assumed to be correct.
 
 Error bounds require that +, -, *, / and sqrt are each correctly rounded, and that sums are not reordered. XLA
 satisfies these conditions on CPUs, but contracts a*b+c and rewrites divisions by constants. Such changes
-affect last bits, so the cutoff decisions of two builds may differ if a margin is below its error bound.
+affect last bits. Therefore two builds may disagree on whether a pair is inside the cutoff, if its distance
+from the cutoff is below the error bound.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
 
 
 def _row(test: str, status: Status | bool, **values: Any) -> DoctorRow:
-    """Return the result row of a test with its text filled in; status True means "ok", False "unsafe"."""
+    """Return the result of a test with a descriptive text; status True means "ok", False "unsafe"."""
     if not isinstance(status, str):
         status = "ok" if status else "unsafe"
     words = _WORDS[test]
@@ -325,7 +326,7 @@ def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) -> jax.Array:
-    """Compute r² of every listed pair by one matrix-vector product, like jax-md; 0 in unused slots."""
+    """Compute r² of every listed pair by one matrix-vector product, like jax-md; 0 for padding."""
     used = slots[:, 0] < fractional.shape[0]
     index = jnp.where(used[:, None], slots, 0)
     separation = fractional[index[:, 0]] - fractional[index[:, 1]]
@@ -455,7 +456,7 @@ def _lennard_jones(
 
 
 class Child:
-    """A Python process that runs code and prints one line; it is started early to avoid waiting."""
+    """A Python process that runs code in the background and prints one line."""
 
     def __init__(self, code: str):
         pipe: Any = subprocess.PIPE

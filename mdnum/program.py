@@ -3,8 +3,9 @@
 Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. An
 object with this interface (a program) determines all bits of a run, including the initial state. Forks,
 parameter maps, screening and certificates use only this interface. Decisions, such as whether a pair is
-inside the cutoff, are an input of each time step. Therefore decisions can be recorded, and imposed on another
-program. The implementations are `mdnum.rollout.program.MdProgram` and `mdnum.ball.program.BallProgram`.
+inside the cutoff, are an input of each time step. Therefore the decisions of one program can be recorded and
+imposed on another program. The implementations are `mdnum.rollout.program.MdProgram` and
+`mdnum.ball.program.BallProgram`.
 """
 
 from __future__ import annotations
@@ -28,8 +29,7 @@ class Program(Protocol):
         steps: number of steps that the system specifies.
         timestep: time step in the unit of the system file.
         scale: reference length of tolerances: the longest cutoff, or the largest initial height.
-        ulp: unit in the last place of the largest initial coordinate, length; the smallest possible
-            displacement.
+        ulp: unit in the last place of the largest initial coordinate, length (the smallest displacement).
         streams: whether runs may continue beyond the requested steps; False for runs that are stored whole.
         imposable: reason why decisions cannot be imposed on the program; None if imposing is possible.
     """
@@ -50,7 +50,7 @@ class Program(Protocol):
     def imposable(self) -> str | None: ...
 
     def check(self, other: Any) -> None:
-        """Raise an error if another program has another number of atoms or balls, or other decisions.
+        """Raise an error if two programs have different numbers of atoms or balls, or kinds of decisions.
 
         Raises:
             InputError: the programs cannot be compared.
@@ -97,7 +97,7 @@ class Program(Protocol):
         ...
 
     def number(self, key: str) -> Number:
-        """Return the numerical parameter of the system that belongs to a key.
+        """Return the numerical parameter of the system that is given by a key of the system file.
 
         Raises:
             InputError: no parameter or several parameters match; the message lists the known parameters.
@@ -109,7 +109,7 @@ class Program(Protocol):
         ...
 
     def differing(self, other: Any, steps: int, step: int, key: str) -> Differing:
-        """Return the decision that differs at a step between this and another program."""
+        """Return the decision that differs between this program and another program at a step."""
         ...
 
 
@@ -273,7 +273,7 @@ class DecisionHistory:
 
 @dataclass(frozen=True)
 class Differing:
-    """Decision that differs at a step between two simulations with adjacent values of a parameter."""
+    """Decision that differs at a step between two simulations with slightly different parameter values."""
 
     # the one whose margin is closest to 0 on both sides; a, b, margins and bounds are those of the two
     # programs

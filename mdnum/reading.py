@@ -148,8 +148,7 @@ def check_claim(path: str | Path, atoms: int | None = None) -> None:
 
     Args:
         path: the file.
-        atoms: number of atoms in the file's header; None to search the header in formats whose readers trust
-            it.
+        atoms: number of atoms in the file's header; None to read it from the header, if readers trust it.
 
     Raises:
         InputError: there would be at least a thousand atoms per byte, which no compression achieves.

@@ -48,8 +48,7 @@ Parameters = Mapping[str, complex]
 class _Motion:
     """Base class of both exact motions: validation of the start, derivatives, height and velocity.
 
-    Derivatives are complex-step derivatives, which have no cancellation (Squire & Trapp, SIAM Review 40
-    (1998) 110).
+    Complex-step derivatives have no cancellation (Squire & Trapp, SIAM Review 40 (1998) 110).
     """
 
     y0: float

@@ -40,8 +40,8 @@ def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") ->
     """Return the smallest tolerance (m) of an iterative solver that each role's floating-point format allows.
 
     A penetration no longer decreases when `gain` times the penetration rounds to zero, and a tolerance below
-    the smallest number of a format rounds to zero. The smallest usable tolerance is the largest of the
-    values.
+    the smallest number of a format rounds to zero. The largest returned value is the smallest usable
+    tolerance.
 
     Args:
         precision: names of formats by role, as attributes.

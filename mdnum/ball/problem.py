@@ -189,7 +189,7 @@ def loss_of(
 
 
 def loss_at(bare, world, y0, v0, values, imposed):
-    """Compute the loss for given parameter values, which are arguments so that XLA cannot fold them.
+    """Compute the loss for given parameter values, all of which are arguments of the compiled function.
 
     Args:
         bare: number of steps, and loss.

@@ -1,4 +1,4 @@
-"""Simulation of bouncing balls: the compiled time-stepping loop, its record, and comparisons of two runs."""
+"""Simulation of bouncing balls: compiled time-stepping loop, records of runs, and comparison of two runs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """Record of a finished run. In arrays with a row per step, row s is the step from state s to state s + 1.
+    """Record of a finished run. In arrays with one row per step, row s is the step that ends in state s + 1.
 
     Attributes:
         world: the bouncing-ball model that was simulated.

@@ -1,7 +1,7 @@
 """A time step of the bouncing ball: integration schemes and contact models.
 
-Every integration scheme defines the height that decides contact; this height is recorded. All products are
-rounded before they are added (no fused multiply-add), so numpy gives the same bits in the same dtype.
+Each integration scheme specifies the height at which contact is decided; this height is recorded. Products
+are rounded before they are added (no fused multiply-add), so numpy gives the same bits.
 """
 
 from __future__ import annotations
@@ -266,7 +266,7 @@ class Contact(Protocol):
         ...
 
     def acceleration(self, y: Balls, v: Balls, free: Balls, contact: Touching, r: Rounding) -> Balls:
-        """Return the acceleration of a state, for integration schemes that use it in the next step."""
+        """Return the acceleration of a state, which some integration schemes use again in the next step."""
         ...
 
 
@@ -321,7 +321,7 @@ class Projection(_Forceless):
 
     Each iteration multiplies the penetration by 1 - alpha k, so tol is reached from p0 after ceil(log(tol /
     p0) / log(1 - alpha k)) iterations. With alpha k between 1 and 2, iterations overshoot; with alpha k = 2,
-    they never end. For any k, the floor is at 0: k affects the final height only through the remaining
+    they never end. For any k, the floor is at 0: k changes the final height only by the remaining
     penetration.
     """
 

@@ -116,7 +116,7 @@ class Relative(GlobalSum):
     """Stopping rule that compares the sum of residuals with the tolerance times the initial sum."""
 
     def threshold(self, first, iteration):
-        """Return tol times the first residual; if this residual is zero, the smallest normal number."""
+        """Return tol times the initial residual, or the smallest normal number if this residual is zero."""
         scaled = jnp.asarray(self.tol).astype(first.dtype) * first
         # float32's smallest would be 0 in float16, and no residual is below that
         least = jnp.finfo(first.dtype).tiny
@@ -251,8 +251,7 @@ def elementwise(function: Map) -> Map:
     JAX has no reverse mode for a `while_loop`, because the required memory is not known in advance. However,
     a function that treats each ball separately has a diagonal Jacobian. All entries of this Jacobian follow
     from a few tangents that are propagated in the loop, and no iteration is stored. The result is the
-    derivative of the actual iterations, with every decision fixed. The record and the inputs in `rest` have
-    no derivative.
+    derivative of the iterations with fixed decisions. The record and the inputs in `rest` have no derivative.
 
     Args:
         function: a function whose outputs for ball b depend only on the inputs for ball b (and on `rest`).

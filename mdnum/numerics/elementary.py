@@ -2,8 +2,8 @@
 
 Elementary functions differ between libraries, and between the instruction sets for which a compiler generates
 code. The functions here have no branch, no table and no fused multiply-add. Each function consists of sums,
-products, quotients, roots, comparisons, selections and bit operations. Every interpreter that runs the jax
-trace of a function operation by operation (such as the compiled loop) obtains the same number.
+products, quotients, roots, comparisons, selections and bit operations. Every interpreter that runs a function
+operation by operation, such as the compiled loop, obtains the same number.
 
 Arguments and results are float64. Subnormal arguments are treated as 0. Results below 2.2261e-308 are 0, and
 results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps, the spacing of the

@@ -46,12 +46,11 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """A decision with hysteresis, like a Schmitt trigger: it turns on at one threshold and off at another.
+    """A decision with hysteresis (a Schmitt trigger), which turns on at one threshold and off at another.
 
     With one threshold, a quantity that fluctuates about the threshold flips the decision at each crossing.
     With a gap between two thresholds that is wider than the noise, the decision flips once. The skin of a
-    Verlet list has the same purpose: the list is rebuilt when the skin is used up, not whenever an atom
-    moves.
+    Verlet list has the same purpose: lists are rebuilt when the skin is used up, not at every move.
     """
 
     enter: Threshold  # where a no turns yes
@@ -126,7 +125,7 @@ class Ledger:
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "flips"]:
-        """Whether |margin| of each flip is within the error bound, so that the step depends on rounding."""
+        """Whether rounding errors could change the step of each flip (|margin| is within the error bound)."""
         return np.abs(self.margin) <= self.bound
 
     def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:

@@ -3,7 +3,7 @@
 XLA on a CPU contracts a*b + c into a fused multiply-add. Therefore the bits of an expression depend on fusion
 and on the instruction set, and differ from those of numpy. The decision whether a pair is inside the cutoff
 must not depend on the compiler. Therefore `fence` prevents the contraction, and numpy reproduces the decision
-bit for bit. Other formulas can be evaluated operation by operation: with every result rounded, in interval
+bit for bit. Formulas can also be evaluated operation by operation: with every result rounded, in interval
 arithmetic, or with the same bits on every processor.
 """
 
@@ -45,8 +45,7 @@ def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
     The fence is an exclusive-or of the bits of x with a zero that XLA does not know. The fence also forces
     the rounding to float16 and bfloat16, which XLA on a CPU may omit.
 
-    Source: optimization_barrier and reduce_precision do not prevent the contraction on a CPU
-    (openxla/xla#41579).
+    Source: optimization_barrier and reduce_precision do not prevent contraction (openxla/xla#41579).
     """
     return _through_integers(x, zero)
 

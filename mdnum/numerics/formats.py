@@ -111,9 +111,8 @@ def _rounded(x: Float[Array, "..."], name: str, whole: Callable[[Array], Array])
 def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
     """Round x to the nearest number of a format, ties to even, in the dtype of x.
 
-    Subnormal numbers of the format are kept (`lax.reduce_precision` flushes them to zero), and numbers beyond
-    the largest become infinite. A float64 number is rounded once, whereas a cast may round twice. The
-    derivative is 1.
+    Subnormal numbers are kept (unlike in `lax.reduce_precision`), and numbers beyond the largest become
+    infinite. A float64 number is rounded once, whereas a cast may round twice. The derivative is 1.
 
     Args:
         x: float64 or narrower.
@@ -167,8 +166,8 @@ def quantize(
 ) -> Float[Array, "..."]:
     """Return the multiple of `scale` nearest to x, between `lowest` * `scale` and `highest` * `scale`.
 
-    The derivative is 1 inside the range and 0 outside. Inside the range, the error is at most scale/2 plus
-    one rounding.
+    The derivative is 1 in this range and 0 elsewhere. In the range, the error is at most scale/2 plus a
+    rounding.
     """
     return jnp.clip(jnp.rint(x / jnp.broadcast_to(scale, x.shape)), lowest, highest) * scale
 

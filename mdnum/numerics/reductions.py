@@ -137,8 +137,8 @@ class FixedPoint(Reduction):
     """A fixed-point sum: every term is rounded to a multiple of 2^-bits, and the multiples are added.
 
     The result has the same bits for every order of the n terms. Error: at most n * 2^(-bits - 1) plus the
-    rounding of the result. The result is NaN if a term exceeds 2^(62 - bits) / n, because the integer sum
-    could then overflow.
+    rounding of the result. If a term exceeds 2^(62 - bits) / n, the sum could overflow, and the result is
+    NaN.
     """
 
     bits: int = 40  # binary digits after the point, from -1000 to 1000

@@ -2,8 +2,7 @@
 
 A displacement is x_j - x_i minus at most one lattice vector for each periodic axis, rounded after every
 subtraction. The squared components of the displacement are added in the order x, y, z. The error of each
-rounding is proportional to the magnitude of the rounded result; `Reach` bounds these magnitudes for all
-positions in a box.
+rounding is proportional to the magnitude of the rounded result; `Reach` bounds these magnitudes.
 """
 
 from __future__ import annotations
@@ -27,10 +26,9 @@ def _signed(dtype: np.dtype) -> np.dtype:
 
 
 def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
-    """Return the index of x among all floats of its dtype, as a signed integer; -0 and +0 have index 0.
+    """Return the index of x among all floats of the same dtype, as a signed integer; ±0 has index 0.
 
-    Adjacent finite floats have adjacent indices, so a difference of indices is a number of ulps. The index of
-    NaN has no meaning.
+    Adjacent finite floats have adjacent indices: differences count ulps. The index of NaN has no meaning.
     """
     x = np.asarray(x)
     integer = _signed(x.dtype)
@@ -40,9 +38,9 @@ def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
 
 
 def ulp_distance(a, b, dtype: DTypeLike = np.float64) -> Int[np.ndarray, "..."]:
-    """Return the signed number of steps between adjacent floats of dtype from a to b; positive if b > a.
+    """Return the difference b - a in ulps: the signed number of floats of dtype between a and b.
 
-    The result is exact up to 2^62; it is ±2^62 for larger numbers (floats of opposite sign).
+    Results up to 2^62 are exact; larger ones (floats of opposite sign) are returned as ±2^62.
     """
     start, end = ordinal(np.asarray(a, dtype)), ordinal(np.asarray(b, dtype))
     limit = np.int64(2**62)
@@ -94,7 +92,8 @@ class Reach:
         """Return the sum of |lattice components| in all rounded results, and the number of roundings.
 
         After the first subtraction, a component is d + n_1 a_1 + n_2 a_2 + n_3 a_3, where d is the final
-        displacement and each n is -1, 0 or 1. Each following subtraction removes one term n_k a_k.
+        displacement and each n is -1, 0 or 1. Each following subtraction of a lattice vector removes one of
+        the terms n_k a_k.
         """
         sizes, most = np.zeros(3), 1
         for axis in range(3):
@@ -105,7 +104,7 @@ class Reach:
         return sizes, most
 
     def narrowed(self, dtype: DTypeLike) -> Float[np.ndarray, "3"]:
-        """Return the rounding error of lattice vectors in dtype per axis, summed over vectors, length."""
+        """Return the rounding error of lattice vectors in dtype per axis (sum over all vectors), length."""
         lattice = np.array(self.lattice, np.float64).reshape(-1, 3)
         return np.abs(lattice.astype(dtype).astype(np.float64) - lattice).sum(axis=0)
 

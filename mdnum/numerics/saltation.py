@@ -2,8 +2,8 @@
 
 A perturbed trajectory reaches a threshold at a different time; between both times, only one of the
 trajectories follows the new equation of motion. To first order, this difference changes the tangent by a
-rank-one term. Derivatives of a discrete time-stepping program lack this term, because the time steps do not
-move with the event.
+rank-one term. Derivatives of a time-stepping program lack this term, because time steps do not move with the
+event.
 
 The functions accept numpy and jax arrays with any number of leading batch axes, also inside jit.
 """

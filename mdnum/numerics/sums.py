@@ -4,8 +4,8 @@ A summation order is used in two ways. The force loop of molecular dynamics pass
 partial sum is carried from block to block, so that the terms of a whole neighbor list are never stored at
 once. A summation order that needs all terms stores the terms and adds them at the end. All other callers pass
 a whole array and get the sum over the first axis, which is rounded after every addition and has the same bits
-as a numpy loop in the dtype of the terms. `jnp.sum` differs from all orders here: it adds 16-bit terms in
-float32 and in another order, which hides the effect of a 16-bit accumulator.
+as a numpy loop in the dtype of the terms. `jnp.sum` differs from all of these summation orders: it adds
+16-bit terms in float32, which hides the effect of a 16-bit accumulator.
 
 The derivative of every sum is that of the exact sum, because rounding and order have no derivative.
 """
@@ -133,7 +133,7 @@ class Sequential(Serial):
     order: Literal["forward", "reversed"] = "forward"
 
     def within(self, total, terms):
-        """Add the terms to the partial sum if the order is forward; return them if the order is reversed."""
+        """Add the terms to the partial sum in forward order, or return the terms if the order is reversed."""
         if self.order == "reversed":
             return super().within(total, terms)
         for term in terms:
@@ -239,8 +239,8 @@ class Permuted(Serial):
 class Halves(Reduction):
     """The sum of the first half of the terms plus the sum of the second half, each added sequentially.
 
-    A sum over pairs has this order if each pair is stored once, with one scatter operation for each of its
-    atoms. Error: at most gamma_{n/2} * sum |terms|.
+    Two scatter operations over pairs, one for each atom of a pair, add in this order. Error: at most
+    gamma_{n/2} * sum |terms|.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -259,8 +259,8 @@ class Halves(Reduction):
 class Twice(Reduction):
     """A sequential sum of all halved terms, followed by the same halved terms again.
 
-    A sum over a neighbor list that stores each pair for both atoms has this order. Error: at most gamma_{2n}
-    * sum |terms|, if no halved term is subnormal.
+    A scatter operation over a list that stores each pair for both atoms adds in this order. Error: at most
+    gamma_{2n} * sum |terms|, if no halved term is subnormal.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -400,7 +400,7 @@ class RunningSum:
     columns = ("term", "addend", "running sum", "exact sum", "bits lost")
 
     def table(self) -> tuple[tuple[Any, ...], ...]:
-        """Return the additions as rows with the columns `columns`; exact sums are rounded to float64."""
+        """Return a table of all additions, with the columns `columns`; exact sums are rounded to float64."""
         return tuple(
             (row.term, row.addend, row.running, float(row.exact), row.bits_lost) for row in self.rows
         )

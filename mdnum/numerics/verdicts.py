@@ -217,8 +217,8 @@ class Growth:
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
     """Return the mean slope of a logarithm, its standard error, and whether growth is faster than linear.
 
-    Slope and standard error, per row, are estimated from blocks of the later rows. The result is NaN, NaN,
-    False if there are too few rows or if the rows are not finite.
+    Slope and standard error, per row, are estimated from blocks of later rows. The result is NaN, NaN, False
+    if there are too few rows, or if numbers are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
@@ -242,7 +242,7 @@ def split_of(separation: Float[np.ndarray, "steps"], tolerance: float) -> int | 
 
 
 def _last_seen(separation: Float[np.ndarray, "steps"]) -> int:
-    """Return the last step at which a separation is known; -1 if it is unknown at every step."""
+    """Return the last step at which a separation is known; -1 if there is no such step."""
     seen = np.flatnonzero(np.isfinite(separation))
     return int(seen[-1]) if len(seen) else -1
 
@@ -251,7 +251,7 @@ def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
     """Fit the exponential growth rate of the separation of two runs before saturation.
 
     The fit uses steps before the split with a separation between 1e-12 and 0.1 times the tolerance, after the
-    last step below this range. A low r_squared indicates a fit to noise.
+    last step with a smaller separation. A low r_squared indicates a fit to noise.
 
     Args:
         separation: of each step, length; NaN after a run ended.
@@ -404,8 +404,7 @@ def _counted(
 ) -> ForkVerdict:
     """Return the verdict on runs that also split with imposed decisions, by counting delayed splits.
 
-    The count at the other displacement can only withdraw a verdict, so it does not add to the error
-    probability.
+    Repeats at another displacement can only withdraw a verdict, so they do not add to the error probability.
     """
     pair = delays[0][0]
     threshold = 0.0 if rate is None else E_FOLDINGS / rate
@@ -513,7 +512,7 @@ class SplitCell:
 
 @dataclass(frozen=True)
 class Share:
-    """Contribution of decisions or arithmetic to a split: the delay of the split when it is removed."""
+    """Contribution of one difference (decisions or arithmetic) to a split: the delay if it is removed."""
 
     what: What  # the difference that is taken away; the other one stays
     reference: Name  # the run that is compared with

@@ -126,8 +126,7 @@ class BackwardRun:
     Args:
         simulation: the system as objects, with a fixed-point state.
         end: the state after the last step of the run.
-        baths: bits of the thermostat's bath, by step, before each step at which the forward run emptied the
-            bath.
+        baths: bits of the thermostat's bath before each step at which the forward run emptied the bath.
 
     Raises:
         InputError: the state is not a fixed-point state.
@@ -178,7 +177,7 @@ class BackwardRun:
         self._check_bath()
 
     def _change_bath(self) -> None:
-        """Restore the thermostat's stored bath if the forward run emptied the bath before this step."""
+        """Restore the thermostat's stored bath (bits lost by friction) at steps at which it was emptied."""
         step, period = int(self.back.step), self.simulation.propagator.pause
         if period is None or step % int(period):
             return
@@ -188,7 +187,7 @@ class BackwardRun:
         self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
-        """Raise `NumericalError` if the thermostat's bath is not zero at a step at which it was emptied."""
+        """Raise `NumericalError` if the thermostat's bath is not zero where the forward run emptied it."""
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(

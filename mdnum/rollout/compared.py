@@ -90,7 +90,7 @@ class ReferenceFrame:
         return np.sort(self.keys_of(*np.divmod(own, len(self.labels))))
 
     def keys_of(self, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """Return the keys of pairs of atoms i and j with the labels of the other run, in the given order."""
+        """Return integer keys of pairs of atoms i and j, with the atom labels of the other run."""
         atoms = len(self.labels)
         channel, i = np.divmod(i, atoms)
         a, b = self.labels[i], self.labels[j]
@@ -102,7 +102,7 @@ class ReferenceFrame:
 
 @dataclass(frozen=True)
 class CrossFlip:
-    """A pair of atoms whose cutoff decisions in two runs begin or cease to differ at a step."""
+    """A pair of atoms for which two runs begin or cease to disagree about the cutoff at a step."""
 
     step: int  # of the flip
     # i, j: the pair, labels of the first run, i < j
@@ -165,7 +165,7 @@ class CrossFlips(Sequence[CrossFlip]):
 
 
 class CrossRecorder:
-    """Record of the pairs of atoms whose cutoff decisions currently differ between two runs.
+    """Record of the pairs of atoms that are inside the cutoff in only one of two runs.
 
     Args:
         a, b: keys of the pairs inside the cutoff at the first step, with labels of the first run.
@@ -185,7 +185,7 @@ class CrossRecorder:
     def take(
         self, first: int, rows: int, a: PairFlips, b: PairFlips
     ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
-        """Return the number of pairs whose decisions differ at each of the next steps, and all changes of it.
+        """Return the number of pairs with different decisions at each of the next steps, and its changes.
 
         Args:
             first: step of the first row.
@@ -211,7 +211,7 @@ class CrossRecorder:
 
 
 def _times_before(keys: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """For each key in an array, count the earlier occurrences of the same key."""
+    """Return, for each integer in an array, how often the same integer occurs before it."""
     order, times = np.argsort(keys, kind="stable"), np.empty(len(keys), np.int64)
     times[order] = np.arange(len(keys)) - np.searchsorted(keys[order], keys[order])
     return times
@@ -296,7 +296,7 @@ def separations(
     b: Float[np.ndarray, "rows 3 atoms"],
     others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
-    """Return the largest distance between the same atoms in two runs for each row; NaN if a position is NaN.
+    """Return the largest distance between the same atoms of two runs at each step; NaN if a position is NaN.
 
     Args:
         cells: the box, or one box for each row; distances are minimum-image distances.
@@ -312,7 +312,7 @@ def separations(
 
 
 def strains(cells: Sequence[Cell], others: Sequence[Cell]) -> Float[np.ndarray, "rows"]:
-    """Return the largest relative change of any length between two boxes (the strain), for each row."""
+    """Return the strain (largest relative change of any length) between two boxes at each step."""
     by = np.array([cell.deformation(other) for cell, other in zip(cells, others, strict=True)])
     out, known = np.full(len(by), np.nan), np.flatnonzero(np.isfinite(by).all(axis=(1, 2)))
     # a rotation is no strain
@@ -347,5 +347,5 @@ def overridden(
 def differ(
     a: Float[np.ndarray, "rows 3 atoms"], b: Float[np.ndarray, "rows 3 atoms"]
 ) -> Bool[np.ndarray, "rows"]:
-    """Return, for each row, True if any number differs between two runs or is NaN."""
+    """Return True for each step at which any number differs between two runs or is NaN."""
     return (a != b).any(axis=(1, 2))

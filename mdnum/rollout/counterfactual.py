@@ -24,8 +24,8 @@ from mdnum.systems.simulation import Simulation
 class Counterfactual:
     """A run with its own arithmetic, on which the cutoff decisions of another run (the leader) are imposed.
 
-    Decisions that the run would have made by itself are also computed, and differences are counted. The
-    object is called with each segment of the leader; `until` returns the resulting rows.
+    The decisions that the run would have made by itself are also computed, and differences are counted. The
+    object is called with each segment of the leader; `until` returns the resulting time steps.
 
     Args:
         simulation: the run whose arithmetic is used.
@@ -70,7 +70,7 @@ class Counterfactual:
         self._record: EpochRecord | None = None
 
     def __call__(self, segment: Segment) -> None:
-        """Simulate the next steps of the leader with its decisions imposed, and keep the resulting rows."""
+        """Simulate the next steps of the leader with the leader's decisions imposed; store the results."""
         if self._over:
             return
         rows = self.follow(segment)
@@ -82,11 +82,11 @@ class Counterfactual:
             self._ahead.append(rows)
 
     def until(self, last: int) -> Rows | None:
-        """Return the rows up to a step that were not returned before; None if there are no such rows."""
+        """Return the simulated steps up to a step that were not returned before; None if there are none."""
         return taken(self._ahead, last)
 
     def follow(self, segment: Segment) -> Rows:
-        """Simulate the next steps of the leader with its decisions imposed, and return the resulting rows."""
+        """Simulate the next steps of the leader with the leader's decisions imposed; return the results."""
         parts: list[Rows] = []
         row = 0
         while row < segment.rows and not self.failed:
@@ -145,7 +145,7 @@ class Counterfactual:
         return tuple(leaves), structure
 
     def _list(self, segment: Segment):
-        """Return this run's neighbor list, and the map from its slots to slots of the leader's list."""
+        """Return this run's neighbor list, and the position of each listed pair in the leader's list."""
         simulation = self.simulation
         if self._own is None:
             home, cell = self.state.x, jax.tree.map(np.asarray, self.state.cells[0])
@@ -172,7 +172,7 @@ def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species s
 def _places(
     table: PairTable, led: PairTable, labels: Int[np.ndarray, "atoms"]
 ) -> Int[np.ndarray, "slots atoms"]:
-    """Return, for each slot of a neighbor list, the slot of the same pair in another neighbor list."""
+    """Return, for each entry of a neighbor list, the position of the same pair in another list."""
     atoms = len(labels)
     slot, column = np.nonzero(led.index < atoms)
     keys = led.order[column].astype(np.int64) * atoms + led.order[led.index[slot, column]]
@@ -190,7 +190,7 @@ def _places(
 def _mapped(
     bits: UInt8[Array, "rows words atoms"], place: Int[Array, "slots atoms"], channels: int = 1
 ) -> UInt8[Array, "rows own atoms"]:
-    """Rearrange the packed decisions of one neighbor list into the slots of another list."""
+    """Rearrange packed decisions from the order of one neighbor list to the order of another list."""
     rows, _, atoms = bits.shape
     shift = jnp.arange(8, dtype=jnp.uint8)[None, None, :, None]
     each = ((bits[:, :, None, :] >> shift) & jnp.uint8(1)).reshape(rows * channels, -1)

@@ -183,7 +183,7 @@ def first_state(simulation: Simulation) -> Start:
 
 
 def room_for(rows: int, per_row: int) -> int:
-    """Return the number of rows to allocate for at least `rows` steps, a power of two."""
+    """Return the number of time steps for which memory is allocated: a power of two, at least `rows`."""
     few = max(2, min(_MOST_ROWS, _SMALL_BYTES // per_row))
     return 1 << max(few.bit_length() - 1, rows.bit_length())
 
@@ -248,7 +248,7 @@ class Engine:
         self.leaves = tuple(leaves)
 
     def _room(self, words: int) -> int:
-        """Return the number of rows of a record: a power of two within the memory limit."""
+        """Return the number of time steps that a record can hold, a power of two within the memory limit."""
         kept = self.record and self.rows
         per_row = self.simulation.atoms * (2 * 24 + 12 + words) if kept else 64
         per_row += sum(leaf.size * 8 for leaf in jax.tree.leaves(self._inputs))
@@ -274,7 +274,7 @@ class Engine:
         self._records[turn] = record
 
     def segments(self) -> Iterator[Segment]:
-        """Yield segments in the order of steps, until the run has ended or failed."""
+        """Yield groups of consecutive time steps (segments), until the run has ended or failed."""
         here, turn, held = self.start, 0, None
         listed = self._listed(here)
         waiting: Segment | None = None
@@ -295,7 +295,7 @@ class Engine:
                 listed = self._listed(here)
 
     def again(self, start: Start) -> Segment:
-        """Recompute the segment that begins at a given state, with the same bits.
+        """Recompute the time steps that follow a given state, with the same bits as before.
 
         Args:
             start: state at which a segment of this engine began (`resume_point` of the previous segment).
@@ -307,7 +307,7 @@ class Engine:
         return made
 
     def _listed(self, start: Start) -> tuple[PairTable, Tables]:
-        """Build the neighbor list for a state; return the list and its tables for the compiled loop."""
+        """Build the neighbor list for a state; return the list, and its tables for the compiled loop."""
         cell = self._cell
         if self._moves:
             cell = jax.tree.map(np.asarray, start.state.cells[-1])
@@ -339,7 +339,7 @@ class Engine:
     def _segment(
         self, listed, start: Start, held, turn: int, begun: tuple[EpochOutcome, EpochRecord]
     ) -> tuple[Segment, np.ndarray | jax.Array | None]:
-        """Wait for the compiled loop; return its segment and the decisions at the last step."""
+        """Wait for the compiled loop; return the recorded steps and the decisions at the last step."""
         outcome, record = begun
         rows, rebuild, finite, _ = np.asarray(outcome.flags).tolist()
         while (changes := record.changes) is not None and finite and changes.found > len(changes.pairs):
@@ -403,7 +403,7 @@ class Engine:
 
 
 def resume_point(segment: Segment) -> Start:
-    """Return the state from which a run continues after a segment, with a new neighbor list if necessary."""
+    """Return the state from which a run continues after a recorded group of steps (a segment)."""
     state, slots = segment.state, segment.table.slots
     if segment.due:
         return Start(state, state.x, segment.last + 1, segment.epoch + 1, slots)

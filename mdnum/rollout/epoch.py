@@ -118,7 +118,7 @@ class EpochState(NamedTuple):
 
 
 class StepInputs(NamedTuple):
-    """Inputs of a time step that its derivatives need in addition to positions, box and virial."""
+    """Inputs of a time step that are needed for its derivatives, without positions, box and virial."""
 
     v: Float[Array, "3 atoms"]  # velocities that lead there, as the step before left them
     extra: Any  # the extra state then
@@ -149,7 +149,7 @@ class EpochRecord(NamedTuple):
     inputs: Any = ()  # `StepInputs` of each row, where they were asked for
 
     def boxes(self, rows: int, pbc: tuple[bool, bool, bool]) -> tuple[Cell, ...]:
-        """Return the boxes of the first rows; empty if the box is the same for all rows."""
+        """Return the simulation boxes of the first steps; empty if the box is constant."""
         if not self.cell.size:
             return ()
         return tuple(Cell.create(one, pbc) for one in np.asarray(self.cell)[:rows])
@@ -210,7 +210,7 @@ def empty_record(
 
 
 def write_row(record: EpochRecord, row, **values) -> EpochRecord:
-    """Write one row of the named arrays of a record."""
+    """Write the values of one time step into the named arrays of a record."""
 
     def put(column, value):
         return lax.dynamic_update_index_in_dim(column, jnp.asarray(value, column.dtype), row, 0)
@@ -225,7 +225,8 @@ def over_rows(
     """Scan like `jax.lax.scan` over the first `used` rows, in reverse order if `backward` is True.
 
     Buffers have the size of the longest segment, so that one compiled function can be used for all segments.
-    A loop over the whole buffer would spend most of its time on empty rows. Outputs of unused rows are zero.
+    A loop over the whole buffer would spend most of its time on empty rows. Outputs for unused rows of the
+    buffers are zero.
     """
     first = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
     _, out = jax.eval_shape(step, carry, first)

@@ -1,4 +1,4 @@
-"""Table of flips from recorded cutoff decisions: pair, step, margin and energy jump of each flip."""
+"""Table of flips (pairs that cross the cutoff): atoms, step, distance from the cutoff and energy jump."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _fingerprint_of_keys(keys):
 
 @njit
 def _note_rows(before, rows, index, x, v, pairs, ends, count):
-    """Record the changes of decisions between consecutive time steps with one neighbor list."""
+    """Record the changes of cutoff decisions in consecutive time steps with the same neighbor list."""
     held = before.copy()
     for r in range(len(rows)):
         note(held, rows[r], index, x[r], v[r], r, pairs, ends, count)
@@ -71,7 +71,7 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
 # atoms in one place have no radial speed: not a number, as in numpy
 @njit(error_model="numpy")
 def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, narrow, back, first, factor):
-    """Compute the columns of the table of flips, and check that margins agree with decisions.
+    """Compute the columns of the table of flips, and check whether distances agree with decisions.
 
     Args:
         labels: labels of the sorted atoms. species: species by label. kinds: pair type of two species.
@@ -139,7 +139,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
 
 
 def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
-    """Return the deformation from each row's box to the previous row's box; empty if the box is fixed."""
+    """Return the deformation from the box of each step to the previous box; empty if the box is fixed."""
     if not segment.cells:
         return np.empty((0, 3, 3))
     before = jax.tree.map(np.asarray, segment.start.cells[1]), *segment.cells[:-1]
@@ -147,7 +147,7 @@ def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
 
 
 def _noted(before, bits, index, x, v) -> Changes:
-    """Return the changes of decisions in consecutive steps with one list, in the compiled loop's format."""
+    """Return the changes of cutoff decisions in consecutive steps with the same neighbor list."""
     room = len(bits) * max(64, bits.shape[2] // 4)
     while True:
         made = np.empty((room, 4), np.int32), np.empty((room, 12), x.dtype), np.zeros(3, np.int64)
@@ -171,7 +171,7 @@ class AmbiguousPairs(Columns):
 
 
 class PairRecorder:
-    """Recorder of all flips of pair decisions in a simulation.
+    """Recorder of all flips (pairs that cross the cutoff) in a simulation.
 
     A flip is a difference between the decisions for a pair at two consecutive steps, even if the neighbor
     list was rebuilt in between. A pair that was missing in the old list enters with the new list, and a pair
@@ -221,7 +221,7 @@ class PairRecorder:
         return stacked(cells), None if dtype == "float64" else stacked(cells, dtype)
 
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
-        """Bounds on the rounding errors of margins at each step, in the unit of the margin (r or r²)."""
+        """Bounds on the rounding errors of r or r² (the compared quantity) at each step."""
         decider = self.simulation.decider
         if not decider.grows and not segment.cells:
             return np.repeat([decider.bounds], segment.rows, axis=0)
@@ -260,8 +260,8 @@ class PairRecorder:
     def flips(self, segment: Segment) -> FlipTable:
         """Return the flips of a segment, sorted by step, i and j (user's labels, i < j; see `type_of`).
 
-        Distance, margin and radial speed refer to the step of the flip. The margin has the same bits as in
-        the run.
+        Distance, margin and radial speed refer to the step of the flip. The margin (threshold minus quantity)
+        has the same bits as in the run.
 
         Raises:
             MdnumError: a flip was recorded for only one atom of a pair, or a margin contradicts its decision
@@ -331,7 +331,7 @@ class PairRecorder:
         return (margin >= 0 if inclusive else margin > 0) != ledger.entered
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
-        """Return the keys of the pairs inside the cutoff at the last step of the previous neighbor list."""
+        """Return integer keys of the pairs inside the cutoff at the last step of the previous list."""
         if self._held_segment is not None:
             table, bits, _ = self._held_segment
             self._held_keys = _keys(self.simulation, table, np.asarray(bits))
@@ -345,7 +345,7 @@ class PairRecorder:
         return 2 * float(segment.leap) < rule.skin and self._held_segment[2] == int(segment.inside)
 
     def _replace(self, segment: Segment) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the flips at the change of lists: pairs on which the old and the new list disagree."""
+        """Return the pairs that are inside the cutoff in only one of two successive neighbor lists."""
         self.missed = 0
         if not segment.opens or (self._held_segment is None and self._held_keys is None):
             return None
@@ -371,19 +371,19 @@ class PairRecorder:
 def pair_keys(
     i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], atoms: int
 ) -> Int[np.ndarray, "pairs"]:
-    """Return one integer key for each pair i < j, sorted; for i see `Simulation.type_of`."""
+    """Return one integer (key) for each pair of atoms i < j, sorted; for i see `Simulation.type_of`."""
     return np.sort(i.astype(np.int64) * atoms + j)
 
 
 def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "words atoms"]):
-    """Return the sorted keys of all pairs inside the cutoff."""
+    """Return sorted integer keys of all pairs inside the cutoff."""
     keys = np.empty(count_set(bits), np.int64)
     return keys[: _write_keys(bits, table.index, table.order, table.place, keys)].copy()
 
 
 @njit
 def _write_keys(bits, index, order, place, keys):
-    """Write the keys of the pairs inside the cutoff in ascending order; return the number of keys."""
+    """Write integer keys of all pairs inside the cutoff, in ascending order; return the number of keys."""
     atoms, listed, at = order.shape[0], index.shape[0] // 8, 0
     # the channel of a decision counts as one of its first atom
     for first in range(atoms * (bits.shape[0] // listed)):
@@ -404,19 +404,19 @@ def _write_keys(bits, index, order, place, keys):
 
 
 def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.ndarray, "pairs"]:
-    """Return the keys of the pairs that were inside the cutoff at one step of a run."""
+    """Return integer keys of the pairs that were inside the cutoff at one step of a run."""
     return _keys(simulation, segment.table, bits_of(segment, row))
 
 
 def bits_of(segment: Segment, row: int) -> UInt8[np.ndarray, "words atoms"]:
-    """Return the packed decisions at one step of a segment, without recomputation for the last step."""
+    """Return the packed cutoff decisions at one step of a segment."""
     if row == segment.rows - 1 and segment.held is not None and segment.closes != "blow-up":
         return np.asarray(segment.held)
     return segment.rows_of("bits")[row]
 
 
 def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "pairs"]:
-    """Return the keys of all pairs inside the cutoff, from a new search with the arithmetic of the run."""
+    """Find all pairs inside the cutoff by a new search with the arithmetic of the run; return keys."""
     decider = simulation.decider
     table = simulation.verlet_list(skin=0.0).build(np.asarray(wrapped, np.float64), simulation.cell)
     _, _, i, j = table.listed(simulation.channels)

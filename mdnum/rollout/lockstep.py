@@ -1,8 +1,8 @@
 """Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other imposed.
 
 Each free run has the same bits as a single run, because neighbor lists and compiled loops are separate.
-Decisions are compared by means of the flips of both runs. Therefore the cost does not depend on the number of
-pairs, and only pairs with different decisions are stored.
+Cutoff decisions are compared by means of their changes in both runs. Therefore the cost does not depend on
+the number of pairs, and only pairs with different decisions are stored.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mdnum.systems.simulation import Simulation
 
 
 def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactual]) -> Iterator[PairRows]:
-    """Advance two runs and their counterfactual runs together, one segment of the first run at a time.
+    """Advance two runs and their counterfactual runs together, in groups of time steps.
 
     Args:
         leader, follower: the runs A and B; the counterfactual with the decisions of a run is its listener.
@@ -86,7 +86,7 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
 def beside(
     leader: Track, runs: Sequence[Track | Counterfactual]
 ) -> Iterator[list[Float[np.ndarray, "rows"]]]:
-    """Yield the separations of several runs from a leading run, one segment at a time."""
+    """Yield the separations of several runs from a leading run, in groups of time steps."""
     while leader.segment() is not None:
         rows = leader.until(end := leader.ready)
         yield [separation_of(rows, run.until(end)) for run in runs]
@@ -139,7 +139,7 @@ def _per_row(doubts: AmbiguousPairs, rows: Rows) -> Int[np.ndarray, "rows"]:
 
 
 def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarray, "rows"]:
-    """Convert the smallest |margin| of each step to a length, a lower bound on distances from the cutoff."""
+    """Return a lower bound on the distance of all pairs from their cutoff at each step, length."""
     if rows is None or rows.nearest is None:
         return np.full(len(clock), np.nan)
     margin = rows.nearest
@@ -154,7 +154,7 @@ def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarra
 
 
 def _bound(track: Track, rows: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Return the largest rounding bound of any pair type at each step of a run, as a length."""
+    """Return the largest bound on rounding errors of pair distances at each step of a run, length."""
     if rows is None:
         return np.zeros(0)
     decider = track.simulation.decider

@@ -135,8 +135,7 @@ class MdProgram:
     def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
         """Return copies of the simulation with random displacements of the atoms of at most about `size`.
 
-        The largest displacement is at least one ulp, because a smaller displacement would be lost by
-        rounding.
+        The largest displacement is at least one ulp, because rounding removes smaller displacements.
         """
         rng = np.random.default_rng(seed)
         x, ulp = np.asarray(self.start.state.x), self.ulp
@@ -151,7 +150,7 @@ class MdProgram:
         return programs
 
     def decision(self, other: MdProgram, flips: Sequence[CrossFlip], separation: float) -> Decision:
-        """Return the decision at a fork, for the pair nearest to its cutoff among all pairs that differ."""
+        """Return the cutoff decision that differs between two runs, for the pair nearest to the cutoff."""
         differing = [flip for flip in flips if flip.differs]
         flip = min(differing, key=lambda flip: abs(flip.margin) if np.isfinite(flip.margin) else np.inf)
         if np.isfinite(flip.margin):
@@ -171,7 +170,7 @@ class MdProgram:
         )  # fmt: skip
 
     def number(self, key: str) -> Number:
-        """Return a numerical parameter of the system, given its path."""
+        """Return the numerical parameter of the system that is given by a path."""
         simulation = self.simulation
         name = parameters.resolve(simulation, key, parameters.numbers(simulation))
 
@@ -204,7 +203,7 @@ class MdProgram:
         return DecisionHistory(every, digest, x, value, energy, failed)
 
     def differing(self, other: MdProgram, steps: int, step: int, key: str = "") -> Differing:
-        """Return the pair that is nearest to its cutoff among the pairs that differ at a step."""
+        """Return the pair nearest to the cutoff among all pairs with different decisions at a step."""
         sides = [one._pairs_at(steps, step) for one in (self, other)]
         keys = np.setxor1d(sides[0][0], sides[1][0], assume_unique=True)
         pairs = [divmod(int(key), self.size) for key in keys]
@@ -220,7 +219,7 @@ class MdProgram:
         return Differing(nearest)
 
     def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], Simulation, np.ndarray]:
-        """Return the pairs inside the cutoff, the simulation in its box, and positions at a step of a run."""
+        """Return pairs inside the cutoff, the simulation with its box, and positions at a step of a run."""
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             if segment.last >= step:
                 row = step - segment.first
@@ -229,7 +228,7 @@ class MdProgram:
         raise IndexError(f"the run has no step {step}")
 
     def state_at(self, step: int, last: int) -> tuple[Simulation, Float[np.ndarray, "atoms 3"]] | None:
-        """Return the simulation in its box and wrapped positions at a step; None after the end of the run."""
+        """Return the simulation with the box of a step, and wrapped positions; None after the run."""
         track = Track(self.simulation, last, self.begin, self.frame, flips=False)
         while track.segment() is not None:
             rows = track.until(track.ready)
@@ -243,7 +242,7 @@ class MdProgram:
 def pair_margin(
     simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int, labels: Simulation | None = None
 ) -> float:
-    """Return threshold minus quantity (r or r²) of a pair, with the same bits as in the decision of a run.
+    """Return threshold minus quantity (r or r²) of a pair, with the same bits as in a run.
 
     Args:
         x: wrapped positions, length.
@@ -256,6 +255,6 @@ def pair_margin(
 
 
 def pair_bound(simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int) -> float:
-    """Return the bound on the rounding error of a pair's margin at the given positions."""
+    """Return a bound on the rounding error of r or r² of a pair at the given positions."""
     kind = int(simulation.type_of(np.array([i]), np.array([j]))[0])
     return float(simulation.decider.bounds_at(x.T[None])[0, kind])

@@ -85,7 +85,7 @@ class _Progress:
 
 @dataclass
 class Rollout:
-    """A simulation run in progress, with its run folder.
+    """A simulation run in progress, which writes its results to a run folder.
 
     Attributes:
         simulation: the system as objects.
@@ -352,7 +352,7 @@ def run(
     progress: Progress | None = None,
     shown: Shown | None = None,
 ) -> RunResult:
-    """Simulate a system and record every flip in a run folder.
+    """Simulate a system, and record every pair that crosses the cutoff in a run folder.
 
     Args:
         system: a simulation, a system, a shipped name or the path of a system file; None when resuming,

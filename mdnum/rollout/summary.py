@@ -79,7 +79,7 @@ class RunTally:
     def take(
         self, segment: Segment, rows: dict[str, np.ndarray], ledger: FlipTable, bounds: np.ndarray
     ) -> None:
-        """Add a segment to the totals: rows of series.parquet, flips, and rounding bounds."""
+        """Add a group of time steps, with flips and rounding bounds, to the totals."""
         self.bound = max(self.bound, float(np.max(bounds)))
         pairs = rows["pairs"]
         if self.step < 0:
@@ -110,7 +110,7 @@ class RunTally:
 
 
 def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, flips: int) -> str:
-    """Format a line of log.txt for a step, with the number of pairs inside and of flips up to this step."""
+    """Format a line of log.txt for a step, with the numbers of pairs inside the cutoff and of flips."""
     potential, kinetic = segment.rows_of("potential")[row], segment.rows_of("kinetic")[row]
     temperature = 2 * kinetic / (degrees_of_freedom(simulation) * simulation.units.k_B)
     step = segment.first + row
@@ -405,7 +405,7 @@ class ListHealth:
     """Monitor of a run's neighbor lists, which counts missed pairs and dangerous rebuilds.
 
     A list can miss a pair only if the displacements of two atoms add up to more than the skin. A safe rebuild
-    rule prevents this; with any other rule, every such step is compared with a new neighbor search.
+    rule prevents such displacements; with any other rule, a new neighbor search checks such steps.
     """
 
     simulation: Simulation  # the system as objects
@@ -419,7 +419,7 @@ class ListHealth:
     mismatches: int = 0
 
     def take(self, segment: Segment, missed: int) -> list[dict[str, np.ndarray]]:
-        """Add a segment; return a table row for each neighbor list whose use has ended.
+        """Add a group of time steps; return a table row for each neighbor list whose use has ended.
 
         Args:
             segment: the engine's record.

@@ -50,7 +50,7 @@ class Rows:
         return self.cells or (self.box,) * len(self)
 
     def seen_by(self, frame: ReferenceFrame) -> Rows:
-        """Return the rows with the atom labels and axes of another run."""
+        """Return the time steps with the atom labels and axes of another run."""
         if frame.is_same:
             return self
         by = np.array([self.box.deformation(cell) for cell in self.cells]) if self.cells else None
@@ -58,7 +58,7 @@ class Rows:
         return replace(self, x=x, v=v, cells=frame.boxes(self.cells, self.box))
 
     def cut(self, count: int) -> tuple[Rows, Rows]:
-        """Split the rows into the first `count` rows and the remaining rows."""
+        """Split the time steps into the first `count` steps and the remaining steps."""
 
         def part(rows: slice, **changed: Any) -> Rows:
             columns = {name: getattr(self, name) for name in _COLUMNS}
@@ -69,7 +69,7 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: list[Rows]) -> Rows:
-        """Concatenate consecutive groups of rows."""
+        """Concatenate groups of consecutive time steps."""
         if len(parts) == 1:
             return parts[0]
         columns = {name: [getattr(part, name) for part in parts] for name in _COLUMNS}
@@ -86,7 +86,7 @@ _COLUMNS = ("x", "v", "energy", "nearest", "overridden", "furthest")
 
 
 def taken(ahead: list[Rows], last: int) -> Rows | None:
-    """Remove all rows up to a step from a list, and return the removed rows; None if there are none."""
+    """Remove all time steps up to a given step from a list, and return them; None if there are none."""
     parts: list[Rows] = []
     while ahead and ahead[0].first <= last:
         rows = ahead.pop(0)
@@ -135,7 +135,7 @@ class Track:
         self.failed = ""
 
     def segment(self) -> Segment | None:
-        """Read the next segment of the run, and keep its rows and flips; return None after the last."""
+        """Read and store the next group of time steps of the run; return None at the end of the run."""
         segment = next(self._segments, None)
         if segment is None:
             return None
@@ -158,7 +158,7 @@ class Track:
         return self._ahead[-1].last
 
     def until(self, last: int) -> Rows | None:
-        """Return all rows up to a step that were not returned before; None if there are none."""
+        """Return all recorded steps up to a step that were not returned before; None if there are none."""
         while not self._ahead or self.ready < last:
             if self.segment() is None:
                 break
@@ -180,7 +180,7 @@ class Track:
 
 
 def rows_of(simulation: Simulation, segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
-    """Return the rows of a segment in the user's order of atoms, with labels and axes of another run."""
+    """Convert recorded time steps to the user's order of atoms, and to labels and axes of another run."""
     x, v = (in_user_order(segment.rows_of(name), segment.table.order) for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
     nearest = segment.rows_of("nearest").astype(np.float64)

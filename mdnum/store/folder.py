@@ -196,7 +196,7 @@ class RunFolder:
 
     @property
     def kind(self) -> str:
-        """Kind of the run folder, as declared by the command that created it."""
+        """Kind of the run folder, which is declared by the command that created the folder."""
         return self.layout.kind
 
     # -- writing ---------------------------------------------------------------------------------
@@ -393,11 +393,10 @@ class RunFolder:
         return state
 
     def take(self, layout: Layout) -> None:
-        """Make this process the only writer of a run folder that is resumed from answers.json.
+        """Lock a run folder that is resumed from answers.json, so that no other process writes into it.
 
         Raises:
-            FolderError: another process writes the folder, or the files that are needed to resume have
-                changed.
+            FolderError: another process writes the folder, or files that are needed to resume have changed.
         """
         self._layout = layout
         self._take_lock()
@@ -481,8 +480,7 @@ class RunFolder:
     def about(self) -> dict[str, Any]:
         """Metadata of the tables: version, kind, system, digest of the run, and units by quantity.
 
-        The metadata do not depend on the time of writing, so that a resumed run has the same bytes as an
-        uninterrupted run.
+        The metadata do not depend on the time of writing, so a resumed run has the same bytes as any other.
         """
         made, system = self._read_json("provenance.json"), self.system
         named = system.get("units") or system.get("world")

@@ -42,8 +42,8 @@ _DISTINCT = frozenset({"i", "j", "distance", "before", "margin", "margin_before"
 class TableStream:
     """A growing table, stored in the files `<name>.parquet` and `parts/<name>-<first row>.parquet`.
 
-    The name of a file determines the rows in this file. Rows can therefore be identified after a kill at any
-    stage of writing, merging or truncating.
+    The name of a part file determines the rows in the file. Rows can therefore be identified after a kill at
+    any stage of writing, merging or truncating.
     """
 
     def __init__(

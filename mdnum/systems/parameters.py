@@ -8,8 +8,7 @@ indices).
 
 `dynamics.temperature` is the temperature of the thermostat and of drawn velocities, which scale with its
 square root; velocities of the structure do not change. `velocity.scale` scales any velocities.
-`cutoff.radius` also moves the onset if the cutoff does not switch. `box.scale` scales the box and all
-positions.
+`cutoff.radius` also moves the onset if the cutoff does not switch. `box.scale` scales box and positions.
 """
 
 from __future__ import annotations
