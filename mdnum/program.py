@@ -1,10 +1,10 @@
 """Interface of simulations to analyses such as forks and parameter maps, and results of comparisons.
 
 Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. An
-object with this interface (a program) determines all bits of a run, including the initial state. Forks,
-parameter maps, screening and certificates use only this interface. Decisions, such as whether a pair is
-inside the cutoff, are an input of each time step. Therefore the decisions of one program can be recorded and
-imposed on another program. The implementations are `mdnum.rollout.program.MdProgram` and
+object with this interface (a program) determines all bits of a run, including the initial state. Analyses
+such as forks and parameter maps use only this interface. Decisions, such as whether a pair is inside the
+cutoff, are an input of each time step. Therefore the decisions of one program can be recorded and imposed on
+another program. The implementations are `mdnum.rollout.program.MdProgram` and
 `mdnum.ball.program.BallProgram`.
 """
 

@@ -152,7 +152,7 @@ def hashes(system: _System) -> dict[str, str | None]:
     format have the same hash.
 
     Returns:
-        file (None for a system that did not come from a file), program, and structure (None without atoms).
+        digests by name: file (None without a system file), program, and structure (None without atoms).
     """
     file = None
     if system.path is not None and Path(system.path).is_file():

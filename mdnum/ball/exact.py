@@ -80,7 +80,7 @@ class _Motion:
     def first_contact(self) -> Known:
         """Return the time (s) at which the ball first reaches the floor.
 
-        Error: a few ulps, for upward and for downward v0.
+        The error is a few ulps for any sign of the initial velocity v0.
         """
         return self._known(_down)[0]
 
@@ -220,7 +220,7 @@ class ExactPenalty(_Motion):
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.
 
-    Error: about ten ulps per contact, in values and in derivatives.
+        The error of values and derivatives is about ten ulps per contact.
     """
 
     y0: float  # height at the start, m, at least 0

@@ -290,7 +290,7 @@ def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float
 
 
 def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
-    """Return a run with its balls in the order of the balls in the other run of a comparison."""
+    """Return a run with its balls reordered like the balls in the other run of a comparison."""
     place = np.argsort(order)
     columns = ("y", "v", "height", "contact", "iterations", "reason", "residual", "margin", "before")
     arrays = {name: getattr(run, name) for name in columns}

@@ -97,7 +97,7 @@ def _scaled(x: Any, p: Any, n: Any) -> Any:
 
 
 def exp(x: Any, low: Any = None) -> Any:
-    """Return exp(x + low), where x + low is an argument with more than 53 bits. Error: below 1.5 ulp."""
+    """Return the exponential of an argument that is the sum x + low. Error: below 1.5 ulp."""
     return _scaled(x if low is None else x + low, *_reduced(x, low))
 
 

@@ -29,7 +29,7 @@ def integer_of(dtype):
 
 
 def zero_bits(dtype) -> jax.Array:
-    """Return an integer zero with as many bits as dtype, which `fence` needs as an argument of jit."""
+    """Return an integer zero with the width of dtype, which is passed into jit for use by `fence`."""
     return jax.device_put(np.zeros((), integer_of(dtype)))
 
 

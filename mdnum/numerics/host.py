@@ -27,7 +27,7 @@ _NAMES = {
 def by_numpy(function: Callable[..., Any], *arguments: np.ndarray) -> list[np.ndarray]:
     """Evaluate a function of arrays by numpy; jax computes operations that numpy and scipy do not have.
 
-    Error: a few ulps for each elementary function of numpy and scipy.
+    The error is a few ulps for each elementary function of numpy and scipy.
     """
     with jax.enable_x64(True), np.errstate(all="ignore"):
         program = jax.make_jaxpr(function)(*arguments)

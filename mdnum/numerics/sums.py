@@ -63,7 +63,7 @@ class Reduction:
     """
 
     def within(self, total: jax.Array, terms: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array | None]:
-        """Process one block of terms; return the partial sum, and the terms that `finish` adds (or None)."""
+        """Process one block of terms; return the partial sum, and numbers that `finish` adds (or None)."""
         return total, jnp.stack(list(terms))
 
     def finish(self, total: jax.Array, blocks: jax.Array | None) -> jax.Array:
@@ -74,7 +74,7 @@ class Reduction:
     def __call__(
         self, terms: Float[Array, "n ..."], zero: Int[Array, ""] | None = None
     ) -> Float[Array, "..."]:
-        """Return the sum over the first axis, rounded after every addition in the dtype of the terms.
+        """Return the sum over the first axis, with rounding after every addition in the dtype of the terms.
 
         Args:
             terms: the terms of the sum.

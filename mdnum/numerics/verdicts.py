@@ -44,7 +44,7 @@ class Delay:
 
     @classmethod
     def of(cls, free: Float[np.ndarray, "steps"], imposed: Float[np.ndarray, "steps"], tolerance: float):
-        """Create a `Delay` from the separations at each step, length; NaN after a run has ended."""
+        """Create a `Delay` from the free and the imposed separations at each step, length (or NaN)."""
         splits = (split_of(run, tolerance) for run in (free, imposed))
         return cls(*splits, free_until=_last_seen(free), imposed_until=_last_seen(imposed))
 
@@ -99,7 +99,7 @@ FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
 
 @dataclass(frozen=True)
 class Count:
-    """Numbers of pairs of runs with a delayed split, and of pairs without a delay."""
+    """Numbers of pairs of runs that split later without the flips, and that do not."""
 
     pairs: int  # that were run, the pair itself among them
     later: int  # that were delayed by more than asked for
@@ -128,7 +128,7 @@ class Count:
 
     @property
     def wanted_for_majority(self) -> int:
-        """Number of further pairs that would decide the majority if all agreed; 0 if none can be run."""
+        """Number of further pairs that decide the majority if all agree; 0 if not needed or impossible."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -402,7 +402,7 @@ def _counted(
     gained: float,
     reasons: tuple[Reason, ...],
 ) -> ForkVerdict:
-    """Return the verdict on runs that also split with imposed decisions, by counting delayed splits.
+    """Return the verdict on runs that split even with imposed decisions, from the number of delayed pairs.
 
     Repeats at another displacement can only withdraw a verdict, so they do not add to the error probability.
     """
@@ -512,7 +512,7 @@ class SplitCell:
 
 @dataclass(frozen=True)
 class Share:
-    """Contribution of one difference (decisions or arithmetic) to a split: the delay if it is removed."""
+    """Contribution of one difference (decisions or arithmetic) to a split: delay of the split without it."""
 
     what: What  # the difference that is taken away; the other one stays
     reference: Name  # the run that is compared with

@@ -29,7 +29,7 @@ def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3
         simulation: the system as objects.
         positions: positions of the atoms, length.
 
-    Error: the period is at most a few percent too long, because the Lanczos iteration has 12 steps.
+        The period is at most a few percent too long, because the Lanczos iteration has 12 steps.
     """
     smooth = simulation.with_policy()
     smooth = smooth.with_cutoff("force-shifted") if smooth.pairwise else smooth

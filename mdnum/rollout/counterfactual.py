@@ -25,7 +25,7 @@ class Counterfactual:
     """A run with its own arithmetic, on which the cutoff decisions of another run (the leader) are imposed.
 
     The decisions that the run would have made by itself are also computed, and differences are counted. The
-    object is called with each segment of the leader; `until` returns the resulting time steps.
+    object is called with each group of steps of the leader; `until` returns the resulting steps.
 
     Args:
         simulation: the run whose arithmetic is used.
@@ -82,7 +82,7 @@ class Counterfactual:
             self._ahead.append(rows)
 
     def until(self, last: int) -> Rows | None:
-        """Return the simulated steps up to a step that were not returned before; None if there are none."""
+        """Return the simulated time steps up to `last` that were not returned yet; None if there are none."""
         return taken(self._ahead, last)
 
     def follow(self, segment: Segment) -> Rows:

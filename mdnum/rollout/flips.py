@@ -71,7 +71,7 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
 # atoms in one place have no radial speed: not a number, as in numpy
 @njit(error_model="numpy")
 def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, narrow, back, first, factor):
-    """Compute the columns of the table of flips, and check whether distances agree with decisions.
+    """Compute the columns of the table of flips, and check that distances agree with decisions.
 
     Args:
         labels: labels of the sorted atoms. species: species by label. kinds: pair type of two species.

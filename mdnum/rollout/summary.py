@@ -104,7 +104,7 @@ class RunTally:
 
     @classmethod
     def from_dict(cls, values: dict) -> RunTally:
-        """Restore the totals from the values of `to_dict`."""
+        """Restore the totals from the values that `to_dict` returned."""
         lines = {name: LineFit(**values[name]) for name in ("conserved", "without_jumps")}
         return cls(**{**values, **lines})
 
@@ -396,7 +396,7 @@ class Epoch:
 
     @classmethod
     def from_dict(cls, values: dict) -> Epoch:
-        """Restore the statistics from the values of `to_dict`."""
+        """Restore the statistics from the values that `to_dict` returned."""
         return cls(**{**values, "lost": set(values["lost"])})
 
 

@@ -56,7 +56,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def opened(path: Path, mode: Literal["rb", "r+b", "ab"] = "rb") -> BinaryIO:
-    """Open a file in a run folder; raise an error for a link or anything else than a regular file.
+    """Open a file in a run folder; raise an error if the path is a link or not a regular file.
 
     Args:
         mode: "r+b" and "ab" write in place, so a file with a second name (a hard link) is also rejected.

@@ -589,7 +589,7 @@ class RunFolder:
     # -- inside ----------------------------------------------------------------------------------
 
     def _usable(self) -> list[str]:
-        """Return the names of files in a new run folder; raise an error if the folder contains a run."""
+        """Return the names of files in a folder for a new run; raise an error if the folder is in use."""
         there = self.path.iterdir() if self.path.is_dir() else ()
         present = sorted(entry.name for entry in there if entry.name != _LOCK)
         if present and not _came_to_nothing(self.path, present):

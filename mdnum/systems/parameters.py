@@ -7,8 +7,8 @@ A parameter is a number or an array of numbers, and its name is a path. Paths ar
 indices).
 
 `dynamics.temperature` is the temperature of the thermostat and of drawn velocities, which scale with its
-square root; velocities of the structure do not change. `velocity.scale` scales any velocities.
-`cutoff.radius` also moves the onset if the cutoff does not switch. `box.scale` scales box and positions.
+square root; velocities of the structure do not change. `velocity.scale` scales all velocities, drawn or not.
+`cutoff.radius` also sets the onset of a cutoff without switching. `box.scale` scales box and positions.
 """
 
 from __future__ import annotations

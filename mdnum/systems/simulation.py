@@ -173,7 +173,7 @@ class Simulation:
 
     @cached_property
     def force(self) -> PairForce | ManyBodyForce:
-        """Function that computes forces and cutoff decisions from positions and a list, inside jit."""
+        """Function for use inside jit that computes forces and cutoff decisions for a neighbor list."""
         # kept for later calls, so it must hold no tracer even where its first use is inside a jit
         with jax.ensure_compile_time_eval():
             parts = (self.model, self.cell, self.decider, self.policy, self.reduction)
@@ -426,7 +426,7 @@ class Simulation:
 
 
 def _edges(index: Int[np.ndarray, "slots atoms"], form: str) -> Int[np.ndarray, "first second"]:
-    """Return the pairs of a neighbor table in the format of `Tables.edges`, grouped by atom."""
+    """Return the pairs in a neighbor list, grouped by atom, in the format of `Tables.edges`."""
     atoms = index.shape[1]
     if form == "dense":
         return np.ascontiguousarray(index.T, np.int32)

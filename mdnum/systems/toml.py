@@ -146,7 +146,7 @@ def line_of(text: str, key: Key) -> int | None:
 def dump(tables: Mapping[str, Any]) -> str:
     """Return the TOML text of nested tables; values of None are omitted, and floats keep every bit.
 
-    In each table, `kind` or `rule` is written first, then other scalars, and finally (as in TOML) tables.
+    In each table, `kind` or `rule` is written first, then other scalars, then tables (required by TOML).
     """
     lines: list[str] = []
     _dump_table((), tables, lines)
