@@ -65,7 +65,7 @@ class Deadline:
 def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
     """Raise `TimeUp` in the main thread if the block is still running `grace` seconds after the deadline.
 
-    The exception is raised repeatedly, because the block may catch one. Compiled code is not interrupted.
+    The exception is raised repeatedly, in case the block catches it. Compiled code is not interrupted.
     """
     if math.isinf(deadline.left) or threading.current_thread() is not threading.main_thread():
         yield

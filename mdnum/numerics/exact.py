@@ -43,7 +43,7 @@ def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
     """Return x, and prevent XLA from contracting the operation that computes x with the next operation.
 
     The fence is an exclusive-or of the bits of x with a zero that XLA does not know. The fence also forces
-    the rounding to float16 and bfloat16, which XLA on a CPU may omit.
+    rounding to float16 and bfloat16, which XLA on a CPU may omit.
 
     Source: optimization_barrier and reduce_precision do not prevent contraction (openxla/xla#41579).
     """

@@ -544,8 +544,8 @@ class RunFolder:
         Raises:
             FolderError: the folder is damaged or unfinished, or has no manifest; or its digests match, but it
                 has contents that mdnum does not write. In the latter case, the message names a line of
-                mdnum's code. An exception for an intact folder that this object wrote is a bug of mdnum, and
-                is raised unchanged.
+                mdnum's code. If the folder is intact and was written by this object, the exception is a bug
+                and is raised unchanged.
         """
         try:
             yield

@@ -195,7 +195,7 @@ def leaf_of(model: Any, name: str) -> Any:
 
 
 def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bool = True) -> dict[str, Any]:
-    """Return the arrays of pair potentials and their cutoffs by path.
+    """Return the parameter arrays of pair potentials and of their cutoffs, by path.
 
     `shared` includes arrays that do not depend on the pair type, `species` includes arrays with one entry per
     species. The path `cutoff.radius` is the radius of all terms if all radii agree. If radii differ, each
