@@ -77,7 +77,9 @@ def run() -> Demo:
             Claim("large first is one last place below", seen[0], repr(LARGE), seen[0] == LARGE),
             Claim("large first stops", stopped["large first"], "True", stopped["large first"]),
             Claim("small first is the tolerance", seen[1], repr(TOL), seen[1] == TOL),
-            Claim("small first goes on", not stopped["small first"], "True", not stopped["small first"]),
+            Claim(
+                "small first does not stop", not stopped["small first"], "True", not stopped["small first"]
+            ),
             Claim(
                 "the exact sum is the tolerance",
                 float(large.exact),
@@ -85,13 +87,13 @@ def run() -> Demo:
                 large.exact == small.exact == Fraction(TOL),
             ),
             Claim(
-                "the solver saw what the table says",
+                "the sums of the solver are those of the table",
                 [large.result, small.result],
                 "the same bits",
                 (large.result, small.result) == seen,
             ),
             Claim(
-                "jnp.sum hides it",
+                "jnp.sum gives the tolerance in both orders",
                 list(hidden.values()),
                 f"{TOL!r} twice",
                 set(hidden.values()) == {TOL},
@@ -110,8 +112,8 @@ def run() -> Demo:
         ],
         plots=[_errors(histories)],
         in_md=(
-            "The force on an atom is such a sum over its neighbors, in the order of the list. The "
-            "same table can be made for it (running_sum_table with the terms recorded by a Tap)."
+            "The force on an atom is such a sum over its neighbors, in the order of the list. The same "
+            "table can be made for this sum (running_sum_table with the terms recorded by a Tap)."
         ),
         data={
             "penetrations": TERMS.astype(float),
@@ -128,13 +130,13 @@ def _errors(histories: dict[str, RunningSum]) -> Plot:
     count = np.arange(1, len(TERMS) + 1)
     return Plot(
         "accumulator-misses",
-        title="What the accumulator misses after each addition",
+        title="Error of the running sum after each addition",
         x_label="additions",
         y_label="running sum - exact sum (last places of the tolerance)",
         series=(
             Series("large first", count, missing(histories["large first"]), "line+points", "bad"),
             Series("small first", count, missing(histories["small first"]), "line+points", "first"),
         ),
-        caption="Large first, every small term is lost, and a last place is missing at the end. Small first, "
-        "nothing is.",
+        caption="If the largest term is added first, every small term is lost. If the small terms are "
+        "added first, no term is lost.",
     )

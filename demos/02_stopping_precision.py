@@ -191,7 +191,7 @@ def run() -> Demo:
             for dtype in FORMATS
         ),
         Claim(
-            "the loss of a fragile run does not depend on k, and this is said",
+            "the loss of a fragile run does not depend on k, and the gradient reports this",
             [one.notes["k"] for one in fragile],
             "ended before k was used; derivative 0",
             all(not one.depends["k"] and one.gradient["k"] == 0.0 for one in fragile)
@@ -311,8 +311,8 @@ def _sum_plot(sums: dict[str, tuple[RunningSum, RunningSum]]) -> Plot:
         x_label="terms added",
         y_label="sum - tolerance (ulps of the narrow dtype)",
         series=tuple(series),
-        caption="In a narrow dtype the eight small terms leave no trace; in float32 the sum arrives at the "
-        "tolerance, which is not below it, and the solver goes on.",
+        caption="In a narrow dtype the eight small terms do not change the sum. In float32 the sum "
+        "equals the tolerance, so the solver continues.",
         horizontals=((0.0, "tolerance"),),
     )
 
@@ -331,6 +331,6 @@ def _penetrations(rows: dict[str, list[Row]]) -> Plot:
         x_label="0: before, 1: where the solver stopped",
         y_label="sum of penetrations (m)",
         series=tuple(series),
-        caption="The fragile runs stop where they start; the others lose a quarter.",
+        caption="The fragile runs make no iteration; in the other runs the sum decreases by a quarter.",
         horizontals=((boundary_batch("bfloat16")[0], "tolerance in bfloat16"),),
     )

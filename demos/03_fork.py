@@ -74,7 +74,7 @@ def run() -> Demo:
     height = -parted.margins[0], -parted.margins[1]
     jump = H * abs(float(b.v[at - 1, 0]))
     return Demo(
-        title="One ulp, another step of contact",
+        title="One ulp changes the step of the first contact",
         question=(
             "The initial heights of two balls are neighboring floats. Do the balls touch the floor "
             "in the same step?"
@@ -90,7 +90,8 @@ def run() -> Demo:
             f"heights are {height[0]:.2g} m and {height[1]:.2g} m. The velocity of one ball is reset, "
             f"the other ball falls for one more step, and a separation of {before:.1g} m becomes "
             f"{after:.1g} m. With the decisions of the first ball imposed, the second ball stays "
-            f"within {held.separation.max():.1g} m of it: the decision is the cause. On a spring the "
+            f"within {held.separation.max():.1g} m of the first ball: the decision is the cause. On a "
+            f"spring the "
             "same flip does not separate the balls, because the force is 0 when contact begins."
         ),
         numbers={
@@ -106,7 +107,7 @@ def run() -> Demo:
             "runs": runs,
         },
         checks=[
-            Claim("the starts are neighboring floats", apart, "1 ulp", apart == 1),
+            Claim("the initial heights are neighboring floats", apart, "1 ulp", apart == 1),
             Claim(
                 "first contacts are one step apart",
                 contact[1] - contact[0],
@@ -119,21 +120,23 @@ def run() -> Demo:
                 f"contact, {contact[0]}",
                 parted.channel == "contact" and at == contact[0],
             ),
-            Claim("before the fork they are within rounding", before, "below 1e-14 m", before < 1e-14),
             Claim(
-                "after it they are a step's fall apart",
+                "before the fork the separation is within rounding", before, "below 1e-14 m", before < 1e-14
+            ),
+            Claim(
+                "after the fork the separation is at least the fall of a step",
                 after,
                 f"at least {jump:.3g} m",
                 after >= jump * (1 - 1e-9),
             ),
             Claim(
-                "under the same decisions, they stay within rounding",
+                "with the same decisions the separation stays within rounding",
                 float(held.separation.max()),
                 "below 1e-14 m",
                 bool(held.separation.max() < 1e-14),
             ),
             Claim(
-                "on a spring the flip is there too, and parts nothing",
+                "on a spring the flip occurs, too, but does not separate the balls",
                 [soft.fork, float(soft.separation.max())],
                 f"fork at {contact[2]}, below 1e-13 m",
                 soft.fork == contact[2] and bool(soft.separation.max() < 1e-13),
@@ -191,7 +194,7 @@ def _heights(a: BallRun, b: BallRun, at: int) -> Plot:
             Series("lower", a.time, a.y[:, 0], role="first"),
             Series("upper", b.time, b.y[:, 0], role="second", dashed=True),
         ),
-        caption="The curves lie on each other up to the first contact, and are two trajectories afterwards.",
+        caption="The curves agree up to the first contact, and differ afterwards.",
         verticals=((at * H, "fork"),),
     )
 
@@ -212,7 +215,7 @@ def _separations(a: BallRun, parted: BallDifference, held: BallDifference, soft:
             Series("the same decisions imposed", a.time, shown(held), role="first"),
             Series("on a spring", a.time, shown(soft), role="second"),
         ),
-        caption="One flip takes the separation from rounding to the fall of a step. Where the decision is "
-        "imposed, or acting on it changes nothing at the boundary, it stays at rounding.",
+        caption="One flip increases the separation from rounding to the fall during one step. If the "
+        "decision is imposed, or if the force is zero at the boundary, the separation stays at rounding.",
         verticals=((parted.fork * H, "fork"),),
     )

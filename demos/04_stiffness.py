@@ -344,9 +344,10 @@ def run() -> Demo:
     at = int(np.argmin(abs(z - QUIET)))
     fine = float(long.energy[np.argmax(long.steps == overflow), 0, 0])
     return Demo(
-        title="Stable, and yet not differentiable",
+        title="Stable, but not differentiable",
         question=(
-            "Up to which stiffness can the trajectory of the ball be trusted, and up to which its derivative?"
+            "Up to which stiffness can the trajectory of the ball be trusted, and up to which stiffness "
+            "its derivative?"
         ),
         result=(
             f"At h sqrt(k) = {QUIET} the energy of the ball stays bounded, but its gradient exceeds "
@@ -354,11 +355,14 @@ def run() -> Demo:
         ),
         answer=(
             "Held in contact, a ball is stable under semi-implicit Euler up to h sqrt(k) = 2 (measured "
-            f"{found['semi-implicit-euler']:.4f}). A bouncing ball hardly notices: at 1.97 and 2.02 its "
-            f"energy reaches {alone[0]:.1f} and {alone[1]:.1f} times the first. Its derivative does: from "
-            f"h sqrt(k) = {first:.2f} on it passes {wide.gradient_bound:.0e} within {STEPS:,} steps, where "
-            f"the exact one is at most {wide.exact[-1]:.0f}. At {QUIET} it overflows double precision by "
-            f"step {overflow:,} while the energy has stayed below {fine:.1f} times the first."
+            f"{found['semi-implicit-euler']:.4f}). A bouncing ball hardly shows this limit: at 1.97 and "
+            f"2.02 its energy reaches {alone[0]:.1f} and {alone[1]:.1f} times the initial energy. The "
+            f"derivative does not stay bounded: from "
+            f"h sqrt(k) = {first:.2f} on it exceeds {wide.gradient_bound:.0e} within {STEPS:,} steps, "
+            f"where "
+            f"the exact derivative is at most {wide.exact[-1]:.0f}. At {QUIET} the derivative overflows "
+            f"double precision by "
+            f"step {overflow:,} while the energy stays below {fine:.1f} times the initial energy."
         ),
         numbers={
             "limit": limit("semi-implicit-euler"),
@@ -374,25 +378,25 @@ def run() -> Demo:
         },
         checks=(
             Claim(
-                "the measured limit is the eigenvalues'",
+                "the measured limit agrees with the eigenvalues",
                 found["semi-implicit-euler"],
                 "2 ± 1e-4",
                 abs(found["semi-implicit-euler"] - 2) < 1e-4,
             ),
             Claim(
-                "rounding does not move it: float32 has the same",
+                "rounding does not change the limit: float32 gives the same value",
                 narrow,
                 "within 1e-3",
                 abs(narrow - found["semi-implicit-euler"]) < 1e-3,
             ),
             Claim(
-                "the limit leaves no mark on a bouncing ball: E/E(0) just below and just above",
+                "the energy of a bouncing ball does not show the limit: E/E(0) just below and just above",
                 alone,
                 "within a factor of 10 of each other",
                 0.1 < alone[0] / alone[1] < 10,
             ),
             Claim(
-                f"at {QUIET} the derivative overflows and the ball does not",
+                f"at {QUIET} the derivative overflows and the energy does not",
                 [overflow, fine],
                 f"before step {LONG:,}, E/E(0) below 10",
                 bool(np.isinf(long.gradient[-1, 0, 0])) and fine < 10,
@@ -404,7 +408,7 @@ def run() -> Demo:
                 set(wide.kind.ravel().tolist()) == {0, 1, 2},
             ),
             Claim(
-                "the growth of the derivative is the one that the eigenvalues of a bounce predict",
+                "the growth of the derivative agrees with the eigenvalues of a bounce",
                 ratio,
                 "median ratio 1 ± 0.25",
                 abs(ratio - 1) < 0.25,
@@ -426,7 +430,8 @@ def run() -> Demo:
                 x_scale="log",
                 region=Region(z, wide.steps.astype(float), wide.kind[:, 0], WORDS),
                 verticals=((2.0, "limit of the contact"),),
-                caption="The derivative is lost far below the limit, and the sooner the stiffer the floor.",
+                caption="The derivative grows without bound far below the limit, and earlier on stiffer "
+                "floors.",
             ),
             Plot(
                 "damping-stiffness",
@@ -445,7 +450,7 @@ def run() -> Demo:
                         "ink",
                     ),
                 ),
-                caption="Damping takes the bounces away and the growth with them.",
+                caption="Damping ends the bounces, and with them the growth of the derivative.",
             ),
             Plot(
                 "one-ball",
@@ -467,7 +472,7 @@ def run() -> Demo:
                     ),
                 ),
                 verticals=((float(overflow), "overflow"),),
-                caption="Three hundred orders of magnitude between a ball that looks fine and its slope.",
+                caption="The derivative exceeds the bounded energy by three hundred orders of magnitude.",
             ),
             Plot(
                 "growth-derivative",
@@ -480,7 +485,8 @@ def run() -> Demo:
                     Series("eigenvalues of a bounce", z, predicted, "line", "ink", dashed=True),
                 ),
                 verticals=((z[at], "above"),),
-                caption="At h sqrt(k) = 1 three steps are exactly half a turn, and nothing grows.",
+                caption="At h sqrt(k) = 1 three steps are exactly half a period, and the derivative "
+                "does not grow.",
             ),
         ),
         in_md=(

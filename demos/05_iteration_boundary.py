@@ -136,9 +136,9 @@ def run() -> Demo:
             f"{above.iterations}: the residual after {one.iteration} is {margin[0]:.1g} on one side of "
             f"the tolerance and {margin[1]:.1g} on the other. The loss goes from {below.loss:.3g} to "
             f"{above.loss:.3g} and its derivative from {below.gradient:.3g} to {above.gradient:.3g}, where a "
-            f"smooth function would change by {smooth:.1g}. It took {one.evaluations} rollouts to find. "
-            f"Every derivative says that a larger gain leaves less ({inside:.2g} on average); over the whole "
-            f"interval the loss changes by {ends:.1g} per unit of gain."
+            f"smooth function would change by {smooth:.1g}. The search took {one.evaluations} runs. "
+            f"Every derivative states that the loss decreases with the gain ({inside:.2g} on average); "
+            f"over the whole interval the loss changes by {ends:.1g} per unit of gain."
         ),
         numbers={
             "k_below": below.at,
@@ -156,19 +156,19 @@ def run() -> Demo:
         checks=[
             Claim("every boundary stands between adjacent floats", ulps, "1 ulp each", set(ulps) == {1}),
             Claim(
-                "each takes one iteration away",
+                "at each boundary the solver makes one iteration fewer",
                 [b.below.iterations - b.above.iterations for b in found],
                 "1 each",
                 all(b.below.iterations == b.above.iterations + 1 for b in found),
             ),
             Claim(
-                "all that real arithmetic has in the interval, and no other",
+                "the boundaries are those of real arithmetic in the interval",
                 len(found),
                 str(_expected()),
                 len(found) == _expected(),
             ),
             Claim(
-                "each is where real arithmetic has it, but for the rounding of its iterations",
+                "each boundary agrees with real arithmetic within the rounding of its iterations",
                 off,
                 "within 64 ulps",
                 max(off) <= 64,
@@ -180,7 +180,7 @@ def run() -> Demo:
                 all(low <= 0 < high for low, high in margins),
             ),
             Claim(
-                "the loss jumps by what one iteration leaves less",
+                "the loss jumps by the change of one iteration",
                 jump,
                 f"{TOL:g} * alpha * k to 1e-9 relative",
                 math.isclose(jump, TOL * ALPHA * above.at, rel_tol=1e-9),
@@ -231,27 +231,29 @@ def _plots(grid: list[Side], found: list[Tooth]) -> list[Plot]:
     return [
         Plot(
             "loss",
-            title="Penetration that is left, along the gain",
+            title="Remaining penetration over the gain",
             x_label="gain k",
             y_label="loss (m)",
             series=(
                 Series("loss", x, np.array([point.loss for point in points])),
                 Series("grid", at, loss, "points", "muted"),
             ),
-            caption="It falls between boundaries and jumps back to the tolerance at each.",
+            caption="The penetration decreases between boundaries and jumps back to the tolerance at "
+            "each boundary.",
             verticals=marks,
             horizontals=((TOL, "tolerance"),),
         ),
         Plot(
             "derivative",
-            title="Its derivative, through the iterations that ran",
+            title="Derivative of the penetration through the executed iterations",
             x_label="gain k",
             y_label="dloss/dk (m)",
             series=(
                 Series("derivative", x, np.array([point.gradient for point in points]), role="second"),
                 Series("slope over the whole interval", at[[0, -1]], flat, role="muted", dashed=True),
             ),
-            caption="Right everywhere but at the boundaries, and of the wrong size for any step across one.",
+            caption="The derivative is correct except at the boundaries, but does not describe a change "
+            "across a boundary.",
             verticals=marks,
         ),
     ]

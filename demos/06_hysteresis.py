@@ -91,7 +91,7 @@ def run() -> Demo:
         ),
         answer=(
             f"Balls on a vibrating spring cross the floor {low} times; if a contact begins below 0 "
-            f"but ends only above {LIFTS[2]:g} m, they do so {high} times. A solver that starts when "
+            f"but ends only above {LIFTS[2]:g} m, there are {high} flips. A solver that starts when "
             f"a float16 sum reaches tol changes its decision {starts[two]} times in {PRESSED_STEPS} "
             f"steps, and in {apart[two]} of these steps another order of the sum gives a different "
             f"decision; if it starts at {one:g} tol, the numbers are {starts[one]} and {apart[one]}. "
@@ -109,7 +109,7 @@ def run() -> Demo:
             "left_with": left[one],
         },
         checks=[
-            Claim("contact flips shrink with the gap", list(rows.values()), "falling", _falls(rows)),
+            Claim("a wider gap reduces the contact flips", list(rows.values()), "falling", _falls(rows)),
             Claim("a gap of 1 cm removes most of them", [low, high], "below a tenth", high < low / 10),
             Claim(
                 "a ball leaves contact only above the gap",
@@ -118,7 +118,7 @@ def run() -> Demo:
                 bool(_leaves(contact[LIFTS[2]]) > LIFTS[2]),
             ),
             Claim(
-                "the solver's decision to start wavers without a gap",
+                "without a gap the solver's decision to start fluctuates",
                 starts[two],
                 "more than 100 times",
                 starts[two] > 100,
@@ -132,7 +132,7 @@ def run() -> Demo:
             ),
             Claim("and in none with one", apart[one], "0", apart[one] == 0),
             Claim(
-                "the price: more penetration is left",
+                "the disadvantage: more penetration remains",
                 left[one] / left[two],
                 "above 1",
                 left[one] > left[two],
@@ -183,7 +183,7 @@ def _heights(plain: BallRun, gap: BallRun) -> Plot:
     shown = slice(0, 200)
     return Plot(
         "shaken-ball",
-        title="A shaken ball, and when it is in contact",
+        title="Height and contacts of a shaken ball",
         x_label="time (s)",
         y_label="height (m)",
         series=(
@@ -211,12 +211,12 @@ def _heights(plain: BallRun, gap: BallRun) -> Plot:
 def _gaps(rows: dict[float, int]) -> Plot:
     return Plot(
         "contact-flips",
-        title="Contact flips against the gap",
+        title="Contact flips over the width of the gap",
         x_label="gap (m)",
         y_label="flips",
         y_scale="symlog",
         series=(Series("flips", np.array(list(rows)), np.array(list(rows.values()), float), "line+points"),),
-        caption="The gap has to be wider than the ball wavers, about 0.7 cm here.",
+        caption="The gap has to be wider than the fluctuations of the ball, which are about 0.7 cm here.",
     )
 
 
@@ -224,10 +224,10 @@ def _residuals(run: BallRun) -> Plot:
     start = np.abs(np.minimum(run.height, 0)).sum(axis=1, dtype=np.float64) / TOL
     return Plot(
         "solver-finds",
-        title="What the solver finds at the beginning of each step",
+        title="Residual at the beginning of each step",
         x_label="step",
         y_label="sum of penetrations / tol",
         series=(Series("first residual", np.arange(1, len(start) + 1), start, "points"),),
-        caption="It wavers about the tolerance and stays well below the second threshold.",
+        caption="The residual fluctuates around the tolerance and stays well below the second threshold.",
         horizontals=((1.0, "tol"), (GAPS[1], "starts here with a gap")),
     )

@@ -83,14 +83,14 @@ def run() -> Demo:
     total, own = found["global sum"], found["per instance"]
     drift = _growth()
     return Demo(
-        title="A sum over the batch couples balls that never meet",
+        title="A sum over the batch couples independent balls",
         question=(
             "A ball far from the others penetrates the floor. Does this affect the solvers of the others?"
         ),
         result=(
             "With a common sum, one more ball in the batch changes the number of iterations for "
             f"every other ball from {total['before'][0]} to {total['after'][0]}; with a separate rule "
-            "for each ball it changes none."
+            f"for each ball, no number changes."
         ),
         answer=(
             "With a common sum for the batch, all of them are affected: the number of iterations "
@@ -108,7 +108,7 @@ def run() -> Demo:
         },
         checks=[
             Claim(
-                "global sum: share of other balls whose count changed",
+                "global sum: fraction of other balls whose number of iterations changes",
                 total["coupling"],
                 "1",
                 total["coupling"] == 1,
@@ -121,13 +121,13 @@ def run() -> Demo:
                 found["fixed count"]["coupling"] == 0,
             ),
             Claim(
-                "per instance: their loss and its derivative keep every bit",
+                "per instance: the loss of the other balls and its derivative do not change a bit",
                 [own["loss"], own["grad_k"]],
                 "equal pairs",
                 own["loss"][0] == own["loss"][1] and own["grad_k"][0] == own["grad_k"][1],
             ),
             Claim(
-                "global sum: the derivative of their loss is that of another number of iterations",
+                "global sum: the derivative of the loss belongs to another number of iterations",
                 total["grad_k"],
                 "n p (3/4)^(n-1) / 2 with n = 7 and 8",
                 all(
@@ -136,7 +136,7 @@ def run() -> Demo:
                 ),
             ),
             Claim(
-                "the larger the batch, the more iterations under one sum, and not under one each",
+                "a larger batch needs more iterations with one sum, but not with a rule for each ball",
                 [drift["global sum"], drift["per instance"]],
                 "rising; constant",
                 drift["global sum"][-1] > drift["global sum"][0] and len(set(drift["per instance"])) == 1,
@@ -161,7 +161,7 @@ def run() -> Demo:
         plots=[
             Plot(
                 "iterations-ball",
-                title="Iterations of a ball against the size of its batch",
+                title="Iterations of a ball over the size of its batch",
                 x_label="balls in the batch",
                 y_label="iterations",
                 x_scale="log",
@@ -169,8 +169,8 @@ def run() -> Demo:
                     Series("global sum", _SIZES, np.array(drift["global sum"], float), "line+points", "bad"),
                     Series("per instance", _SIZES, np.array(drift["per instance"], float), "line+points"),
                 ),
-                caption="Equal balls, 0.45 m below the floor: under one sum a ball's own solve depends on "
-                "how many others there are.",
+                caption="Equal balls, 0.45 m below the floor: with one sum the solve for a ball depends "
+                "on the number of other balls.",
             )
         ],
         in_md=(

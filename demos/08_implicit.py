@@ -250,17 +250,17 @@ def run() -> Demo:
             "A projection returns a ball to the floor. How does the final position depend on the gain?"
         ),
         result=(
-            "The derivative of the fixed point is 0; through the iterations that ran at a tolerance of 1e-2 "
-            f"it is {unrolled[0]:.2g}."
+            f"The derivative of the fixed point is 0; through the iterations at a tolerance of 1e-2 it "
+            f"is {unrolled[0]:.2g}."
         ),
         answer=(
-            "Not at all: the fixed point is the floor, and its derivative by k is 0. Through the "
-            f"{counts[0]}, {counts[1]} and {counts[2]} iterations that run at tolerances of 1e-2, 1e-4 and "
-            f"1e-6 it is {unrolled[0]:.2g}, {unrolled[1]:.2g} and {unrolled[2]:.2g}: an artefact that "
-            f"vanishes like the tolerance (power {order:.2f}). Reverse mode over n iterations keeps "
-            f"something of each, {tapes[-1].unrolled / 2**20:.0f} MiB for 1,000 balls and "
-            f"{ITERATIONS[-1]} iterations; the linear solve does not grow. But its own "
-            "tolerance enters the derivative, times the condition number."
+            "The fixed point is the floor, so its derivative with respect to k is 0. Through the "
+            f"{counts[0]}, {counts[1]} and {counts[2]} iterations at tolerances of 1e-2, 1e-4 and 1e-6 "
+            f"the derivative is {unrolled[0]:.2g}, {unrolled[1]:.2g} and {unrolled[2]:.2g}: an artifact "
+            f"that is proportional to the tolerance (power {order:.2f}). Reverse mode over n iterations "
+            f"stores data of each iteration, {tapes[-1].unrolled / 2**20:.0f} MiB for 1,000 balls and "
+            f"{ITERATIONS[-1]} iterations; the memory of the linear solve does not grow. The tolerance "
+            f"of this solve, times the condition number, is an error of the derivative."
         ),
         numbers={
             "grad_k_unrolled": unrolled.tolist(),
@@ -283,13 +283,13 @@ def run() -> Demo:
             Claim("the implicit derivative is 0 at every tolerance", fixed, "0", not np.any(fixed)),
             Claim("and mdnum says so", said.notes["k"], "does not depend on k", not said.depends["k"]),
             Claim(
-                "the artefact shrinks like the tolerance",
+                "the artifact is proportional to the tolerance",
                 float(order),
                 "a power of 0.9 to 1",
                 bool(0.85 < order < 1.05),
             ),
             Claim(
-                "taking the stopped iterate for the fixed point lets the tolerance back in as -p/k",
+                "the implicit derivative at the stopped iterate contains the tolerance as -p/k",
                 near,
                 "-p/k to 1e-10 relative",
                 bool(np.allclose(near, [-value / K for value, _ in ran], rtol=1e-10, atol=0)),
@@ -302,7 +302,7 @@ def run() -> Demo:
             ),
             Claim("and of the implicit one", flat, "1", flat == 1),
             Claim(
-                f"at condition number {CONDITION:g} its error follows the tolerance of the solve",
+                f"at condition number {CONDITION:g} the error follows the tolerance of the solve",
                 float(rate),
                 "a power of 0.9 to 1.1",
                 bool(0.9 < rate < 1.1),
@@ -310,7 +310,7 @@ def run() -> Demo:
         ],
         tables=[
             table(
-                "derivative of the penetration that is left, by the gain k",
+                "derivative of the remaining penetration with respect to the gain k",
                 (
                     "tolerance (m)",
                     "iterations",
@@ -363,7 +363,7 @@ def _artefact(unrolled: np.ndarray, near: list[float]) -> Plot:
     x = np.array(TOLERANCES)
     return Plot(
         "tolerance-adds",
-        title="What the tolerance adds to the derivative by the gain",
+        title="Error of the derivative with respect to the gain, over the tolerance",
         x_label="tolerance (m)",
         y_label="|derivative by k| (m)",
         x_scale="log",
@@ -373,7 +373,8 @@ def _artefact(unrolled: np.ndarray, near: list[float]) -> Plot:
             Series("implicit at the stopped iterate", x, -np.array(near), "line+points", "second"),
             Series("proportional to the tolerance", x, x, "line", "muted", dashed=True),
         ),
-        caption="The implicit derivative at the fixed point is exactly 0 and not on a logarithmic axis.",
+        caption="The implicit derivative at the fixed point is exactly 0, and not shown on a "
+        "logarithmic axis.",
     )
 
 
@@ -381,7 +382,7 @@ def _memory_plot(tapes: list[Memory]) -> Plot:
     x = np.array([row.iterations for row in tapes], float)
     return Plot(
         "memory-gradient",
-        title="Memory of a gradient against the number of iterations",
+        title="Memory of a gradient over the number of iterations",
         x_label="iterations",
         y_label="temporaries (bytes)",
         x_scale="log",
@@ -395,7 +396,7 @@ def _memory_plot(tapes: list[Memory]) -> Plot:
             ),
             Series("implicit", x, np.array([row.implicit for row in tapes], float), "line+points", "second"),
         ),
-        caption="Only the tape grows; as planned by the compiler.",
+        caption="Only the stored data of reverse mode grow (memory as planned by the compiler).",
     )
 
 
@@ -403,7 +404,7 @@ def _accuracy_plot(solved: list[Accuracy]) -> Plot:
     x = np.array([row.tolerance for row in solved])
     return Plot(
         "backward-solve",
-        title="What the backward solve leaves",
+        title="Error of the backward solve",
         x_label="tolerance of the solve",
         y_label="relative error of the derivative",
         x_scale="log",
@@ -412,5 +413,5 @@ def _accuracy_plot(solved: list[Accuracy]) -> Plot:
             Series("measured", x, np.array([row.error for row in solved]), "line+points"),
             Series("tolerance times condition number", x, x * CONDITION, "line", "muted", dashed=True),
         ),
-        caption="The derivative of an implicit function is as good as its linear solve, no better.",
+        caption="The derivative of an implicit function is only as accurate as its linear solve.",
     )

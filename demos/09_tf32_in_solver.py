@@ -455,19 +455,20 @@ def run() -> Demo:
     return Demo(
         title="Ten bits in a matrix product, inside a solver",
         question=(
-            "Some devices multiply float32 matrices with ten fraction bits unless told otherwise. What does "
-            "that do to an iterative solver, and to the contacts it decides?"
+            "Some devices multiply float32 matrices with ten fraction bits unless told otherwise. How "
+            "does this affect an iterative solver, and the contacts that depend on it?"
         ),
         result=(
-            f"Conjugate gradients with TF32 products report a residual of {believed['tf32']:.1e}; the true "
-            f"one is {true['tf32']:.2g}."
+            f"Conjugate gradients with TF32 products report a residual of {believed['tf32']:.1e}; the "
+            f"true residual is {true['tf32']:.2g}."
         ),
         answer=(
             f"At condition number {HARD:.0e}, conjugate gradients with TF32 products stop after "
-            f"{counts['tf32']} iterations with a residual of {believed['tf32']:.1e} by their recurrence; the "
-            f"true one is {true['tf32']:.2g}. With float32 it is {true['float32']:.1e} after "
-            f"{counts['float32']}; bfloat16 hits the cap of {CAP}. In a column of {BALLS} balls the products "
-            f"cost {inner['tf32']} inner iterations instead of {inner['float32']}, and where only {BUDGET} "
+            f"{counts['tf32']} iterations with a residual of {believed['tf32']:.1e} by their "
+            f"recurrence; the true residual is {true['tf32']:.2g}. With float32 the true residual is "
+            f"{true['float32']:.1e} after {counts['float32']} iterations; with bfloat16 the limit of "
+            f"{CAP} iterations is reached. In a column of {BALLS} balls the solver needs "
+            f"{inner['tf32']} inner iterations instead of {inner['float32']}, and if only {BUDGET} "
             f"outer iterations per step are allowed, {in_words}."
         ),
         numbers={
@@ -484,7 +485,7 @@ def run() -> Demo:
         },
         checks=[
             Claim(
-                "TF32: the recurrence says converged",
+                "TF32: the recurrence reports convergence",
                 believed["tf32"],
                 f"at most {TOL}, before the cap",
                 believed["tf32"] <= TOL and reasons["tf32"] == Reason.TOLERANCE,
@@ -498,7 +499,12 @@ def run() -> Demo:
                 "below 1e-3",
                 true["float32"] < 1e-3,
             ),
-            Claim("bfloat16 hits the cap", counts["bfloat16"], str(CAP), counts["bfloat16"] == CAP),
+            Claim(
+                "bfloat16 reaches the limit of iterations",
+                counts["bfloat16"],
+                str(CAP),
+                counts["bfloat16"] == CAP,
+            ),
             Claim(
                 "at condition number 100 the counts are nearly the same",
                 [int(one.iterations) for one in easy.values()],
@@ -508,19 +514,19 @@ def run() -> Demo:
                 <= 10,
             ),
             Claim(
-                "in the column fewer bits cost more inner iterations",
+                "in the column fewer bits need more inner iterations",
                 inner,
                 "growing from float64 to bfloat16",
                 inner["float64"] < inner["float32"] < inner["tf32"] < inner["bfloat16"],
             ),
             Claim(
-                "every outer loop of it still ends at its tolerance",
+                "every outer loop of the column still ends at its tolerance",
                 {name: one.ended() for name, one in full.items()},
                 f"tolerance, {STEPS} times",
                 all(one.ended() == {"tolerance": STEPS} for one in full.values()),
             ),
             Claim(
-                f"with {BUDGET} outer iterations TF32 changes a contact and float32 none",
+                f"with {BUDGET} outer iterations TF32 changes a contact and float32 changes none",
                 [flips["float32"], flips["tf32"]],
                 "none, some",
                 flips["float32"] is None and flip is not None,
@@ -603,8 +609,8 @@ def _residuals(solved: dict[str, Solution]) -> Plot:
             Series("TF32, recurrence", count, kept["tf32", "history"], role="bad", dashed=True),
         ),
         y_scale="log",
-        caption="The recurrence (dashed) falls to the tolerance in both formats. The true residual stops "
-        "where the rounding of the products lets it.",
+        caption="The recurrence (dashed) falls to the tolerance in both formats. The true residual "
+        "stays at a level that is determined by the rounding of the products.",
         horizontals=((TOL, "tolerance"),),
     )
 
@@ -623,6 +629,6 @@ def _inner(runs: dict[str, ColumnRun]) -> Plot:
             Series("TF32", step, counts["tf32"], role="second"),
             Series("bfloat16", step, counts["bfloat16"], role="bad"),
         ),
-        caption="The column lands between steps 1 and 11 and collapses once more around step 14; the fewer "
-        "bits, the more iterations.",
+        caption="The column lands between steps 1 and 11 and collapses once more around step 14. With "
+        "fewer bits, more iterations are needed.",
     )

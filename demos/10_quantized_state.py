@@ -211,7 +211,7 @@ def run() -> Demo:
     own = horizon(np.asarray(integer), contact)
     at = BITS.index(16)
     return Demo(
-        title="Quantize what is read, not what is remembered",
+        title="Quantize inputs, not the state",
         question=(
             "An input, a parameter or the state is stored in b bits. For how many steps are the "
             "contacts unchanged?"
@@ -223,9 +223,10 @@ def run() -> Demo:
         answer=(
             f"With 16 bits in the state the first contact differs after {found['state'][at]:.0f} steps, in "
             f"the input after {found['input'][at]:.0f}, in the stiffness after "
-            f"{found['parameter'][at]:.0f} (medians of {BALLS} balls). Every further bit of state buys about "
-            f"{per_bit:.0f} steps; the balls double a separation in {doubling:.0f}. An integer state "
-            f"parts from float64 too, but its events are exact: {STEPS} steps and back return every bit."
+            f"{found['parameter'][at]:.0f} (medians of {BALLS} balls). Every further bit of the state "
+            f"adds about {per_bit:.0f} steps; a separation doubles in {doubling:.0f} steps. A run with an "
+            f"integer state also separates from float64, but its events are exact: {STEPS} steps and "
+            f"their reversal return every bit."
         ),
         numbers={
             "state_horizon_16_bits": found["state"][at],
@@ -245,13 +246,13 @@ def run() -> Demo:
                 bool((np.diff(found["state"]) > 0).all()),
             ),
             Claim(
-                "it grows by a doubling per bit",
+                "the horizon grows by a doubling time per bit",
                 [per_bit, doubling],
                 "within a factor of 2",
                 0.5 < per_bit / doubling < 2.0,
             ),
             Claim(
-                "up to 24 bits the state is the worst place for them",
+                "up to 24 bits, quantizing the state has the largest effect",
                 [found[name][:-1] for name in found],
                 "state before input and parameter",
                 all(
@@ -297,7 +298,7 @@ def _horizons(found: dict[str, list[float]], doubling: float) -> Plot:
     guide = found["state"][0] + (bits - bits[0]) * doubling
     return Plot(
         "long-contacts",
-        title="How long the contacts are those of float64",
+        title="Steps for which the contacts agree with float64",
         x_label="bits",
         y_label="first step with another contact",
         series=(
@@ -306,7 +307,7 @@ def _horizons(found: dict[str, list[float]], doubling: float) -> Plot:
             Series("input", bits, np.array(found["input"]), "line+points", "first"),
             Series("one doubling per bit", bits, guide, role="muted", dashed=True),
         ),
-        caption="A bit in the state is lost anew in every step and buys only the time in which a separation "
-        "doubles.",
+        caption="The state is rounded in every step, so one more bit adds only the time in which a "
+        "separation doubles.",
         horizontals=((float(STEPS), "end of the run"),),
     )

@@ -64,19 +64,19 @@ def run() -> Demo:
     return Demo(
         title="Coalescing is a reduction",
         question=(
-            f"{CONTACTS} contacts load {PANELS} panels. In how many ways can the same entries be added, and "
-            "does any panel change its mind?"
+            f"{CONTACTS} contacts load {PANELS} panels. In how many ways can the same entries be added, "
+            f"and does the decision about any panel change?"
         ),
         result=(
             f"{ORDERS} storage orders of the same sparse entries give {loose} different sums; summed "
-            "exactly, they give one."
+            f"exactly, they give one sum."
         ),
         answer=(
             f"In {ORDERS} storage orders a scattered addition gives {loose} different vectors, and in "
-            f"{yields['scatter-add, storage order']} of them some panel that carries exactly its limit is "
-            f"found below it. Sorting by index alone changes nothing ({by_index}): duplicates still come as "
-            "stored. Sorted by value too, summed exactly, or in fixed point, there is 1 answer; the last two "
-            "are also right."
+            f"{yields['scatter-add, storage order']} of them the computed load of a panel at exactly "
+            f"its limit is below the limit. Sorting by index alone changes nothing ({by_index}), "
+            f"because duplicates stay in storage order. If duplicates are also sorted by value, summed "
+            f"exactly, or summed in fixed point, there is 1 result; the last two methods are also correct."
         ),
         numbers={
             "distinct_scatter_add": loose,
@@ -89,7 +89,7 @@ def run() -> Demo:
             "largest_error_ulps": ulps["scatter-add, storage order"],
         },
         checks=[
-            Claim("storage order decides the bits", loose, "more than 100 of 1000", loose > 100),
+            Claim("the storage order determines the bits", loose, "more than 100 of 1000", loose > 100),
             Claim("a sort by index does not help", by_index, f"{loose}, as scattered", by_index == loose),
             *(
                 Claim(f"{name}: one answer", distinct[name], "1", distinct[name] == 1)
@@ -133,6 +133,7 @@ def _spread(found: np.ndarray, exact: np.float32) -> Plot:
         x_label="computed - exact (ulps)",
         y_label="storage orders",
         series=(Series("scatter-add", values, counts, "steps", "bad"),),
-        caption="Left of zero the panel is found below its limit, though it carries exactly that.",
+        caption="Left of zero the computed load is below the limit, although the exact load equals the "
+        "limit.",
         verticals=((0.0, "exact"),),
     )

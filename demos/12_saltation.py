@@ -106,11 +106,12 @@ def run() -> Demo:
         ),
         answer=(
             f"By {exact[0]:.5f} m per m. Discretize, then differentiate: the derivative of the steps is "
-            "exactly 0 at every step size, because a step that puts the ball on the floor forgets where it "
-            "came from. Differentiate, then discretize: the tangent of the motion, with the saltation matrix "
+            "exactly 0 at every step size, because a step that puts the ball on the floor discards its "
+            "previous height. Differentiate, then discretize: the tangent of the motion, with the "
+            "saltation matrix "
             f"at each impact, is {by_saltation[-1][0]:.4f} at the smallest step, and its error shrinks with "
-            f"order {order:.2f}. Without an impact the two are the same number. Locating the impact inside "
-            f"the step makes them agree: that leaves {abs(error[0]):.0e}."
+            f"order {order:.2f}. Without an impact the two derivatives agree. If the impact is located "
+            f"inside the step, they agree, too: the remaining error is {abs(error[0]):.0e}."
         ),
         numbers={
             "exact": float(exact[0]),
@@ -130,7 +131,7 @@ def run() -> Demo:
                 zero,
             ),
             Claim(
-                "before the first impact both ways are one number",
+                "before the first impact both derivatives agree",
                 float(apart[0]),
                 "exactly 0.0",
                 bool(apart[0] == 0),
@@ -148,7 +149,7 @@ def run() -> Demo:
         ),
         tables=(
             table(
-                "Derivative of the height at 2 s by the height at the start",
+                "Derivative of the height at 2 s with respect to the initial height",
                 ("by", "h (s)", "derivative, from 1 m", "error", "error, 31 starts"),
                 tuple(rows),
             ),
@@ -156,7 +157,7 @@ def run() -> Demo:
         plots=(
             Plot(
                 "error-derivative",
-                title="Error of the derivative against the step",
+                title="Error of the derivative over the step",
                 x_label="h (s)",
                 y_label="error of dy/dy0, root mean square",
                 x_scale="log",
@@ -189,7 +190,7 @@ def _history(world: World) -> Plot:
     motion = ExactImpact(1.0).height(time).gradient["y0"]
     return Plot(
         "derivative-along",
-        title="The derivative along the way, from 1 m with h = 0.01 s",
+        title="The derivative over time, from 1 m with h = 0.01 s",
         x_label="time (s)",
         y_label="dy/dy0",
         series=(
@@ -197,5 +198,6 @@ def _history(world: World) -> Plot:
             Series("steps", steps * 0.01, np.array(plain), "line", "bad"),
             Series("steps and saltation", steps * 0.01, np.array(salted), "points", "first"),
         ),
-        caption="All agree up to the first impact. There the derivative of the steps drops to zero for good.",
+        caption="All derivatives agree up to the first impact, at which the derivative of the steps "
+        "becomes zero.",
     )

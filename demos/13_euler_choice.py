@@ -113,19 +113,22 @@ def run() -> Demo:
     opposite = explicit[1] * semi[1] < 0
     return Demo(
         title="Two Eulers, two gradients",
-        question=("Does it matter whether a step moves the ball with the old or with the new velocity?"),
+        question=(
+            "A step can move the ball with the old or with the new velocity. Does this affect the result?"
+        ),
         result=(
-            f"If two lines are exchanged, the derivative after 2 s is {explicit[1]:+.3f} or "
+            f"Depending on the order of two lines, the derivative after 2 s is {explicit[1]:+.3f} or "
             f"{semi[1]:+.3f} (exact: {float(end.gradient['y0']):+.3f})."
         ),
         answer=(
-            f"The two programs differ in the order of two lines. After 2 s with h = {h:g} s they have the "
-            f"ball at {explicit[0]:.3f} and {semi[0]:.3f} m (exact: {float(end.value):.3f}), with "
-            f"derivatives by the start of {explicit[1]:.3f} and {semi[1]:.3f} "
+            f"The two programs differ in the order of two lines. After 2 s with h = {h:g} s the ball is "
+            f"at {explicit[0]:.3f} and {semi[0]:.3f} m (exact: {float(end.value):.3f}), with "
+            f"derivatives with respect to the initial height of {explicit[1]:.3f} and {semi[1]:.3f} "
             f"(exact: {float(end.gradient['y0']):.3f})"
             + (": not even the sign agrees. " if opposite else ". ")
-            + "Both are the exact derivative of their own program, and both approach that of the motion with "
-            "order 1. Schemes of order 2 keep their order in the height and lose it in the derivative."
+            + "Both numbers are exact derivatives of their own program, and both approach the "
+            "derivative of the motion with order 1. Schemes of order 2 have order 2 in the height, "
+            "but only order 1 in the derivative."
         ),
         numbers={
             "dy_dy0_explicit": explicit[1],
@@ -141,7 +144,7 @@ def run() -> Demo:
         },
         checks=(
             Claim(
-                "the gradients of the two programs differ by more than the exact one's size",
+                "the gradients of the two programs differ by more than the exact gradient",
                 abs(explicit[1] - semi[1]),
                 f"above {abs(float(end.gradient['y0'])):.3g}",
                 abs(explicit[1] - semi[1]) > abs(float(end.gradient["y0"])),

@@ -59,14 +59,15 @@ def run() -> Demo:
         title="Infinitely many bounces",
         question=("When does a bouncing ball come to rest, and which program finds this time?"),
         result=(
-            f"The ball is at rest after {limit:.6f} s and infinitely many bounces. Located impacts find that "
-            f"time within {off:.0e} s; fixed steps never come to rest."
+            f"The ball is at rest after {limit:.6f} s and infinitely many bounces. With located impacts "
+            f"the time is found within {off:.0e} s; fixed steps never come to rest."
         ),
         answer=(
-            f"At {limit:.6f} s, after infinitely many bounces, in closed form. The program that locates "
-            f"impacts calls a rebound of {REST_SPEED:g} m/s rest, which is bounce {last}; whatever its step, "
-            f"it rests within {off:.0e} s of that time. Fixed steps never rest: a second later they still "
-            "touch the floor in every step, with a speed proportional to h."
+            f"In closed form, the ball is at rest at {limit:.6f} s, after infinitely many bounces. The "
+            f"program that locates "
+            f"impacts ends at a rebound of {REST_SPEED:g} m/s, which is bounce {last}; for any step it "
+            f"ends within {off:.0e} s of the exact time. With fixed steps the ball never rests: a "
+            f"second later it still touches the floor in every step, with a speed proportional to h."
         ),
         numbers={
             "rest_time": limit,
@@ -82,13 +83,13 @@ def run() -> Demo:
         },
         checks=(
             Claim(
-                "located impacts rest at the time in closed form, whatever the step",
+                "with located impacts the ball rests at the time in closed form, for any step",
                 off,
                 "below 2e-12 s for 1, 7, 60 and 500 steps",
                 off < 2e-12,
             ),
             Claim(
-                "they count every bounce up to then",
+                "located impacts count every bounce up to this time",
                 miscounted,
                 "0 steps with another count",
                 miscounted == 0 and counted_to_rest == last,
@@ -202,5 +203,6 @@ def _staircase(exact: ExactImpact, located, counted: np.ndarray, limit: float) -
                 "impacts located, h = 0.01 s", seen[shown], counted[shown].astype(float), "points", "first"
             ),
         ),
-        caption="Every factor in the time that is left costs the same number of bounces, without end.",
+        caption="The remaining time decreases by the same factor in each bounce, so the number of "
+        "bounces has no limit.",
     )

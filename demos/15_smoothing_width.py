@@ -74,15 +74,18 @@ def run() -> Demo:
             "large is the bias?"
         ),
         result=(
-            f"With a contact {single:g} m wide, one of {found[0.0].minima} minima is left; at 0.1 m "
+            f"With a contact {single:g} m wide, one of {found[0.0].minima} minima remains; at 0.1 m "
             f"this minimum has moved by {bias[0.1]:.3f} m."
         ),
         answer=(
-            f"With a hard contact the loss has {found[0.0].minima} minima and its derivative is off by "
-            f"{found[0.0].rough:.0f}, where the exact one is about 2. From a width of {single:g} m on, "
-            f"{single / travel:.1f} of the way that the ball falls in one step, one minimum is left; at "
-            f"{calm:g} m the derivative is off by {found[calm].rough:.3f}. But a softer floor is another "
-            f"problem: at 0.1 m the minimum has moved by {bias[0.1]:.3f} m. For small widths the bias grows "
+            f"With a hard contact the loss has {found[0.0].minima} minima and its derivative has an "
+            f"error of {found[0.0].rough:.0f}, while the exact derivative is about 2. From a width of "
+            f"{single:g} m on, "
+            f"{single / travel:.1f} of the distance that the ball falls in one step, one minimum "
+            f"remains; at "
+            f"{calm:g} m the derivative has an error of {found[calm].rough:.3f}. But a softer floor "
+            f"changes the problem: at 0.1 m the minimum has moved by {bias[0.1]:.3f} m. For small "
+            f"widths the bias grows "
             f"as the width to the power {order:.2f}."
         ),
         numbers={
@@ -97,13 +100,13 @@ def run() -> Demo:
         },
         checks=(
             Claim(
-                "a hard contact leaves many minima, a soft one a single one",
+                "a hard contact has many minima, a soft contact has a single minimum",
                 [found[0.0].minima, found[single].minima],
                 "above 20, and 1",
                 found[0.0].minima > 20 and found[single].minima == 1,
             ),
             Claim(
-                "the derivative's error falls by a thousand and more",
+                "the error of the derivative decreases by a factor of at least a thousand",
                 found[0.0].rough / found[calm].rough,
                 "above 1000",
                 found[0.0].rough > 1000 * found[calm].rough,
@@ -111,14 +114,14 @@ def run() -> Demo:
             Claim(
                 "and then the bias takes over",
                 [bias[calm], bias[WIDTHS[-1]]],
-                "the widest shifts the minimum at least five times as far as the calmest",
+                "the largest width shifts the minimum at least five times as far as the best width",
                 abs(bias[WIDTHS[-1]]) > 5 * abs(bias[calm]),
             ),
             Claim("the bias of small widths is quadratic", order, "2 ± 0.1", abs(order - 2) < 0.1),
         ),
         tables=(
             table(
-                f"Start that ends at the wanted height after 2 s: k = {K:g} 1/s², h = {h:g} s",
+                f"Initial height that ends at the given height after 2 s: k = {K:g} 1/s², h = {h:g} s",
                 ("width (m)", "minima", "best start (m)", "shift (m)", "error of dy/dy0", "largest |dy/dy0|"),
                 tuple(
                     (eps, one.minima, one.best, bias[eps], one.rough, float(np.abs(one.slope).max()))
@@ -137,7 +140,8 @@ def run() -> Demo:
                     Series("exact, hard", STARTS[SOME], exact, "line", "ink", dashed=True),
                 ),
                 verticals=((WANTED, "wanted"),),
-                caption="Hard: a noise of minima around the exact curve. Soft: one, in another place.",
+                caption="With a hard contact there are many minima around the exact curve, with a soft "
+                "contact one shifted minimum.",
             ),
             Plot(
                 "derivative-that",
@@ -149,7 +153,8 @@ def run() -> Demo:
                     *(_series(eps, found[eps].slope) for eps in SHOWN),
                     Series("exact, hard", STARTS[SOME], known, "line", "ink", dashed=True),
                 ),
-                caption="With a hard contact its sign is that of the last step of the contact.",
+                caption="With a hard contact the sign of the derivative is determined by the last step "
+                "of the contact.",
             ),
             Plot(
                 "trade",
@@ -175,7 +180,8 @@ def run() -> Demo:
                     ),
                 ),
                 verticals=((travel, "fall in one step"),),
-                caption="The width that helps is half the way in one step; beyond it only the bias grows.",
+                caption="The best width is half the distance moved in one step; for larger widths only "
+                "the bias grows.",
             ),
         ),
         in_md=(

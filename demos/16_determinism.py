@@ -85,7 +85,7 @@ def run() -> Demo:
     ulp = float(np.max(np.abs(higher.y - here.y)))
     contacts = [own["plain_contact"], old["plain_contact"]]
     return Demo(
-        title="The same bits every time, and what that is worth",
+        title="Equal bits in every run do not mean correct results",
         question=(
             "Does a rollout give the same bits in a new process, with another compilation, and in a batch?"
         ),
@@ -96,11 +96,12 @@ def run() -> Demo:
         answer=(
             f"mdnum's program, whose products are rounded before they are added, has one fingerprint in "
             f"{len(found)} processes, under an older instruction set, without a compiler and in a batch: "
-            f"first contact in step {own['fenced_contact']}. The same formulas written plainly repeat "
-            f"themselves too, {'but' if contacts[0] != contacts[1] else 'and'} touch in step {contacts[0]} "
-            f"here and in step {contacts[1]} under the older instruction set. Equal bits say that nothing "
-            "outside the inputs had a say. They do not say that the answer is right, or firm: started one "
-            f"ulp higher the ball is just as repeatable, and {ulp:.1g} m away."
+            f"first contact in step {own['fenced_contact']}. A plain program with the same formulas is "
+            f"also reproducible, {'but' if contacts[0] != contacts[1] else 'and'} its first contact is "
+            f"in step {contacts[0]} here and in step {contacts[1]} under the older instruction set. "
+            f"Equal bits show that the "
+            f"result depends only on the inputs. They do not show that the result is correct or "
+            f"insensitive: started one ulp higher, the ball is equally reproducible, and {ulp:.1g} m away."
         ),
         numbers={
             "fingerprints": len({answer["fenced"] for answer in found.values()}),
@@ -120,10 +121,17 @@ def run() -> Demo:
                 "yes",
                 old_same["fenced"],
             ),
-            Claim(f"and without a compiler ({EAGER} steps)", uncompiled, "yes", uncompiled),
-            Claim("and as one ball of a batch of nine", in_batch, "yes", in_batch),
             Claim(
-                "a start one ulp higher repeats as well, and is another trajectory",
+                f"mdnum's program has the same bits without a compiler ({EAGER} steps)",
+                uncompiled,
+                "yes",
+                uncompiled,
+            ),
+            Claim(
+                "mdnum's program has the same bits for one ball of a batch of nine", in_batch, "yes", in_batch
+            ),
+            Claim(
+                "a ball started one ulp higher is reproducible, too, and has another trajectory",
                 ulp,
                 "above 0.01 m",
                 ulp > 0.01 and all(answer["higher"] for answer in same.values()),
@@ -174,7 +182,7 @@ def run() -> Demo:
         plots=[
             Plot(
                 "trajectories-that",
-                title="Trajectories that are each repeatable",
+                title="Reproducible trajectories that differ",
                 x_label="time (s)",
                 y_label="|difference of heights| (m)",
                 y_scale="log",
@@ -182,8 +190,8 @@ def run() -> Demo:
                     _gap("plainly written", here, plain, "second"),
                     _gap("started one ulp higher", here, higher.y[1:, 0], "bad", dashed=True),
                 ),
-                caption="Difference from mdnum's run. Each is the same in every process of this kind: "
-                "repeatable is not the same as determined.",
+                caption="Difference from mdnum's run. Each trajectory is the same in every process of "
+                "this kind, but the trajectories differ.",
             )
         ],
         in_md=(

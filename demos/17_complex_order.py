@@ -89,25 +89,27 @@ def run() -> Demo:
     return Demo(
         title="Order parameters are complex numbers",
         question="How do |psi6|, |S(k)| and the phase of S(k) of a crystal depend on epsilon through a run?",
-        result=f"d|z|/depsilon = Re(g dz) with the g of jax.grad is right to {off:.0e}; with its conjugate, "
-        f"PyTorch's convention, it is {100 * wrong:.0f} % off. The phase of S crosses its branch cut "
+        result=f"d|z|/depsilon = Re(g dz) with the g of jax.grad is correct within {off:.0e}; with its "
+        f"conjugate, "
+        f"the convention of PyTorch, the error is {100 * wrong:.0f} %. The phase of S crosses its "
+        f"branch cut "
         f"{len(ledger)} times in {turned:.2f} turns.",
-        answer="For a real f(z) jax.grad gives df/dx - i df/dy, so that df = Re(g dz). The gradient of |z| "
-        "has modulus 1 however small z is, that of the phase 1/|z|; at 0 neither exists, and JAX says 0 for "
-        "|z| and NaN for z/|z|. A crossing of the cut is a flip with a margin, Im z, and a jump of 2 pi; "
-        "with the jumps of the ledger added the phase is continuous.",
+        answer="For a real f(z) jax.grad gives df/dx - i df/dy, so that df = Re(g dz). The gradient of "
+        "|z| has modulus 1 for any z, the gradient of the phase has modulus 1/|z|. At z = 0 neither "
+        "exists; JAX returns 0 for |z| and NaN for z/|z|. A crossing of the branch cut is a flip with a "
+        "margin, Im z, and a jump of 2 pi. If the jumps in the ledger are added, the phase is continuous.",
         numbers={"error": off, "error_conjugate": wrong, "crossings": len(ledger), "turns": turned,
                  "steps": ledger.step.tolist(), "smallest_margin": float(np.abs(ledger.margin).min()),
                  "psi6": float(np.abs(z[0])), "gradient_at_zero": list(near[-1][1:])},
         checks=[
-            Claim("d|z| is that of real differences", off, "below 1e-6", off < 1e-6),
-            Claim("with the conjugate gradient it is not", wrong, "above 0.01", wrong > 0.01),
+            Claim("d|z| agrees with finite differences of real numbers", off, "below 1e-6", off < 1e-6),
+            Claim("with the conjugate gradient d|z| does not agree", wrong, "above 0.01", wrong > 0.01),
             Claim("the phase follows the drift", turned, f"{turns:.3f} ± 0.02", abs(turned - turns) < 0.02),
             Claim("no crossing is within rounding", sum(ledger.ambiguous), "0", not any(ledger.ambiguous)),
         ],
         tables=[
             table("at the last step", ("z", "|z|", "|g|", "d|z|/depsilon", "by differences"), rows),
-            table("modulus of what jax.grad gives", ("|z|", "of |z|", "of arg z", "of Re z/|z|"), near),
+            table("modulus of the result of jax.grad", ("|z|", "of |z|", "of arg z", "of Re z/|z|"), near),
             table("crossings of the branch cut", ("step", "margin Im z", "bound", "jump"),
                   np.stack([ledger.step, ledger.margin, ledger.bound, ledger.jump], 1).tolist()),
         ],

@@ -53,13 +53,14 @@ def run() -> Demo:
 "The residual S is 9.96e-4 in one run and 1.004e-3 in another, and the tolerance is "
 "1e-3. What happens next?"
 ),
-        result="S = 9.96e-4 stops, S = 1.004e-3 makes one more iteration: the run that was lower by 8e-6 m "
-        f"ends higher by {jump:.3g} m, its contact lasts {lasts[1]} step instead of {lasts[0]}, and its next "
-        f"one begins at step {again[1]} instead of {again[0]}.",
-        answer=f"The run that stops leaves {left[0]:.3g} m, and what it leaves does not depend on k: its "
-        f"derivative is exactly {slopes[0]:g}. The other leaves {left[1]:.3g} m with a derivative of "
-        f"{slopes[1]:.3g}. A residual that differs by 0.8 % makes a state that differs by a quarter of the "
-        "penetration, and from there on other steps find the ball on the floor.",
+        result=f"With S = 9.96e-4 the solver stops, with S = 1.004e-3 it makes one more iteration: the "
+        f"ball that was lower by 8e-6 m ends higher by {jump:.3g} m, its contact lasts {lasts[1]} step "
+        f"instead of {lasts[0]}, and its next contact begins at step {again[1]} instead of {again[0]}.",
+        answer=f"The run that stops leaves a penetration of {left[0]:.3g} m, which does not depend on "
+        f"k: the derivative "
+        f"is exactly {slopes[0]:g}. The other run leaves {left[1]:.3g} m with a derivative of "
+        f"{slopes[1]:.3g}. A difference of 0.8 % in the residual becomes a difference of a quarter of "
+        f"the penetration, and from then on the ball touches the floor in different steps.",
         numbers={
             "left": left, "grad_k": slopes, "iterations": [int(one["iterations"][0]) for one in runs],
             "jump": jump, "contact_lasts": lasts, "next_contact": again,
@@ -68,7 +69,8 @@ def run() -> Demo:
         checks=[
             Claim("one stops, the other makes an iteration", [int(one["iterations"][0]) for one in runs],
                   "0 and 1", [int(one["iterations"][0]) for one in runs] == [0, 1]),
-            Claim("an iteration leaves 1 - alpha k", left[1], "0.75 of 1.004e-3",
+            Claim("an iteration reduces the penetration by the factor 1 - alpha k", left[1], "0.75 of "
+                "1.004e-3",
                   bool(np.isclose(left[1], 0.75 * RESIDUALS[1], rtol=1e-12))),
             Claim("without an iteration nothing depends on k", slopes[0], "exactly 0", slopes[0] == 0),
             Claim("with one the derivative is -alpha S", slopes[1], f"{exact:.4g} to 1e-12",
@@ -80,8 +82,8 @@ def run() -> Demo:
                       list(zip(RESIDUALS, ("stop", "go on"), left, slopes, lasts, again, strict=True)))],
         plots=[Plot("separation", "Distance of the two runs", "step", "|difference of heights| (m)",
                     (Series("", np.arange(1, STEPS + 1), apart),), y_scale="log",
-                    caption="8e-6 m before the decision, thirty times that after it; where a contact begins "
-                    "a step earlier in one run the distance jumps.")],
+                    caption="The distance is 8e-6 m before the decision, and thirty times as large "
+                    "after it. If a contact begins a step earlier in one run, the distance jumps.")],
         in_md=(
 "If a minimizer, SHAKE or a self-consistent field stops one iteration earlier, the "
 "positions differ, and a list that is built from them may contain another pair."

@@ -67,12 +67,13 @@ def run() -> Demo:
 "load?"
 ),
         result=f"dx/dp is infinite at p = 0 and {plain[1]:.2f} at 8e-6. A regularization of {spring:g} in "
-        f"the linear solve gives half of that, and {solved[spring][-1]:.2f} at p = 0: one over the number "
-        "chosen.",
-        answer="1 - dG/dx = 3 x^2 is what the linear system divides by. A stiffness added to that system "
-        "alone gives a finite number that is the derivative of nothing. Added to the energy it gives the "
-        "true derivative of another problem, whose bead rests elsewhere. At p = 0 both are one over the "
-        f"stiffness. The iterations are no way out: after {ITERATIONS} of them x is still {x:.4f}, and their "
+        f"the linear solve halves the value at 8e-6, and gives {solved[spring][-1]:.2f} at p = 0, the "
+        f"inverse of the regularization.",
+        answer=f"The linear system divides by 1 - dG/dx = 3 x^2. If a stiffness is added to this system "
+        f"alone, the result is a finite number, but not the derivative of any problem. If the stiffness "
+        f"is added to the energy, the result is the exact derivative of another problem, in which the "
+        f"bead rests at another position. At p = 0 both results are the inverse of the stiffness. "
+        f"Iterations do not help: after {ITERATIONS} iterations x is still {x:.4f}, and their "
         f"derivative is {slope / ITERATIONS:.2f} times their number.",
         numbers={
             "derivative": plain[:-1], "half": half, "at_zero": {f"{a:g}": s[-1] for a, s in solved.items()},
@@ -80,15 +81,18 @@ def run() -> Demo:
             "slope_of_iterations": slope, "derivative_of_max_at_kink": kink,
         },
         checks=[
-            Claim("before the singular point the implicit derivative is right", plain[1], "833.33 to 1e-12",
+            Claim("away from the singular point the implicit derivative is correct", plain[1], "833.33 "
+                "to 1e-12",
                   bool(np.isclose(plain[1], exact[1], rtol=1e-12))),
             Claim("at it there is none", plain[-1], "inf", plain[-1] == np.inf),
             Claim("a stiffness of 3 x^2 in the solve halves it", half, "0.5", abs(half - 0.5) < 1e-12),
-            Claim("a spring in the energy has its own derivative", moved[spring][1], f"{real:.6g} to 1e-5",
+            Claim("with a spring in the energy the derivative is that of the changed problem",
+                  moved[spring][1], f"{real:.6g} to 1e-5",
                   abs(moved[spring][1] / real - 1) < 1e-5),
-            Claim("at p = 0 both are 1 / stiffness", ends, f"{1 / spring:.2f}",
+            Claim("at p = 0 both results are 1 / stiffness", ends, f"{1 / spring:.2f}",
                   bool(np.allclose(ends, 1 / spring, rtol=1e-9))),
-            Claim("at the kink of max(0, p), where no derivative exists, JAX says", kink, "1/2", kink == 0.5),
+            Claim("at the kink of max(0, p), where no derivative exists, JAX returns", kink, "1/2",
+                  kink == 0.5),
         ],
         tables=[table("dx/dp", ("p", "condition number", "refused", "exact", "implicit", *(
             f"{a:g} in the {what}" for what in ("solve", "energy") for a in ADDED)), list(zip(
@@ -97,7 +101,8 @@ def run() -> Demo:
             Series("exact", np.array(LOADS[:-1]), np.array(exact[:-1]), "line+points", "ink"),
             *(Series(f"{a:g} in the solve", np.array(LOADS[:-1]), np.array(solved[a][:-1]), "line", role)
               for a, role in zip(ADDED, ("first", "second", "third"), strict=True)),
-        ), x_scale="log", y_scale="log", caption="Each regularization ends at one over itself.")],
+        ), x_scale="log", y_scale="log", caption="At p = 0 each regularized derivative is the inverse "
+            "of the regularization.")],
         in_md=(
 "For a structure with a soft mode, the smallest eigenvalue of the Hessian vanishes, and "
 "the derivatives of all relaxed positions diverge. A Tikhonov term hides this problem, "

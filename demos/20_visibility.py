@@ -71,14 +71,14 @@ def run() -> Demo:
 "A ball is thrown up behind an edge of 1 m. At which speed is it visible for half a "
 "second?"
 ),
-        result=f"Thrown at {best:.4f} m/s the ball is seen for half a second. Counted in steps the time "
-        "seen has the derivative 0 everywhere (exact: "
-        f"{exact:.4f} s per m/s); softened over {wide:g} m it leads to {found[wide]:.3f} m/s, the answer to "
-        "another question.",
-        answer="A step in which the ball is above the edge counts, one below does not: no derivative passes "
-        f"through the decision. The time of each crossing has one, and the two add up to {moved:.4f}. A "
-        "sigmoid has a slope even where the ball is never seen, which is what starts an optimizer, and moves "
-        f"the optimum by {moves[WIDTHS[0]]:.3f} to {moves[WIDTHS[-1]]:.3f} m/s for widths of {WIDTHS[0]:g} "
+        result=f"A ball thrown at {best:.4f} m/s is visible for half a second. If the visible time is "
+        f"counted in steps, its derivative is 0 everywhere (exact: {exact:.4f} s per m/s); if it is "
+        f"smoothed over {wide:g} m, the optimum is {found[wide]:.3f} m/s, the solution of another problem.",
+        answer=f"The visible time counts the steps in which the ball is above the edge, and this "
+        f"decision has no derivative. The times of the two crossings have derivatives, which add up to "
+        f"{moved:.4f}. A sigmoid has a slope even if the ball is never visible, so that an optimizer "
+        f"can start, but it moves the optimum by {moves[WIDTHS[0]]:.3f} to {moves[WIDTHS[-1]]:.3f} m/s "
+        f"for widths of {WIDTHS[0]:g} "
         f"to {WIDTHS[-1]:g} m.",
         numbers={
             "best": best, "derivative": exact, "derivative_by_crossings": moved, "slope_counted": hard,
@@ -91,19 +91,20 @@ def run() -> Demo:
             Claim("neither is within rounding", int(ledger.ambiguous.sum()), "0", not ledger.ambiguous.any()),
             Claim("the count has no derivative", hard, "exactly 0", not np.any(hard)),
             Claim("the crossings have it", moved, f"{exact:.4f} to 1 %", abs(moved / exact - 1) < 0.01),
-            Claim("the time seen is right within two steps", time, f"{total:.4f} ± {2 * H:g}",
+            Claim("the visible time is correct within two steps", time, f"{total:.4f} ± {2 * H:g}",
                   abs(time - total) <= 2 * H),
-            Claim("the wider, the more the optimum moves", list(moves.values())[1:], "increasing",
+            Claim("a larger width moves the optimum further", list(moves.values())[1:], "increasing",
                   bool(np.all(np.diff(list(moves.values())[1:]) > 0))),
         ],
         tables=[table("softened by a sigmoid", ("width (m)", "optimum (m/s)", "moved by", "slope at 4.2 m/s",
                                                "slope at 5 m/s"),
                       [(w, found[w], moves[w], *slopes[w]) for w in lost])],
-        plots=[Plot("loss", "Squared miss of half a second", "speed (m/s)", "loss (s²)", tuple(
+        plots=[Plot("loss", "Squared difference from half a second", "speed (m/s)", "loss (s²)", tuple(
             Series(f"width {w:g} m" if w else "counted", SPEEDS, lost[w][0], "line", role)
             for w, role in zip((0.0, *WIDTHS[1:]), ("ink", "first", "second", "third"), strict=True)),
-            verticals=((best, "exact"),), caption="Counted in steps the loss is flat where nothing is "
-            "seen and a staircase elsewhere. Softened it has a slope everywhere, its minimum elsewhere.")],
+            verticals=((best, "exact"),), caption="Counted in steps, the loss is flat if the ball is "
+                "never visible, and a staircase elsewhere. The smoothed loss has a slope everywhere, "
+                "and another minimum.")],
         in_md=(
 "A coordination number counts neighbors within a radius; its smooth version has a "
 "gradient, but is a different order parameter."

@@ -65,7 +65,7 @@ def run() -> Demo:
     needed = round((3 * MEAN / np.sqrt(3) / (MEAN - TOL)) ** 2)
     crossing = SAMPLES[int(np.argmax(rounding > sampling))]
     return Demo(
-        title="Which was it, the samples or the rounding?",
+        title="Sampling or rounding: which changed the decision?",
         question=(
 "A residual is the mean of random samples, summed in float16. What changes the stopping "
 "decision?"
@@ -75,31 +75,35 @@ f"With 1024 samples, another random key changes {by_key[3]} of {PAIRS} decisions
 f"another order of the sum changes {by_order[3]}. With {crossing} samples rounding is the "
 "larger error: every run stops, with a wrong result."
 ),
-        answer="Run twice more, each time with one of the two changed, and the flip says whose it was. "
-        f"Sampling falls as one over the root of the number: {needed:,} samples put the margin of "
-        f"{MEAN - TOL:.0e} three standard errors away. Rounding grows with the number, because a running "
-        "sum that has become large absorbs what is added; no number of float16 samples decides this.",
+        answer=f"Make two more runs, in each of which only the key or only the order is changed; the "
+        f"run with the flip identifies the cause. The sampling error decreases as one over the square "
+        f"root of the number of samples: {needed:,} samples put the margin of "
+        f"{MEAN - TOL:.0e} three standard errors away. The rounding error grows with the number of "
+        f"samples, because small terms are lost when they are added to a large running sum. No number "
+        f"of float16 samples gives the correct decision.",
         numbers={
             "flips_by_order": by_order, "flips_by_key": by_key, "rounding_exceeds_sampling_at": crossing,
             "samples_needed": needed, "sampling": sampling.tolist(), "rounding": rounding.tolist(),
             "stopped": stopped.tolist(),
         },
         checks=[
-            Claim("sampling falls as the root of the number", float(sampling[0] / sampling[-1]), "16 ± 1",
+            Claim("the sampling error decreases as the square root of the number",
+                  float(sampling[0] / sampling[-1]), "16 ± 1",
                   bool(abs(sampling[0] / sampling[-1] - 16) < 1)),
-            Claim("with few samples nearly every flip is the key's", by_order[0], "below 1 %",
+            Claim("with few samples nearly every flip is caused by the key", by_order[0], "below 1 %",
                   by_order[0] < 0.01 * PAIRS),
-            Claim("with many all runs agree and are wrong", float(stopped[-1]), "1", bool(stopped[-1] == 1)),
+            Claim("with many samples all runs agree and are wrong", float(stopped[-1]), "1",
+                  bool(stopped[-1] == 1)),
         ],
         tables=[table(f"of {PAIRS} pairs of runs", (
             "samples", "order flips", "key flips", "both flip", "by the key", "by the order", "by either "
             "or both",
             "sampling error", "rounding error", "share that stops"), rows)],
-        plots=[Plot("errors", "Error of the residual against the number of samples", "samples", "error (m)", (
+        plots=[Plot("errors", "Error of the residual over the number of samples", "samples", "error (m)", (
             Series("sampling", np.array(SAMPLES, float), sampling, "line+points"),
             Series("rounding", np.array(SAMPLES, float), rounding, "line+points", "bad"),
         ), x_scale="log", y_scale="log", horizontals=((MEAN - TOL, "margin"),),
-            caption="Where the curves cross, more samples stop helping.")],
+            caption="Beyond the crossing of the curves, more samples do not help.")],
         in_md=(
 "The noise of a thermostat and the order of a force sum both change the step at which a "
 "list is rebuilt; a run with the same noise and another order distinguishes them."

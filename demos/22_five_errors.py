@@ -60,13 +60,14 @@ f"The error of the height is {error:.1e} m, although the rounding error is {roun
 f"m and the discretization error {steps:.1e} m: in this run the two cancel. Five "
 "different quantities describe the errors of the run."
 ),
-        answer=f"Precision is {roundoff:.1e}, and it is the same for every run in float32. What the "
-        "roundings add up to is the distance from the same program in float64; what the step adds is the "
-        f"distance of that from the motion. h sqrt(k) is {100 * stability:.0f} % of its limit, so that "
-        f"neither grows; the motion itself multiplies a relative error of the start by {condition:.1f}. "
-        "Change one thing, and one number changes: float16 has another rounding error, a longer step "
-        "another discretization error, a step beyond the limit throws the ball up, and a start 2 cm above "
-        "the floor makes the same program 29 times as sensitive.",
+        answer=f"Precision is {roundoff:.1e}, and it is the same for every run in float32. The rounding "
+        f"error is the difference from the same program in float64. The discretization error is the "
+        f"difference of the float64 run from the exact motion. h sqrt(k) is {100 * stability:.0f} % of "
+        f"its limit, so that neither error grows; the motion itself multiplies a relative error of the "
+        f"initial height by {condition:.1f}. "
+        "If one setting is changed, mainly one number changes: float16 has another rounding error, a "
+        "longer step has another discretization error, a step beyond the limit makes the run unstable, "
+        "and a start 2 cm above the floor makes the same program 29 times as sensitive.",
         numbers={
             "precision": roundoff, "rounding": rounding, "discretization": steps, "stability": stability,
             "condition": condition, "error": error, "largest": largest,
@@ -80,15 +81,17 @@ f"m and the discretization error {steps:.1e} m: in this run the two cancel. Five
                   largest[HEAD[2]] == "five times the step"),
             Claim("the condition number is largest when", largest[HEAD[4]], "started 2 cm up",
                   largest[HEAD[4]] == "started 2 cm up"),
-            Claim("a step beyond the limit ruins the rest", thrown, "above 1 m", thrown > 1),
+            Claim("a step beyond the stability limit makes the other numbers meaningless", thrown,
+                  "above 1 m", thrown > 1),
         ],
-        tables=[table("one run, and one thing changed", ("run", *HEAD),
+        tables=[table("one run, and runs with one changed setting", ("run", *HEAD),
                       [(what, *values) for what, values in found.items()])],
-        plots=[Plot("errors", "Error of the height against the step", "h (s)", "error (m)", (
+        plots=[Plot("errors", "Error of the height over the step", "h (s)", "error (m)", (
             Series("discretization", h, runs["float64"][:, 2], "line+points", "ink"),
             Series("rounding, float32", h, runs["float32"][:, 1], "line+points"),
             Series("rounding, float16", h, runs["float16"][:, 1], "line+points", "bad"),
-        ), x_scale="log", y_scale="log", caption="A shorter step lowers one error and raises the other.")],
+        ), x_scale="log", y_scale="log", caption="A shorter step reduces the discretization error and "
+            "increases the rounding error.")],
         in_md=(
 "The five quantities of a simulation are its dtype, the difference from a reference "
 "code, half of dt times the fastest frequency, the growth of a displacement, and the "
