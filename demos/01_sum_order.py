@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import ml_dtypes
 import numpy as np
+from numpy.typing import DTypeLike
 
 from mdnum.ball import BallRun, GlobalSum, Projection, SemiImplicitEuler, World, simulate
+from mdnum.errors import InputError
 from mdnum.numerics.reductions import BY_NAME
 from mdnum.numerics.roles import RolePrecision
-from mdnum.numerics.sums import Reduction, RunningSum, running_sum_table
+from mdnum.numerics.sums import Reduction
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 #: The tolerance, and five penetrations (m) whose exact sum it is: one just below it and four that are each
@@ -20,6 +27,108 @@ TOL = 2.0**-10
 LARGE = TOL - 2.0**-21
 SMALL = 2.0**-23
 TERMS = np.array([LARGE, SMALL, SMALL, SMALL, SMALL], np.float16)
+
+
+@dataclass(frozen=True)
+class Addition:
+    """One addition in the history of a sum."""
+
+    term: str  # index of the term that was added
+    addend: float  # what was added to the accumulator
+    running: float  # the accumulator afterwards
+    exact: Fraction  # the sum of the terms so far
+    # binary digits of the exact result of this addition below the last place that was kept; 0 where the
+    # addition was exact
+    bits_lost: int
+    absorbed: bool  # a nonzero addend left no trace
+
+
+@dataclass(frozen=True)
+class RunningSum:
+    """A sum with its history."""
+
+    dtype: str  # of the terms and of the accumulator
+    rows: tuple[Addition, ...]  # one per addition
+    result: float  # the last running sum
+    exact: Fraction  # the sum of the terms
+
+    @property
+    def error(self) -> float:
+        """Result minus exact sum, rounded to float64."""
+        return float(Fraction(self.result) - self.exact)
+
+    @property
+    def bits_lost(self) -> int:
+        """Number of bits lost in all additions."""
+        return sum(row.bits_lost for row in self.rows)
+
+    columns = ("term", "addend", "running sum", "exact sum", "bits lost")
+
+    def table(self) -> tuple[tuple[Any, ...], ...]:
+        """Return plain rows under `columns`, with exact sums rounded to float64."""
+        return tuple(
+            (row.term, row.addend, row.running, float(row.exact), row.bits_lost) for row in self.rows
+        )
+
+
+def running_sum_table(terms: Any, dtype: DTypeLike | None = None) -> RunningSum:
+    """Return the history of a sum, term after term.
+
+    The exact sum stands next to the running sum, because every float is a rational number. The last row has
+    the bits that the sequential reduction gives inside jit, except that XLA on a CPU flushes subnormals of
+    every dtype but float16 to zero, and the host keeps them.
+
+    Args:
+        terms: the numbers, shape (n,).
+        dtype: terms are rounded to this dtype first; None keeps the dtype of the terms.
+
+    Raises:
+        InputError: there are no terms, or a number is not finite.
+    """
+    terms = np.asarray(terms)
+    terms = terms.astype(np.dtype(dtype) if dtype is not None else terms.dtype)
+    if terms.ndim != 1 or len(terms) == 0:
+        raise InputError(
+            f"the terms have shape {terms.shape}",
+            remedy="Give a one-dimensional array with at least one term.",
+        )
+    if not np.isfinite(terms.astype(np.float64)).all():
+        raise InputError("a term is not finite, so partial sums cannot be recorded")
+    with np.errstate(all="ignore"):
+        rows = tuple(_additions(terms))
+    exact = sum((Fraction(float(t)) for t in terms), Fraction(0))
+    return RunningSum(str(terms.dtype), rows, rows[-1].running, exact)
+
+
+def _place(x: Any) -> int:
+    """Return the exponent of the last place of a float: x is a multiple of 2^place."""
+    info = ml_dtypes.finfo(x.dtype)
+    exponent = math.frexp(float(x))[1] - 1 if x else info.minexp
+    return max(exponent, int(info.minexp)) - info.nmant
+
+
+def _lost(true: Fraction, kept: Fraction, place: int) -> int:
+    numerator = abs(true.numerator)
+    # the exponent of the lowest binary digit of a dyadic rational
+    lowest = (numerator & -numerator).bit_length() - true.denominator.bit_length()
+    return 0 if true == kept else max(1, place - lowest)
+
+
+def _additions(terms: np.ndarray) -> Iterator[Addition]:
+    total, exact = terms.dtype.type(0), Fraction(0)
+    for k, term in enumerate(terms):
+        new = total + term
+        true = Fraction(float(total)) + Fraction(float(term))
+        exact += Fraction(float(term))
+        yield Addition(
+            str(k),
+            float(term),
+            float(new),
+            exact,
+            _lost(true, Fraction(float(new)), _place(new)) if np.isfinite(new) else 0,
+            bool(new == total and term != 0),
+        )
+        total = new
 
 
 def solve(penetrations: np.ndarray, reduction: Reduction) -> BallRun:

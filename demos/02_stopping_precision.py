@@ -1,4 +1,4 @@
-"""Penetrations sum to the tolerance, so the dtype of the sum decides whether a solver iterates."""
+"""A batch whose penetrations sum to the tolerance: the dtype of the sum decides whether the loop runs."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from mdnum.gradients.ball import ThroughIterations
 from mdnum.gradients.problem import Gradient
 from mdnum.numerics.roles import ALL, RolePrecision
 from mdnum.numerics.rounding import neighbor
-from mdnum.numerics.sums import Reduction, RunningSum, Sequential, running_sum_table
-from mdnum.verbs.demos import Claim, Demo, Plot, Series, Table, table
+from mdnum.numerics.sums import Reduction, Sequential
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, Table, load, table
 
 K = ALPHA = 0.5
 STEPS, MAX_ITER, TOL, SMALL = 4, 25, 1e-3, 8
@@ -31,22 +31,21 @@ FORMATS = ("bfloat16", "float16")
 
 
 def boundary_batch(dtype: str, tol: float = TOL, small: int = SMALL) -> tuple[float, np.ndarray]:
-    """Return penetrations that sum to a tolerance exactly, but to less than the tolerance in a narrow dtype.
+    """Penetrations that sum to a tolerance in exact arithmetic and stay below it in a narrow one.
 
-    The first penetration is the number just below the tolerance. The other penetrations share the difference:
-    each is less than half a unit in the last place of the first, so a sum in this dtype that starts with the
-    first penetration does not change.
+    One is the float below the tolerance, the others share the gap: each is less than half a unit in the last
+    place of the first, so that a sum in this dtype which starts with the first never notices them.
 
     Args:
         dtype: a name such as "bfloat16".
         tol: m, rounded to the dtype.
-        small: number of penetrations that share the difference; a power of 2 keeps the sum exact.
+        small: how many share the gap; a power of 2 keeps the sum exact.
 
     Returns:
-        the rounded tolerance, and the penetrations in float64, shape (small + 1,).
+        the tolerance as rounded, and the penetrations in float64, shape (small + 1,).
 
     Raises:
-        InputError: the dtype cannot represent the difference or a share of the difference.
+        InputError: the gap, or its share, is no number of the dtype.
     """
     kind = ALL[dtype]
     limit = np.asarray(tol, kind)[()]
@@ -61,10 +60,10 @@ def boundary_batch(dtype: str, tol: float = TOL, small: int = SMALL) -> tuple[fl
 
 
 def problem(dtype: str, policy: RolePrecision, reduction: Reduction = Sequential()) -> BallProblem:
-    """Return the problem of a batch at the boundary of a dtype, with four steps without gravity.
+    """The batch on the boundary of a dtype, four steps without gravity.
 
     Args:
-        dtype: dtype of the boundary at which the batch lies.
+        dtype: whose boundary the batch lies on.
         policy: dtype by role.
         reduction: order of the residual's sum.
     """
@@ -75,10 +74,9 @@ def problem(dtype: str, policy: RolePrecision, reduction: Reduction = Sequential
 
 
 def policies(dtype: str) -> dict[str, RolePrecision]:
-    """Return the three compared policies: wide, narrow with a narrow sum, narrow with a wide sum.
+    """The three that are compared: wide, narrow with a narrow sum, narrow with a wide sum.
 
-    All policies compute the loss in float32 from their positions, because a loss of sixteen bits would be
-    rounded.
+    All take the loss in float32 of what positions they have: a loss of sixteen bits would be rounded itself.
     """
     wide = "float32"
     return {
@@ -90,7 +88,7 @@ def policies(dtype: str) -> dict[str, RolePrecision]:
 
 @dataclass(frozen=True)
 class Row:
-    """Record of one run, and the derivative of its loss with respect to the gain."""
+    """One run: its record and its derivative by the gain."""
 
     dtype: str
     name: str
@@ -104,12 +102,12 @@ class Row:
 
     @property
     def contact(self) -> int | None:
-        """First step (from 1) in which a ball touches the floor; None if no ball touches it."""
+        """First step (from 1) in which a ball touches the floor; None where none does."""
         touched = self.run.first_contact[self.run.first_contact > 0]
         return int(touched.min()) if len(touched) else None
 
     def data(self) -> dict[str, Any]:
-        """Return plain values for `--json`."""
+        """Plain values for `--json`."""
         assert self.run.history is not None
         first = self.run.history[0].astype(np.float64)
         return {
@@ -127,7 +125,7 @@ class Row:
 
 
 def measure(dtype: str) -> list[Row]:
-    """Make the three runs for one narrow dtype."""
+    """The three runs of one narrow dtype."""
     rows = []
     for name, policy in policies(dtype).items():
         posed = problem(dtype, policy)
@@ -137,7 +135,7 @@ def measure(dtype: str) -> list[Row]:
 
 
 def exact(dtype: str) -> tuple[list[float], float]:
-    """Return the exact losses after 0 and 1 iterations, and the derivative with respect to the gain."""
+    """Losses of no iteration and of one, and the derivative by the gain of one, in exact arithmetic."""
     _, depths = boundary_batch(dtype)
     squares = sum(Fraction(float(depth)) ** 2 for depth in depths) / len(depths)
     share = 1 - Fraction(ALPHA) * Fraction(K)
@@ -145,7 +143,7 @@ def exact(dtype: str) -> tuple[list[float], float]:
 
 
 def run() -> Demo:
-    """Compare three precisions in two formats, and loss scaling for the run whose derivative underflows."""
+    """Three precisions in two formats, and loss scaling for the one whose derivative underflows."""
     rows = {dtype: measure(dtype) for dtype in FORMATS}
     half = rows["float16"][2]
     posed = problem("float16", policies("float16")[half.name])
@@ -256,10 +254,11 @@ def run() -> Demo:
     )
 
 
-def _sums(dtype: str) -> tuple[RunningSum, RunningSum]:
-    """Return the sum of the residual in float32 and in the narrow dtype."""
+def _sums(dtype: str) -> tuple[Any, Any]:
+    """The history of the residual's sum in float32 and in the narrow dtype."""
     _, depths = boundary_batch(dtype)
-    return tuple(running_sum_table(depths, Sequential(), ALL[kind]) for kind in ("float32", dtype))  # type: ignore[return-value]
+    running_sum_table = load("sum-order").running_sum_table
+    return running_sum_table(depths, np.float32), running_sum_table(depths, ALL[dtype])
 
 
 def _table(rows: dict[str, list[Row]], truth: dict[str, float], scaled: Gradient) -> Table:
@@ -290,11 +289,11 @@ def _table(rows: dict[str, list[Row]], truth: dict[str, float], scaled: Gradient
     return table("Three precisions on two boundaries", columns, tuple(lines))
 
 
-def _running(dtype: str, history: RunningSum) -> Table:
+def _running(dtype: str, history: Any) -> Table:
     return table(f"The fragile sum in {dtype}, addition by addition", history.columns, history.table())
 
 
-def _sum_plot(sums: dict[str, tuple[RunningSum, RunningSum]]) -> Plot:
+def _sum_plot(sums: dict[str, tuple[Any, Any]]) -> Plot:
     series = []
     roles: tuple[tuple[str, Any, Any], ...] = (("bfloat16", "second", "first"), ("float16", "third", "bad"))
     for dtype, wide, narrow in roles:

@@ -16,10 +16,29 @@ from jaxtyping import Array, Bool, Float, Int, Int8
 
 from mdnum.ball.stopping import Reason
 from mdnum.errors import InputError
-from mdnum.numerics.formats import matmul
+from mdnum.numerics.formats import format_of, round_to
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 Vector = Float[Array, "n"]
+
+
+def matmul(
+    a: Float[Array, "... m k"], b: Float[Array, "... k n"], name: str = "float32"
+) -> Float[Array, "... m n"]:
+    """Emulate a device's matrix product: inputs in one format, products and sums in a wider one.
+
+    With "float64" and "float32", everything is in this type. With "tf32", "bfloat16" and "float16", the
+    inputs are rounded to the format, products are exact, and sums are in float32. The result has the dtype of
+    the first matrix.
+
+    Error: at most (2u + gamma_k) |a| |b| with the format's u and float32's gamma. The sums use the order of
+    the CPU's own product, which differs from that of a device.
+    """
+    format_of(name)
+    if name == "float64":
+        return jnp.matmul(a.astype(jnp.float64), b.astype(jnp.float64)).astype(a.dtype)
+    a32, b32 = (round_to(q, name).astype(jnp.float32) for q in (a, b))
+    return jnp.matmul(a32, b32, precision=lax.Precision.HIGHEST).astype(a.dtype)
 
 
 class Solution(NamedTuple):

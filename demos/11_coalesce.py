@@ -5,13 +5,59 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
-from mdnum.numerics.reductions import Exact, FixedPoint, orders, scatter_add, segment_sum
-from mdnum.numerics.sums import Sequential
+from mdnum.errors import InputError
+from mdnum.numerics.reductions import Exact, FixedPoint
+from mdnum.numerics.sums import Reduction, Sequential
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 #: Contacts, the floor panels that they load, and the orders in which they may be stored.
 CONTACTS, PANELS, ORDERS = 96, 6, 1000
+
+
+def segment_sum(
+    values: Float[Array, "entries ..."],
+    index: Int[np.ndarray, "entries"],
+    segments: int,
+    reduction: Reduction = Sequential(),
+) -> Float[Array, "segments ..."]:
+    """Sum each segment in the order of a reduction, rounding after every addition.
+
+    Args:
+        values: the entries.
+        index: segment of each entry, known (not traced), not necessarily sorted.
+        segments: number of segments.
+        reduction: applied to each segment's entries in storage order.
+
+    Raises:
+        InputError: an index outside 0 ... segments - 1.
+    """
+    index = np.asarray(index)
+    if len(index) and not (index.min() >= 0 and index.max() < segments):
+        raise InputError(f"a segment index is outside the range 0 to {segments - 1}")
+    order = np.argsort(index, kind="stable")
+    counts = np.bincount(index, minlength=segments)
+    starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    place = np.arange(len(index)) - np.repeat(starts, counts)
+    shape = (int(counts.max(initial=0)), segments, *values.shape[1:])
+    # shorter segments end in minus zeros, which change no sum and no sign
+    side_by_side = jnp.full(shape, -0.0, values.dtype).at[place, index[order]].set(values[order])
+    return reduction(side_by_side)
+
+
+def scatter_add(
+    values: Float[Array, "entries ..."], index: Int[Array, "entries"], segments: int
+) -> Float[Array, "segments ..."]:
+    """Sum each segment by XLA's scatter: in storage order on a CPU, in any order on a device."""
+    return jnp.zeros((segments, *values.shape[1:]), values.dtype).at[index].add(values)
+
+
+def orders(entries: int, count: int, seed: int = 0) -> list[Int[np.ndarray, "entries"]]:
+    """Return storage orders to test: as given, reversed, and random orders up to `count` in total."""
+    rng = np.random.default_rng(seed)
+    given = np.arange(entries)
+    return [given, given[::-1], *(rng.permutation(entries) for _ in range(count - 2))][:count]
 
 
 def contacts() -> tuple[np.ndarray, np.ndarray]:

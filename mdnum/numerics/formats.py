@@ -1,4 +1,4 @@
-"""Emulation of floating-point formats: rounding, matrix products and loss scaling.
+"""Emulation of floating-point formats: rounding and loss scaling.
 
 The emulation reproduces the rounding of a format, not its speed. Some devices use TF32 for float32 matrix
 products by default: the inputs keep 10 of 23 fraction bits, and the sums are in float32.
@@ -52,11 +52,6 @@ class FloatFormat:
     def smallest_subnormal(self) -> float:
         """The smallest positive number, which is also the spacing below the smallest normal number."""
         return 2.0 ** (self.emin + 1 - self.significand)
-
-    @property
-    def unit_roundoff(self) -> float:
-        """The largest relative error of one rounding to the nearest number."""
-        return 2.0**-self.significand
 
 
 FORMATS: Mapping[str, FloatFormat] = {
@@ -121,25 +116,6 @@ def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
     return _rounded(x, name, jnp.rint)
 
 
-def matmul(
-    a: Float[Array, "... m k"], b: Float[Array, "... k n"], name: str = "float32"
-) -> Float[Array, "... m n"]:
-    """Emulate a device's matrix product, with inputs in one format and sums in a wider format.
-
-    With the formats "float64" and "float32", inputs, products and sums are in the same format. With "tf32",
-    "bfloat16" and "float16", inputs are rounded to the format, products are exact, and sums are in float32.
-    The result has the dtype of the first matrix.
-
-    Error: at most (2u + gamma_k) |a| |b| with the unit roundoff u of the format and gamma_k of float32. The
-    order of summation is that of the CPU, which differs from the order on a device.
-    """
-    format_of(name)
-    if name == "float64":
-        return jnp.matmul(a.astype(jnp.float64), b.astype(jnp.float64)).astype(a.dtype)
-    a32, b32 = (round_to(q, name).astype(jnp.float32) for q in (a, b))
-    return jnp.matmul(a32, b32, precision=lax.Precision.HIGHEST).astype(a.dtype)
-
-
 def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Array, "..."]:
     """Round x stochastically to one of the two nearest numbers of a format, with x as expectation.
 
@@ -155,28 +131,6 @@ def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Arr
         return below + up.astype(jnp.float64)
 
     return _rounded(x, name, up_or_down)
-
-
-@jax.custom_jvp
-def quantize(
-    x: Float[Array, "..."],
-    scale: Float[Array, ""],
-    lowest: Float[Array, ""],
-    highest: Float[Array, ""],
-) -> Float[Array, "..."]:
-    """Return the multiple of `scale` nearest to x, between `lowest` * `scale` and `highest` * `scale`.
-
-    The derivative is 1 in this range and 0 elsewhere. In the range, the error is at most scale/2 plus a
-    rounding.
-    """
-    return jnp.clip(jnp.rint(x / jnp.broadcast_to(scale, x.shape)), lowest, highest) * scale
-
-
-@quantize.defjvp
-def _quantize_jvp(primals, tangents):
-    x, scale, lowest, highest = primals
-    inside = (x >= lowest * scale) & (x <= highest * scale)
-    return quantize(*primals), jnp.where(inside, tangents[0], jnp.zeros_like(x))
 
 
 # --- loss scaling -----------------------------------------------------------------------------------------

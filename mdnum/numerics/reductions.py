@@ -1,4 +1,4 @@
-"""Sums that do not depend on the order of the terms, sums over segments, and all summation orders by name.
+"""Sums that do not depend on the order of the terms, and all summation orders by name.
 
 A finite float is an integer multiple of its format's smallest subnormal number. The exact sum adds these
 integers in a long accumulator (Kulisch & Miranker 1986), stored as 32-bit limbs in int64, and rounds once.
@@ -195,52 +195,3 @@ REDUCTIONS.add(
 parse = REDUCTIONS.parse
 #: Built-in orders with their default options.
 BY_NAME = {name: parse(name) for name in REDUCTIONS.shipped}
-
-
-# --- segments: sums that frameworks make behind one's back ----------------------------------------------
-
-
-def segment_sum(
-    values: Float[Array, "entries ..."],
-    index: Int[np.ndarray, "entries"],
-    segments: int,
-    reduction: Reduction = Sequential(),
-    zero: Int[Array, ""] | None = None,
-) -> Float[Array, "segments ..."]:
-    """Sum the entries of each segment in a given summation order, with rounding after every addition.
-
-    Args:
-        values: the entries.
-        index: segment of each entry, known (not traced), not necessarily sorted.
-        segments: number of segments.
-        reduction: applied to each segment's entries in storage order.
-        zero: see `Reduction`.
-
-    Raises:
-        InputError: an index outside 0 ... segments - 1.
-    """
-    index = np.asarray(index)
-    if len(index) and not (index.min() >= 0 and index.max() < segments):
-        raise InputError(f"a segment index is outside the range 0 to {segments - 1}")
-    order = np.argsort(index, kind="stable")
-    counts = np.bincount(index, minlength=segments)
-    starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
-    place = np.arange(len(index)) - np.repeat(starts, counts)
-    shape = (int(counts.max(initial=0)), segments, *values.shape[1:])
-    # shorter segments end in minus zeros, which change no sum and no sign
-    side_by_side = jnp.full(shape, -0.0, values.dtype).at[place, index[order]].set(values[order])
-    return reduction(side_by_side, zero)
-
-
-def scatter_add(
-    values: Float[Array, "entries ..."], index: Int[Array, "entries"], segments: int
-) -> Float[Array, "segments ..."]:
-    """Sum each segment by XLA's scatter operation: in storage order on a CPU, in any order on a GPU."""
-    return jnp.zeros((segments, *values.shape[1:]), values.dtype).at[index].add(values)
-
-
-def orders(entries: int, count: int, seed: int = 0) -> list[Int[np.ndarray, "entries"]]:
-    """Return `count` storage orders for tests: the given order, the reversed order, and random orders."""
-    rng = np.random.default_rng(seed)
-    given = np.arange(entries)
-    return [given, given[::-1], *(rng.permutation(entries) for _ in range(count - 2))][:count]

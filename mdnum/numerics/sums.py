@@ -1,4 +1,4 @@
-"""Summation orders, their error bounds, and the record of all additions in a sum.
+"""Summation orders and their error bounds.
 
 A summation order is used in two ways. The force loop of molecular dynamics passes blocks of terms, and a
 partial sum is carried from block to block, so that the terms of a whole neighbor list are never stored at
@@ -12,20 +12,16 @@ The derivative of every sum is that of the exact sum, because rounding and order
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import ml_dtypes
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
-from numpy.typing import DTypeLike
 
 from mdnum.errors import InputError
 from mdnum.numerics.exact import fence, integer_of
@@ -117,16 +113,8 @@ def in_order(terms, add, start=None):
     return total
 
 
-class Serial(Reduction):
-    """Base class of summation orders in which terms are added one after another to one accumulator."""
-
-    def places(self, terms: np.ndarray) -> list[int]:
-        """Return the indices of terms, shape (n,), in the order of the additions."""
-        raise NotImplementedError(type(self).__name__)
-
-
 @dataclass(frozen=True)
-class Sequential(Serial):
+class Sequential(Reduction):
     """A sum in forward or reversed order. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4)."""
 
     # "forward" (left to right, as a loop does) or "reversed"
@@ -147,10 +135,6 @@ class Sequential(Serial):
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """Add the terms one after the other, starting from zero."""
         return in_order(terms[::-1] if self.order == "reversed" else terms, add)
-
-    def places(self, terms: np.ndarray) -> list[int]:
-        """Return the indices of the terms in ascending order, or in descending order if reversed."""
-        return list(range(len(terms)))[:: -1 if self.order == "reversed" else 1]
 
 
 def _tree(terms: list[jax.Array]) -> jax.Array:
@@ -221,18 +205,14 @@ class Pairwise(Blocked):
 
 
 @dataclass(frozen=True)
-class Permuted(Serial):
+class Permuted(Reduction):
     """A sequential sum in a random order: a reproducible model of atomic additions on a GPU."""
 
     seed: int = 0  # of the order; the same for every sum of as many terms
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """Add the terms in a random order, which depends only on the seed and the number of terms."""
-        return in_order(terms[np.array(self.places(terms))], add)
-
-    def places(self, terms: Any) -> list[int]:
-        """Return a random order of the terms, which depends only on the seed and the number of terms."""
-        return np.random.default_rng(self.seed).permutation(len(terms)).tolist()
+        return in_order(terms[np.random.default_rng(self.seed).permutation(len(terms))], add)
 
 
 @dataclass(frozen=True)
@@ -274,7 +254,7 @@ class Twice(Reduction):
 
 
 @dataclass(frozen=True)
-class Sorted(Serial):
+class Sorted(Reduction):
     """A sequential sum of terms sorted by magnitude and sign, so that the storage order does not matter.
 
     Ascending order has the smallest error if all terms have the same sign (Higham 2002, 4.2), and descending
@@ -287,12 +267,6 @@ class Sorted(Serial):
         """Sort the terms along the first axis, and add the terms in this order."""
         _, terms = lax.sort((jnp.abs(terms), terms), dimension=0, num_keys=2)
         return in_order(terms if self.order == "ascending" else terms[::-1], add)
-
-    def places(self, terms: np.ndarray) -> list[int]:
-        """Return the indices of the terms sorted by magnitude."""
-        wide = terms.astype(np.float64)
-        order = np.lexsort((wide, np.abs(wide))).tolist()
-        return order if self.order == "ascending" else order[::-1]
 
 
 # --- compensated: the rounding error of every addition is computed exactly and carried along ------------
@@ -351,118 +325,3 @@ class Neumaier(_Compensated):
 
         (total, lost), _ = lax.scan(step, _start(terms), terms, unroll=min(4, terms.shape[0]))
         return add(total, lost)
-
-
-# --- a sum, addition by addition -------------------------------------------------------------------------
-#
-# On the host and exact: every float is a rational number, so the true sum of the terms so far stands next
-# to the running sum. The arithmetic is that of the reduction in the dtype of the terms; the last row has
-# the bits that the reduction gives inside jit, with two exceptions. XLA on a CPU flushes subnormals of
-# every dtype but float16 to zero, the host keeps them. And the orders that stream in the force loop of
-# molecular dynamics (sequential, pairwise) add there products that XLA contracts into the sum, one rounding
-# less per term, so that their last digits may differ.
-
-
-@dataclass(frozen=True)
-class Addition:
-    """A single addition in the record of a sum."""
-
-    term: str  # index of the term that was added
-    addend: float  # what was added to the accumulator
-    running: float  # the accumulator afterwards
-    exact: Fraction  # the sum of the terms so far
-    # binary digits of the exact result of this addition below the last place that was kept; 0 where the
-    # addition was exact
-    bits_lost: int
-    absorbed: bool  # a nonzero addend left no trace
-
-
-@dataclass(frozen=True)
-class RunningSum:
-    """A sum and the record of all its additions."""
-
-    dtype: str  # of the terms and of the accumulator
-    reduction: Any  # the order
-    rows: tuple[Addition, ...]  # one per addition
-    result: float  # what the reduction gives
-    exact: Fraction  # the sum of the terms
-
-    @property
-    def error(self) -> float:
-        """Computed sum minus exact sum, rounded to float64."""
-        return float(Fraction(self.result) - self.exact)
-
-    @property
-    def bits_lost(self) -> int:
-        """Number of bits lost by rounding in all additions."""
-        return sum(row.bits_lost for row in self.rows)
-
-    columns = ("term", "addend", "running sum", "exact sum", "bits lost")
-
-    def table(self) -> tuple[tuple[Any, ...], ...]:
-        """Return a table of all additions, with the columns `columns`; exact sums are rounded to float64."""
-        return tuple(
-            (row.term, row.addend, row.running, float(row.exact), row.bits_lost) for row in self.rows
-        )
-
-
-def running_sum_table(
-    terms: Any, reduction: Reduction = Sequential(), dtype: DTypeLike | None = None
-) -> RunningSum:
-    """Return a sum in a given order, with the record of all its additions.
-
-    Args:
-        terms: the numbers, shape (n,).
-        reduction: a sequential order: sequential, reversed, permuted or sorted.
-        dtype: terms are rounded to this dtype first; None keeps the dtype of the terms.
-
-    Raises:
-        InputError: there are no terms, a term is not finite, or the summation order is not sequential.
-    """
-    terms = np.asarray(terms)
-    terms = terms.astype(np.dtype(dtype) if dtype is not None else terms.dtype)
-    if terms.ndim != 1 or len(terms) == 0:
-        raise InputError(
-            f"the terms have shape {terms.shape}",
-            remedy="Give a one-dimensional array with at least one term.",
-        )
-    if not np.isfinite(terms.astype(np.float64)).all():
-        raise InputError("a term is not finite, so partial sums cannot be recorded")
-    if not isinstance(reduction, Serial):
-        remedy = "Use the reduction sequential, reversed, permuted or sorted"
-        raise InputError(f"{reduction} is not a sequential loop over the terms", remedy=remedy)
-    with np.errstate(all="ignore"):
-        rows = tuple(_loop(terms, reduction.places(terms)))
-    exact = sum((Fraction(float(t)) for t in terms), Fraction(0))
-    return RunningSum(str(terms.dtype), reduction, rows, rows[-1].running, exact)
-
-
-def _place(x: Any) -> int:
-    """Return the exponent of the last place of a float x, such that the spacing of floats is 2^place."""
-    info = ml_dtypes.finfo(x.dtype)
-    exponent = math.frexp(float(x))[1] - 1 if x else info.minexp
-    return max(exponent, int(info.minexp)) - info.nmant
-
-
-def _lost(true: Fraction, kept: Fraction, place: int) -> int:
-    numerator = abs(true.numerator)
-    # the exponent of the lowest binary digit of a dyadic rational
-    lowest = (numerator & -numerator).bit_length() - true.denominator.bit_length()
-    return 0 if true == kept else max(1, place - lowest)
-
-
-def _loop(terms: np.ndarray, order: Sequence[int]) -> Iterator[Addition]:
-    total, exact = terms.dtype.type(0), Fraction(0)
-    for k in order:
-        new = total + terms[k]
-        true = Fraction(float(total)) + Fraction(float(terms[k]))
-        exact += Fraction(float(terms[k]))
-        yield Addition(
-            str(k),
-            float(terms[k]),
-            float(new),
-            exact,
-            _lost(true, Fraction(float(new)), _place(new)) if np.isfinite(new) else 0,
-            bool(new == total and terms[k] != 0),
-        )
-        total = new

@@ -9,9 +9,10 @@ from __future__ import annotations
 import ast
 import importlib.util
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Unpack
 
 import numpy as np
@@ -24,7 +25,7 @@ from mdnum.report.words import typeset
 from mdnum.verbs import frame
 from mdnum.verbs.frame import Keep, Outcome, Verb, View
 
-__all__ = ["Claim", "Demo", "Plot", "Region", "Series", "Table", "demonstrate", "names", "table"]
+__all__ = ["Claim", "Demo", "Plot", "Region", "Series", "Table", "demonstrate", "load", "names", "table"]
 
 TEXTS = Texts(__file__)
 #: Largest number of elements of a list that are printed; of longer lists, the first and last are printed.
@@ -91,7 +92,7 @@ def demonstrate(name: str, **keep: Unpack[Keep]) -> Outcome:
     done: dict[str, Demo] = {}
     for number, one in enumerate(asked):
         frame.say(keep.get("progress"), f"demonstration {one}", number, len(asked))
-        done[one] = load(one)()
+        done[one] = load(one).run()
     documents = [_document(one, demo) for one, demo in done.items()]
     with frame.answering("demos", f"demo-{name}", **keep) as answer:
         summary = documents[0] if name != "all" else {"demos": documents}
@@ -124,8 +125,8 @@ def about(name: str) -> str:
     return (text or "").partition("\n")[0].rstrip(".")
 
 
-def load(name: str) -> Callable[[], Demo]:
-    """Return the function that runs a demonstration.
+def load(name: str) -> ModuleType:
+    """Return the module of a demonstration, whose `run()` runs it.
 
     Raises:
         InputError: no demonstration has this name.
@@ -136,7 +137,7 @@ def load(name: str) -> Callable[[], Demo]:
     # a script's own classes look their module up by name
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.run
+    return module
 
 
 def _files() -> dict[str, Path]:

@@ -24,7 +24,7 @@ import pytest
 
 from mdnum.ball import Penalty, Reason, World
 from mdnum.errors import InputError
-from mdnum.numerics.reductions import Exact, orders
+from mdnum.numerics.reductions import Exact
 from mdnum.verbs import demos
 from mdnum.verbs.demos import Demo
 
@@ -34,7 +34,7 @@ G, H, E = 9.81, 0.01, 0.8
 @cache
 def script(name: str) -> SimpleNamespace:
     """Everything that a demonstration's file defines."""
-    return SimpleNamespace(**demos.load(name).__globals__)
+    return SimpleNamespace(**vars(demos.load(name)))
 
 
 #: By name: a mark of those that take their time, the relative tolerance of the numbers, and the numbers.
@@ -222,7 +222,7 @@ def coalesce(demo: Demo):
     own = script("coalesce")
     panel, load = own.contacts()
     seen = set()
-    for order in orders(len(load), own.ORDERS, seed=1):
+    for order in own.orders(len(load), own.ORDERS, seed=1):
         totals = np.zeros(own.PANELS, np.float32)
         for k in order:
             totals[panel[k]] += load[k]
@@ -276,7 +276,7 @@ OWN: dict[str, Callable[[Demo], Any]] = {
 )
 @pytest.mark.usefixtures("strangers_folder")
 def test_a_demonstration_shows_what_is_known(name: str):
-    demo = demos.load(name)()
+    demo = demos.load(name).run()
     assert [(claim.what, claim.seen) for claim in demo.checks if not claim.ok] == []
     assert demo.ok and demo.checks and demo.title and demo.answer and demo.in_md and demo.plots
     _, rel, known = KNOWN[name]

@@ -1,4 +1,4 @@
-"""Every order of a sum: against the same sum written out, exact rationals and math.fsum; and its history."""
+"""Every order of a sum: against the same sum written out, exact rationals and math.fsum."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rollout.harness import evaluated, liquid, listed, terms_of, write_system
 
 from mdnum.errors import InputError
 from mdnum.numerics.exact import zero_bits
-from mdnum.numerics.reductions import BY_NAME, Exact, FixedPoint, parse, scatter_add, segment_sum
+from mdnum.numerics.reductions import BY_NAME, Exact, FixedPoint, parse
 from mdnum.numerics.sums import (
     Blocked,
     Halves,
@@ -27,7 +27,6 @@ from mdnum.numerics.sums import (
     Sequential,
     Sorted,
     Twice,
-    running_sum_table,
 )
 from mdnum.systems import load
 from mdnum.systems.build import build
@@ -39,8 +38,6 @@ ENDS = [
     *(pytest.param(dtype, marks=pytest.mark.nightly) for dtype in (np.float32, np.float16)),
     ml_dtypes.bfloat16,
 ]
-#: Those that add one term after the other.
-LOOPS = ("sequential", "reversed", "permuted", "sorted")
 
 
 def loop(terms):
@@ -387,110 +384,6 @@ def test_every_sum_is_within_its_bound_and_some_do_not_depend_on_the_order_of_ar
         bound = FEW[name].bound(terms)
         assert np.isfinite(bound).all()
         assert (error <= bound).all(), name
-
-
-# --- the history of a sum: its last row has the bits of the program --------------------------------------
-
-TOL = np.float16(2.0**-10)
-SMALL = [np.float16(2.0**-23)] * 4
-LARGE = np.float16(2.0**-10 - 2.0**-21)
-
-
-@pytest.mark.parametrize("dtype", ENDS)
-def test_the_last_row_has_the_bits_of_the_program(dtype):
-    rng = np.random.default_rng(8)
-    terms = (rng.normal(size=(24, 16)) * 2.0 ** rng.integers(-5, 6, (24, 16))).astype(dtype)
-    totals = every_sum(jnp.asarray(terms))
-    for name in LOOPS:
-        for column in range(4):
-            history = running_sum_table(terms[:, column], BY_NAME[name])
-            assert history.result == float(totals[name][column]), name
-            exact = sum(Fraction(float(t)) for t in terms[:, column])
-            assert history.exact == exact
-            assert history.error == float(Fraction(history.result) - exact)
-            assert history.rows[-1].exact == exact
-
-
-def test_four_small_terms_after_a_large_one_leave_no_trace():
-    history = running_sum_table([LARGE, *SMALL], dtype=np.float16)
-    assert [row.running for row in history.rows] == [float(LARGE)] * 5
-    assert [row.absorbed for row in history.rows] == [False, True, True, True, True]
-    # 2^-23 below a last place of 2^-21: two binary digits each time
-    assert [row.bits_lost for row in history.rows] == [0, 2, 2, 2, 2]
-    assert history.exact == Fraction(2) ** -10
-    assert history.result < TOL
-    assert history.error == -(2.0**-21)
-    # small first, nothing is lost
-    history = running_sum_table([*SMALL, LARGE], dtype=np.float16)
-    assert [row.running for row in history.rows] == [2.0**-23, 2.0**-22, 3 * 2.0**-23, 2.0**-21, 2.0**-10]
-    assert history.bits_lost == history.error == 0
-
-
-def test_one_bit_lost_is_one_bit_lost():
-    for extra, lost in [(2.0**-24, 1), (2.0**-25, 2), (2.0**-24 + 2.0**-30, 7), (2.0**-23, 0)]:
-        assert running_sum_table([1.0, extra], dtype=np.float32).rows[1].bits_lost == lost
-
-
-def test_what_has_no_history_is_refused():
-    with pytest.raises(InputError, match=r"terms have shape \(0,\)"):
-        running_sum_table(np.zeros(0))
-    with pytest.raises(InputError, match="not finite"):
-        running_sum_table([1.0, math.inf])
-    with pytest.raises(InputError, match=r"^Exact\(\) .*sequential loop.*reversed"):
-        running_sum_table([1.0], BY_NAME["exact"])
-
-
-def test_the_table_has_a_row_for_each_addition():
-    assert running_sum_table(np.arange(1.0, 4.0)).table()[2] == ("2", 3.0, 6.0, 6.0, 0)
-
-
-# --- segments: sums behind one's back, against loops over the entries -------------------------------------
-
-
-def entries(count=200, segments=9, dtype=np.float64, seed=1):
-    rng = np.random.default_rng(seed)
-    return rng.integers(0, segments, count), rng.normal(size=count).astype(dtype)
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.float16, ml_dtypes.bfloat16])
-def test_segments_are_summed_in_storage_order(dtype):
-    index, values = entries(dtype=dtype)
-    expected = np.zeros(9, dtype)
-    for i, v in zip(index, values, strict=True):
-        expected[i] = expected[i] + v
-    seen = np.asarray(jax.jit(lambda v: segment_sum(v, index, 9))(jnp.asarray(values)))
-    assert seen.dtype == dtype
-    assert np.array_equal(seen, expected)
-    # on another device in any order
-    if dtype == np.float64 and jax.default_backend() == "cpu":
-        assert np.array_equal(np.asarray(jax.jit(scatter_add, static_argnums=2)(values, index, 9)), expected)
-
-
-@pytest.mark.parametrize("name", ["reversed", "kahan", "exact", "fixed-point"])
-def test_segments_are_summed_by_any_reduction(name):
-    index, values = entries()
-    seen = np.asarray(jax.jit(lambda v: segment_sum(v, index, 10, BY_NAME[name]))(jnp.asarray(values)))
-    assert seen[9] == 0  # a segment without entries
-    assert seen[3] == float(BY_NAME[name](jnp.asarray(values[index == 3])))
-    for k in range(9):
-        own = values[index == k]
-        assert abs(seen[k] - math.fsum(own)) <= BY_NAME[name].bound(own)
-
-
-def test_the_derivative_of_a_segment_sum_gathers():
-    index, values = entries(20, 4)
-    weights = jnp.arange(1.0, 5.0)
-
-    def weighted(v):
-        return jnp.sum(weights * segment_sum(v, index, 4, Exact()))
-
-    slope = jax.jit(jax.grad(weighted))(jnp.asarray(values))
-    assert np.array_equal(np.asarray(slope), np.arange(1.0, 5.0)[index])
-
-
-def test_entries_outside_are_refused():
-    with pytest.raises(InputError, match=r"outside the range 0 to 2"):
-        segment_sum(jnp.ones(2), np.array([0, 3]), 3)
 
 
 # --- sums inside the force loop of molecular dynamics ---------------------------------------------------
