@@ -15,7 +15,7 @@ from mdnum.ball import (
     first_difference,
     simulate,
 )
-from mdnum.numerics.rounding import neighbor, ordinal, ulp_distance
+from mdnum.numerics.rounding import neighbor, ordinal
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 H, STEPS = 0.01, 200
@@ -42,7 +42,7 @@ def adjacent(world: World, low: float, high: float, steps: int) -> tuple[float, 
 
     start = first(low)
     runs = 1
-    while (between := int(ulp_distance(low, high))) > 1:
+    while (between := int(ordinal(high) - ordinal(low))) > 1:
         middle = float(neighbor(low, between // 2))
         runs += 1
         if first(middle) == start:
@@ -70,7 +70,7 @@ def run() -> Demo:
         BallProblem(reset, y0, 0.0, STEPS).value_and_grad(["restitution"])[1]["restitution"]
         for y0 in (low, high)
     ]
-    apart = int(ulp_distance(low, high))
+    apart = int(ordinal(high) - ordinal(low))
     height = -parted.margins[0], -parted.margins[1]
     jump = H * abs(float(b.v[at - 1, 0]))
     return Demo(

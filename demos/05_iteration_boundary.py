@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 
 from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
-from mdnum.numerics.rounding import neighbor, ulp_distance
+from mdnum.numerics.rounding import neighbor, ordinal
 from mdnum.verbs.demos import Claim, Demo, Plot, Series, Table, table
 
 ALPHA, DEPTH, TOL = 0.5, 0.45, 1e-4
@@ -86,7 +86,7 @@ def teeth(low: float, high: float) -> list[tuple[float, float, int]]:
         low, high = stretches.pop()
         if count(low) == count(high):
             continue
-        if (between := int(ulp_distance(low, high))) > 1:
+        if (between := int(ordinal(high) - ordinal(low))) > 1:
             middle = float(neighbor(low, between // 2))
             stretches += [(middle, high), (low, middle)]
             continue
@@ -113,9 +113,9 @@ def run() -> Demo:
     found = [Tooth(side(low), side(high), runs) for low, high, runs in cells]
     one = min(found, key=lambda b: abs(b.above.at - 0.5035))
     below, above = one.below, one.above
-    ulps = [int(ulp_distance(b.below.at, b.above.at)) for b in found]
+    ulps = [int(ordinal(b.above.at) - ordinal(b.below.at)) for b in found]
     known = [exact(b.above.iterations) for b in found]
-    off = [abs(int(ulp_distance(b.above.at, k))) for b, k in zip(found, known, strict=True)]
+    off = [abs(int(ordinal(k) - ordinal(b.above.at))) for b, k in zip(found, known, strict=True)]
     ends = (grid[-1].loss - grid[0].loss) / (grid[-1].at - grid[0].at)
     inside = float(np.mean([point.gradient for point in grid]))
     margins = [[b.margin(b.below), b.margin(b.above)] for b in found]

@@ -19,7 +19,6 @@ from mdnum.numerics.rounding import (
     neighbor,
     ordinal,
     squared_distance_bound,
-    ulp_distance,
     unit_roundoff,
 )
 
@@ -29,5 +28,5 @@ jax.config.update("jax_enable_x64", True)
 __all__ = [
     "Hysteresis", "Ledger", "PrecisionPolicy", "Reach", "RolePrecision", "Threshold", "changes_in_time",
     "check_not_forked", "count_set", "distance_bound", "gamma", "neighbor", "ordinal", "set_bits",
-    "squared_distance_bound", "ulp_distance", "unit_roundoff",
+    "squared_distance_bound", "unit_roundoff",
 ]  # fmt: skip

@@ -87,8 +87,19 @@ def _identity_slope_jvp(primals, tangents):
     return _identity_slope(*primals), tangents[0]
 
 
-def _rounded(x: Float[Array, "..."], name: str, whole: Callable[[Array], Array]) -> Float[Array, "..."]:
-    """Round x to a format, where `whole` is the function that rounds x / spacing to an integer."""
+def round_to(
+    x: Float[Array, "..."], name: str, whole: Callable[[Array], Array] = jnp.rint
+) -> Float[Array, "..."]:
+    """Round x to the nearest number of a format, ties to even, in the dtype of x.
+
+    Subnormal numbers are kept (unlike in `lax.reduce_precision`), and numbers beyond the largest become
+    infinite. A float64 number is rounded once, whereas a cast may round twice. The derivative is 1.
+
+    Args:
+        x: float64 or narrower.
+        name: name of the format; a format with more digits or range than the dtype of x leaves x unchanged.
+        whole: another rounding of x, in units of the local spacing, to a whole number of spacings.
+    """
     form = format_of(name)
     if form.significand >= 53:
         return x
@@ -101,19 +112,6 @@ def _rounded(x: Float[Array, "..."], name: str, whole: Callable[[Array], Array])
     rounded = whole(wide / spacing) * spacing
     rounded = jnp.where(jnp.abs(rounded) > form.largest, jnp.sign(wide) * jnp.inf, rounded)
     return _identity_slope(x, jnp.where(jnp.isfinite(wide), rounded, wide).astype(x.dtype))
-
-
-def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
-    """Round x to the nearest number of a format, ties to even, in the dtype of x.
-
-    Subnormal numbers are kept (unlike in `lax.reduce_precision`), and numbers beyond the largest become
-    infinite. A float64 number is rounded once, whereas a cast may round twice. The derivative is 1.
-
-    Args:
-        x: float64 or narrower.
-        name: name of the format; a format with more digits or range than the dtype of x leaves x unchanged.
-    """
-    return _rounded(x, name, jnp.rint)
 
 
 def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Array, "..."]:
@@ -130,7 +128,7 @@ def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Arr
         up = jax.random.uniform(key, x.shape, jnp.float64) < places - below
         return below + up.astype(jnp.float64)
 
-    return _rounded(x, name, up_or_down)
+    return round_to(x, name, up_or_down)
 
 
 # --- loss scaling -----------------------------------------------------------------------------------------

@@ -37,19 +37,6 @@ def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
     return np.where(bits < 0, lowest - bits, bits)
 
 
-def ulp_distance(a, b, dtype: DTypeLike = np.float64) -> Int[np.ndarray, "..."]:
-    """Return the difference b - a in ulps: the signed number of floats of dtype between a and b.
-
-    Results up to 2^62 are exact; larger ones (floats of opposite sign) are returned as ±2^62.
-    """
-    start, end = ordinal(np.asarray(a, dtype)), ordinal(np.asarray(b, dtype))
-    limit = np.int64(2**62)
-    # halves cannot overflow, and tell where the difference would
-    far = np.abs(end // 2 - start // 2) >= limit // 2
-    with np.errstate(over="ignore"):
-        return np.where(far, np.where(end > start, limit, -limit), end - start)
-
-
 def neighbor(x, ulps: int, dtype: DTypeLike = np.float64):
     """Return the float that is `ulps` floats above x (below x if `ulps` is negative)."""
     x = np.asarray(x, dtype)

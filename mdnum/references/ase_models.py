@@ -22,10 +22,9 @@ energy of a pair at r == rc is zero for shifted and switched cutoffs, so only it
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import Any
 
 from ase.calculators.calculator import Calculator
 from ase.calculators.tersoff import Tersoff, TersoffParameters
@@ -81,7 +80,9 @@ def reference(subject: Simulation | System) -> Reference:
     if isinstance(model, EmbeddedAtom):
         return Reference("ASE EAM", True, "none", lambda: short_listed_eam(Path(model.file)))
     if isinstance(model, tetrahedral.Tersoff):
-        constants = {("Si", "Si", "Si"): TersoffParameters(**asdict(_written_again(model)))}
+        names = TersoffParameters.__dataclass_fields__
+        own = TersoffParameters(**{name: float(getattr(model, name)) for name in names})
+        constants = {("Si", "Si", "Si"): own}
         return Reference("ASE Tersoff", True, "none", lambda: Tersoff(constants, skin=0.0))
     # a sum of terms has no class there
     plain = simulation.pairwise and "" in model.terms
@@ -107,6 +108,7 @@ def independent(subject: Simulation | System) -> Reference:
     if isinstance(model, EnergyFunction):
         conversion = "none: the function, compiled for itself alone"
         return Reference(ENERGY, False, conversion, lambda: EnergyOnNeighborList(model))
+    again = TersoffModel if isinstance(model, tetrahedral.Tersoff) else StillingerWeberModel
     own = simulation.pairwise and all(isinstance(one.potential, PairFunction) for one in model.terms.values())
     return Reference(
         ITSELF if own else "plain numpy on ASE's neighbor list",
@@ -114,16 +116,9 @@ def independent(subject: Simulation | System) -> Reference:
         "none: the function, called pair by pair outside of the loop" if own
         else "none: the formulas of the system file, written a second time",
         lambda: OnNeighborList(
-            PairModel.of(model, simulation.symbols, compare) if simulation.pairwise else _written_again(model)
+            PairModel.of(model, simulation.symbols, compare) if simulation.pairwise else again(model)
         ),
     )  # fmt: skip
-
-
-def _written_again(model: Any) -> StillingerWeberModel | TersoffModel:
-    """Return the plain-numpy implementation of a many-body potential, with the same constants."""
-    kind = TersoffModel if isinstance(model, tetrahedral.Tersoff) else StillingerWeberModel
-    names = (one.name for one in fields(kind) if hasattr(model, one.name))
-    return kind(**{name: float(getattr(model, name)) for name in names})
 
 
 def _objects(subject: Simulation | System) -> Simulation:

@@ -273,8 +273,15 @@ def _add_rows(target: ndarray, rows: ndarray, values: ndarray) -> None:
         target[:, axis] += np.bincount(rows, values[:, axis], len(target))
 
 
+@dataclass(frozen=True)
 class _OneSpecies(Model):
     """A model in which all edges shorter than the cutoff interact, whatever the species of the atoms."""
+
+    constants: Any  # the potential of `mdnum.md.tetrahedral` whose constants it has
+
+    @property
+    def reach(self) -> float:
+        return float(self.constants.r_cut)
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:
@@ -287,45 +294,27 @@ class _OneSpecies(Model):
         return energies, gradient
 
 
-@dataclass(frozen=True)
 class StillingerWeberModel(_OneSpecies):
-    """Stillinger-Weber potential of silicon, equations 2.1 to 2.5 of Physical Review B 31, 5262 (1985).
-
-    Attributes: the constants of the paper; epsilon in eV, sigma in Å.
-    """
-
-    epsilon: float = 2.1683
-    sigma: float = 2.0951
-    a: float = 1.80
-    strength: float = 21.0
-    gamma: float = 1.20
-    A: float = 7.049556277
-    B: float = 0.6022245584
-    p: float = 4.0
-    q: float = 0.0
-    cos0: float = -1.0 / 3.0
-
-    @property
-    def reach(self) -> float:
-        return self.a * self.sigma
+    """Stillinger-Weber potential of one species: Physical Review B 31, 5262 (1985), equations 2.1 to 2.5."""
 
     def within(self, edges, unit):
-        x = edges.r / self.sigma
-        tail = np.exp(1.0 / (x - self.a))
-        dtail = -tail / (x - self.a) ** 2
-        core = self.B * x**-self.p - x**-self.q
-        dcore = -self.p * self.B * x ** (-self.p - 1) + self.q * x ** (-self.q - 1)
-        pair = 0.5 * self.epsilon * self.A * core * tail
-        slope = 0.5 * self.epsilon * self.A * (dcore * tail + core * dtail) / self.sigma
+        own = self.constants
+        x = edges.r / own.sigma
+        tail = np.exp(1.0 / (x - own.a))
+        dtail = -tail / (x - own.a) ** 2
+        core = own.B * x**-4.0 - 1.0
+        dcore = -4.0 * own.B * x**-5.0
+        pair = 0.5 * own.epsilon * own.A * core * tail
+        slope = 0.5 * own.epsilon * own.A * (dcore * tail + core * dtail) / own.sigma
         inner = slope[:, None] * unit
 
         e, f = _triplets(edges)
         e, f = e[e < f], f[e < f]  # each angle once
         cosine, dce, dcf = _cosines(edges, e, f)
-        arm = np.exp(self.gamma / (x - self.a))
-        darm = -self.gamma / (x - self.a) ** 2 * arm / self.sigma
-        excess = cosine - self.cos0
-        strength = self.epsilon * self.strength
+        arm = np.exp(own.gamma / (x - own.a))
+        darm = -own.gamma / (x - own.a) ** 2 * arm / own.sigma
+        excess = cosine + 1.0 / 3.0
+        strength = own.epsilon * own.strength
         angle = strength * arm[e] * arm[f] * excess**2
         twist = 2.0 * strength * arm[e] * arm[f] * excess
         bend = strength * excess**2
@@ -335,63 +324,34 @@ class StillingerWeberModel(_OneSpecies):
         return np.bincount(edges.i, pair, n) + np.bincount(edges.i[e], angle, n), inner
 
 
-@dataclass(frozen=True)
 class TersoffModel(_OneSpecies):
-    """Tersoff's bond-order potential for one species, Physical Review B 38, 9902 (1988), in LAMMPS notation.
-
-    Attributes: the 14 constants of a LAMMPS or ASE entry; the default is Tersoff's T3 silicon.
-    """
-
-    m: float = 3.0
-    gamma: float = 1.0
-    lambda3: float = 1.7322
-    c: float = 1.0039e5
-    d: float = 16.218
-    h: float = -0.59826
-    n: float = 0.78734
-    beta: float = 1.0999e-6
-    lambda2: float = 1.7322
-    B: float = 471.18
-    R: float = 2.85
-    D: float = 0.15
-    lambda1: float = 2.4799
-    A: float = 1830.8
-
-    @property
-    def reach(self) -> float:
-        return self.R + self.D
-
-    def _taper(self, r: ndarray) -> tuple[ndarray, ndarray]:
-        phase = 0.5 * np.pi * (r - self.R) / self.D
-        within = r > self.R - self.D
-        return (
-            np.where(within, 0.5 * (1.0 - np.sin(phase)), 1.0),
-            np.where(within, -0.25 * np.pi / self.D * np.cos(phase), 0.0),
-        )
+    """Tersoff's potential of one species: Physical Review B 38, 9902 (1988), in LAMMPS notation."""
 
     def within(self, edges, unit):
-        r = edges.r
-        taper, dtaper = self._taper(r)
+        own, r = self.constants, edges.r
+        phase, tapered = 0.5 * np.pi * (r - own.R) / own.D, r > own.R - own.D
+        taper = np.where(tapered, 0.5 * (1.0 - np.sin(phase)), 1.0)
+        dtaper = np.where(tapered, -0.25 * np.pi / own.D * np.cos(phase), 0.0)
 
         # zeta of edge e: a sum over the other edges f of the same atom
         e, f = _triplets(edges)
         cosine, dce, dcf = _cosines(edges, e, f)
-        c2, d2, away = self.c**2, self.d**2, self.h - cosine
-        g = self.gamma * (1.0 + c2 / d2 - c2 / (d2 + away**2))
-        dg = -2.0 * self.gamma * c2 * away / (d2 + away**2) ** 2
+        c2, d2, away = own.c**2, own.d**2, own.h - cosine
+        g = own.gamma * (1.0 + c2 / d2 - c2 / (d2 + away**2))
+        dg = -2.0 * own.gamma * c2 * away / (d2 + away**2) ** 2
         stretch = r[e] - r[f]
-        grow = np.exp((self.lambda3 * stretch) ** self.m)
-        dgrow = self.m * self.lambda3**self.m * stretch ** (self.m - 1.0) * grow
+        grow = np.exp((own.lambda3 * stretch) ** own.m)
+        dgrow = own.m * own.lambda3**own.m * stretch ** (own.m - 1.0) * grow
         zeta = np.bincount(e, taper[f] * g * grow, len(r))
 
-        x = (self.beta * zeta) ** self.n
-        order = (1.0 + x) ** (-0.5 / self.n)
+        x = (own.beta * zeta) ** own.n
+        order = (1.0 + x) ** (-0.5 / own.n)
         with np.errstate(divide="ignore", invalid="ignore"):
-            dorder = np.where(zeta > 0, -0.5 * (1.0 + x) ** (-0.5 / self.n - 1.0) * x / zeta, 0.0)
-        repulsion, attraction = self.A * np.exp(-self.lambda1 * r), -self.B * np.exp(-self.lambda2 * r)
+            dorder = np.where(zeta > 0, -0.5 * (1.0 + x) ** (-0.5 / own.n - 1.0) * x / zeta, 0.0)
+        repulsion, attraction = own.A * np.exp(-own.lambda1 * r), -own.B * np.exp(-own.lambda2 * r)
         bond = 0.5 * taper * (repulsion + order * attraction)
         slope = 0.5 * dtaper * (repulsion + order * attraction)
-        slope -= 0.5 * taper * (self.lambda1 * repulsion + self.lambda2 * order * attraction)
+        slope -= 0.5 * taper * (own.lambda1 * repulsion + own.lambda2 * order * attraction)
         inner = slope[:, None] * unit
 
         weight = (0.5 * taper * attraction * dorder)[e]

@@ -15,6 +15,7 @@ from ase.cell import Cell as AseCell
 from numpy import ndarray
 
 from mdnum import systems
+from mdnum.numerics import neighbor, ordinal
 from mdnum.references.conformance.answer import read
 from mdnum.references.conformance.case import once
 from mdnum.references.conformance.lists import ListLimits, PairList
@@ -360,11 +361,11 @@ def effective_cutoff(
     def counts(pair: ndarray) -> bool:
         return len(search.pairs(pair, cell, pbc, r_cut)[0]) > 0
 
-    def counts_at(ordinal: int) -> bool:
-        return counts(np.array([[0.0, 0.0, 0.0], [_double(ordinal), 0.0, 0.0]]))
+    def counts_at(place: int) -> bool:
+        return counts(np.array([[0.0, 0.0, 0.0], [neighbor(0.0, place), 0.0, 0.0]]))
 
-    start = _ordinal(r_cut)
-    if not counts_at(_ordinal(r_cut * (1 - 1e-5))) or counts_at(_ordinal(r_cut * (1 + 1e-5))):
+    inner, start, outer = (int(ordinal(r_cut * factor)) for factor in (1 - 1e-5, 1, 1 + 1e-5))
+    if not counts_at(inner) or counts_at(outer):
         return EffectiveCutoff(r_cut, float("nan"), 0, "not a cutoff", 0, 0)
     # most searches stop within an ulp of what they were asked for, so doubling steps end after two or three
     sign, step = (1, 1) if counts_at(start) else (-1, 1)
@@ -378,11 +379,11 @@ def effective_cutoff(
         counts(pair) != exactly_inside(pair, np.zeros((3, 3)), 0, 1, (0, 0, 0), r_cut)
         for pair in borderline_pairs(r_cut, oriented)
     )
-    comparison = {-1: "<", 0: "<="}.get(first - start, "rounded")
+    found, comparison = float(neighbor(0.0, first)), {-1: "<", 0: "<="}.get(first - start, "rounded")
     if comparison == "rounded" and search.unit > 2.0**-30:
-        single = int(np.float32(_double(first)).view(np.int32)) - int(np.float32(r_cut).view(np.int32))
+        single = int(np.float32(found).view(np.int32)) - int(np.float32(r_cut).view(np.int32))
         comparison = {-1: "< in float32", 0: "<= in float32"}.get(single, comparison)
-    return EffectiveCutoff(r_cut, _double(first), first - start, comparison, oriented, disagree)
+    return EffectiveCutoff(r_cut, found, first - start, comparison, oriented, disagree)
 
 
 def borderline_pairs(r_cut: float, count: int) -> ndarray:
@@ -392,12 +393,3 @@ def borderline_pairs(r_cut: float, count: int) -> ndarray:
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     length = r_cut + rng.uniform(-_NEARBY, _NEARBY, size=(count, 1)) * np.spacing(r_cut)
     return np.stack([np.zeros((count, 3)), length * direction], axis=1)
-
-
-def _ordinal(x: float) -> int:
-    """Return the ordinal number of a positive double among all doubles."""
-    return int(np.float64(x).view(np.int64))
-
-
-def _double(ordinal: int) -> float:
-    return float(np.int64(ordinal).view(np.float64))

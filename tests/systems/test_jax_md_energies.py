@@ -48,7 +48,7 @@ def test_stillinger_weber_has_the_numbers_of_numpy():
     given = {name: scalar(value) for name, value in zip(names, values, strict=True)}
     made = jaxmd.upstream().energy.stillinger_weber_neighbor_list
     one = through_the_door(made, atoms, 3.77118, **given)
-    atoms.calc = OnNeighborList(StillingerWeberModel())
+    atoms.calc = OnNeighborList(StillingerWeberModel(tetrahedral.named("stillinger-weber")))
     found = one.evaluate()
     # jax-md rounds a constant to float32
     assert found.energy == pytest.approx(atoms.get_potential_energy(), rel=1e-8)
