@@ -1,8 +1,8 @@
-"""What crosses between the host and an accelerator in a recorded run, and how fast are steps there?
+"""How much data does a recorded run transfer between host and accelerator, and how fast are its steps?
 
-Answer. 112 bytes a flip, at most twice, and 8 bytes for each atom and list come to the host; 25 bytes a
-step go to the device. On an H200 490 steps a second with 4,000 atoms, 64 with 256,000
-(docs/speed.md). It takes minutes.
+Answer. 112 bytes per flip (at most twice this number) and 8 bytes per atom and list are transferred to the
+host, and 25 bytes per step to the device. An H200 makes 490 steps per second with 4,000 atoms and 64 with
+256,000 (docs/speed.md). It takes minutes.
 
 The Lennard-Jones liquid of LAMMPS's bench/in.lj, recorded, with lists that are built on the device. After a
 warm-up every transfer of the loop is counted: what is read of the device's arrays, and what is put there;

@@ -1,7 +1,7 @@
-"""How fast is a recorded rollout, and what does recording cost?
+"""How fast is a recorded run, and how much time does recording take?
 
-Answer. With 4,000 atoms on one core it makes 29 times the steps of the loop in jax-md and 2.4 times those
-of LAMMPS; recording adds 13 to 20 % (docs/speed.md). It takes minutes.
+Answer. With 4,000 atoms on one core mdnum makes 29 times as many steps as the loop of jax-md and 2.4 times as
+many as LAMMPS; recording adds 13 to 20 % to the time (docs/speed.md). It takes minutes.
 
 The Lennard-Jones liquid of LAMMPS's bench/in.lj (density 0.8442, T near 0.72, skin 0.3, timestep
 0.005) with r_cut 2.5, in float64, from the same start in: mdnum recording every flip (decoded to

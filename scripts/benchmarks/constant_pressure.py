@@ -1,7 +1,7 @@
-"""What does a step at constant temperature or pressure cost beside one at constant energy?
+"""How long does a step at constant temperature or pressure take, relative to a step at constant energy?
 
-Answer. Thermostats at most 3 %, barostats at most 14 %, those of a full box 13 to 35 % (docs/speed.md).
-It takes five minutes.
+Answer. Thermostats add at most 3 %, barostats of isotropic boxes at most 14 %, and barostats of fully
+flexible boxes 13 to 35 % (docs/speed.md). It takes five minutes.
 
 The liquid of benchmark.py, float64, hard cutoff, on one core: every integrator makes as many steps as the
 others in turn, from the same start. Flips are noted and not decoded. Ratios are medians over the turns, of

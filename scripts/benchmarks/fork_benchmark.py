@@ -1,7 +1,7 @@
-"""What does it cost to follow two runs and a counterfactual, beside one recorded run?
+"""How long do two runs and a counterfactual run take, relative to one recorded run?
 
-Answer. 2.9 to 3.4 times the CPU time of one recorded run, with 108 to 4,000 atoms; a whole answer about
-argon/liquid-864 takes 80 s of CPU time, a map of 20 boundaries 22 s. It takes 280 s.
+Answer. 2.9 to 3.4 times the CPU time of one recorded run, with 108 to 4,000 atoms; the whole command for
+argon/liquid-864 takes 80 s of CPU time, a map of 20 boundaries takes 22 s. It takes 280 s.
 
 Run A, run B (the same program, one coordinate one ulp aside) and B's arithmetic under A's decisions advance
 together; beside them A alone, recorded: its flips decoded to ledger rows, all a run does but write them. The

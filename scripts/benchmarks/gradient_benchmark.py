@@ -1,8 +1,8 @@
-"""What does the gradient of a rollout cost, in time and in memory?
+"""How much time and memory does the gradient of a run need?
 
-Answer. Two to four times the forward run (2.6 for the derivative of the steps, about 3 with what flips
-add), in memory that does not grow with the steps of a reversible run (docs/speed.md). It takes many
-minutes.
+Answer. Two to four times the time of the forward run (2.6 times for the derivative of the steps, about 3
+times with the contributions of flips). For a reversible run, the memory does not grow with the number of
+steps (docs/speed.md). It takes many minutes.
 
 The Lennard-Jones liquid of LAMMPS's bench/in.lj (r_cut 2.5, float64), loss: velocity autocorrelation at the
 last step, by sigma and epsilon. Contenders take turns from the same start, after compilation:

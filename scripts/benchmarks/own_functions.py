@@ -1,7 +1,8 @@
-"""What does a pair function of one's own cost beside the built-in Lennard-Jones?
+"""How long does a run with a user-defined pair function take, relative to the built-in Lennard-Jones
+potential?
 
-Answer. In rational operations 1.0 to 1.2 times as much, with an exponential 1.4 to 1.6 (docs/speed.md).
-It takes five minutes.
+Answer. With rational operations 1.0 to 1.2 times as long, with an exponential 1.4 to 1.6 times as long
+(docs/speed.md). It takes five minutes.
 
 The liquid of benchmark.py with 4,000 atoms, float64, hard cutoff, on one core: every potential makes as many
 steps as the others in turn, from the same start. Ratios are medians over the turns, of processor time.

@@ -1,7 +1,7 @@
-"""What does a frame cost that a loop gives to `mdnum.Recorder`, over the same frame of a file?
+"""How long does a frame passed to `mdnum.Recorder` take, relative to the same frame of a file?
 
-Answer. As much, also with a neighbor list; more with one that is new at every step (docs/speed.md).
-It takes minutes.
+Answer. It takes no longer, also with a neighbor list; it takes longer if the list is new at every step
+(docs/speed.md). It takes minutes.
 
 A Lennard-Jones liquid (density 0.8442, r_cut 2.5, timestep 0.005, float64), every step. Frames go through
 `mdnum flips` from a file (ASE's traj), through a recorder, and through a recorder that is given a neighbor

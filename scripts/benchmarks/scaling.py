@@ -1,8 +1,9 @@
-"""How do time, memory and the price of a flip grow with the system, and do two runs slow one another down?
+"""How do time, memory and the time per flip grow with the system, and do simultaneous runs slow each other
+down?
 
-Answer. Nearly linearly: an atom and step takes 0.18 µs at 4,000 atoms and 0.29 at a million, a flip 0.17 to
-0.43 µs. Two runs at a time take 1.0 to 1.1 times as long as one alone (docs/speed.md). It takes many
-minutes.
+Answer. They grow nearly linearly: a step takes 0.18 µs per atom at 4,000 atoms and 0.29 µs at a million
+atoms, a flip takes 0.17 to 0.43 µs. Each of two simultaneous runs takes 1.0 to 1.1 times as long as a single
+run (docs/speed.md). It takes many minutes.
 
 The Lennard-Jones liquid of LAMMPS's bench/in.lj (density 0.8442, r_cut 2.5, skin 0.3, float64), recorded,
 from 4,000 to 1,000,000 atoms. Every size is a process of its own on one core: the lives of two lists to warm

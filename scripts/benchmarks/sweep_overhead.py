@@ -1,9 +1,9 @@
-"""What does a sweep cost besides its points, at one second a point?
+"""How much time does a sweep take in addition to its points, if each point takes one second?
 
 Answer. 0.040 s between two points of a worker (100 points, two workers, a quiet machine, AMD EPYC,
-2026-11-27): from the first point to the last the sweep took 4.6 % longer than its points need. The first
-point began after 3.7 s and the page took 1.7 s. With other programs on both cores it was 0.11 and 0.17 s.
-It takes two minutes.
+2026-11-27): from the first to the last point the sweep took 4.6 % longer than the points themselves. The
+first point began after 3.7 s, and the report took 1.7 s. With other programs running on both cores the time
+between two points was 0.11 and 0.17 s. It takes two minutes.
 
     python scripts/benchmarks/sweep_overhead.py
     python scripts/benchmarks/sweep_overhead.py --points 40

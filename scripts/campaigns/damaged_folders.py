@@ -1,7 +1,8 @@
-"""What does mdnum make of a damaged folder? Random damages, each read again, and what came of it in a table.
+"""How does mdnum treat a damaged folder? Folders are damaged at random and read; a table lists the results.
 
-Answer. Of 280 damages 160 are refused in one line, 11 are reported while the rest is read, and 109 change
-nothing that is read; none goes unnoticed (docs/hostile-input.md). It takes minutes.
+Answer. Of 280 damaged folders, 160 are rejected with a one-line error, 11 are read with a warning, and 109
+give unchanged results; no folder gives other numbers without a warning (docs/hostile-input.md). It takes
+minutes.
 
     python scripts/campaigns/damaged_folders.py                      300 damages, some minutes
     python scripts/campaigns/damaged_folders.py --damages 30 --kinds finished,killed

@@ -1,7 +1,8 @@
-"""How often is the verdict on a gradient wrong? Starts of several systems, each with a truth of its own.
+"""How often is the verdict on a gradient wrong? Starting states of several systems, each with a reference
+value.
 
-Answer. One of 331 trusted derivatives counts as false, and is within 3 % of its truth; 9 % of those that
-are right within 1 % are not trusted (docs/gradients.md). It takes hours.
+Answer. One of 331 trusted derivatives counts as false, and differs from its reference values by less than 3
+%. Of the derivatives that are correct within 1 %, 9 % are not trusted (docs/gradients.md). It takes hours.
 
 `mdnum.gradients.diagnose.trust` calls the derivative of each loss by each parameter trusted, or not. The
 truth comes from central differences of free runs, over shifts of the parameter between 1e-5 and 1e-8 of it:

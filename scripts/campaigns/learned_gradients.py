@@ -1,7 +1,8 @@
-"""Is a trusted gradient of a learned potential right? Sixty starts of four small ones, against differences.
+"""Is a trusted gradient of a learned potential correct? Sixty starting states of four small potentials are
+compared with finite differences.
 
-Answer. In 45 of the starts 87 of 90 derivatives are trusted, and all of these are right within 2 %
-(docs/own-energies.md). It takes an hour.
+Answer. For 45 of the starting states 87 of 90 derivatives are trusted, and all trusted derivatives are
+correct within 2 % (docs/own-energies.md). It takes an hour.
 
 Derivatives are by the gains of two layers, factors of their weights: d/dgain is the derivative along all
 weights of a layer. The loss is one of five in turn. The truth comes from central differences of mdnum's own

@@ -1,7 +1,7 @@
-"""How often does the range that `mdnum flips` gives for flips lost between frames hold the truth?
+"""How often does the range that `mdnum flips` gives for flips lost between frames contain the true value?
 
-Answer. In 98 % of the 364 files that have a range, and its middle is off by a factor of 1.13 in the median
-(docs/lost-flips.md). It takes hours, with --quick minutes.
+Answer. For 98 % of the 364 files with a range. The median factor between the estimate and the true value is
+1.13 (docs/lost-flips.md). It takes hours, with --quick minutes.
 
 A flip is lost where a pair crosses its cutoff and is back before the next frame of the file. The truth is
 known where every step is: a small engine (below) runs a system, and the flips of all pairs are counted by

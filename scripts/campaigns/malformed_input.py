@@ -1,7 +1,7 @@
-"""What does mdnum make of system files that no careful person would write, and of words that are none?
+"""How does mdnum treat damaged system files and invalid options?
 
-Answer. Of 345 cases 298 are refused in one line, 46 run, and 1 ends in such a line; none ends otherwise
-(docs/hostile-input.md). It takes minutes.
+Answer. Of 345 cases, 298 are rejected with a one-line error, 46 run, and 1 run ends with a one-line error; no
+case ends in another way (docs/hostile-input.md). It takes minutes.
 
     python scripts/campaigns/malformed_input.py [--cases 300] [--seed 1]
 

@@ -1,7 +1,8 @@
 """How often is a verdict of `mdnum fork` wrong? Two liquids and a crystal, float32 beside float64.
 
-Answer. In none of 76 to 100 starts of most rows, and in 1 of 100 of one (below 3.0 to 4.7 %, 95 %); half of
-the starts of a liquid with a hard cutoff are undecided (docs/verdict-calibration.md). It takes hours.
+Answer. For none of 76 to 100 starting states in most rows, and for 1 of 100 in one row (upper bounds 3.0 to
+4.7 % at 95 % confidence). For half of the starting states of a liquid with a hard cutoff the verdict is
+undecided (docs/verdict-calibration.md). It takes hours.
 
 A false verdict needs a truth that is known apart from the verdict:
 

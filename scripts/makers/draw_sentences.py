@@ -1,4 +1,4 @@
-"""Forty sentences of mdnum, drawn with a seed from all kinds of text, for readers who do not know it.
+"""Draw forty sentences of mdnum with a random seed from all kinds of text, for readers who do not know mdnum.
 
     python scripts/makers/draw_sentences.py --seed 3
 

@@ -1,4 +1,4 @@
-"""Three tasks each for readers who have nothing but the site, drawn with a seed from the verbs.
+"""Draw three tasks per reader from the verbs, with a random seed, for readers who have only the site.
 
     python scripts/makers/draw_tasks.py --readers 4 --seed 1
 

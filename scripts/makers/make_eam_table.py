@@ -1,4 +1,4 @@
-"""Tabulate an analytic embedded-atom potential of copper: which numbers does systems/copper use?
+"""Tabulate an analytic embedded-atom potential of copper, as used by systems/copper.
 
 Mishin, Mehl, Papaconstantopoulos, Voter and Kress, Phys. Rev. B 63, 224106 (2001): equations 2 to 6 and the
 constants of table II. The form ends as (r_cut - r)^4, so that energy, force and two more derivatives vanish

@@ -1,4 +1,4 @@
-"""Writes mdnum/schemas/*.json, JSON Schemas of what `--json` prints and summary.json holds.
+"""Write mdnum/schemas/*.json, the JSON Schemas of the documents of `--json` and summary.json.
 
 Kinds of documents are declared in make_schemas.toml.
 `--check` compares instead of writing.

@@ -1,4 +1,4 @@
-"""Are averages at constant temperature and pressure those of LAMMPS and ASE?
+"""Do averages at constant temperature and pressure agree with those of LAMMPS and ASE?
 
 Answer. Yes: density, energy, pressure and temperature of 14 runs agree within their errors
 (docs/constant-pressure.md). It takes many minutes.

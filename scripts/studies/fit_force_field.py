@@ -1,7 +1,7 @@
-"""Can a force field be recovered from what a liquid shows, through a hard cutoff?
+"""Can the parameters of a force field with a hard cutoff be recovered from properties of a liquid?
 
-Answer. Yes: from 10 % off, descent with event-aware gradients ends within a hundredth of the true sigma and
-epsilon. The plain gradient arrives by another path. It takes minutes.
+Answer. Yes: from an initial error of 10 %, descent with event-aware gradients ends within 1 % of the true
+sigma and epsilon. The gradient without flips reaches the same values by another path. It takes minutes.
 
 Argon's sigma and epsilon are sought, starting 10 % off, by gradient descent (optax) on a radial
 distribution function and a diffusion constant. Both are averages over short rollouts of the liquid, of

@@ -1,7 +1,7 @@
-"""With how many decimals must a trajectory be written for its flips to be seen?
+"""How many decimals must the positions of a trajectory have so that its flips can be detected?
 
-Answer. Three decimals of an Ångström hide a tenth of the flips of argon at 2 fs a step and make up as many;
-two decimals, more than half. It takes 27 s.
+Answer. With three decimals of an Ångström, a tenth of the flips of argon at steps of 2 fs are missed, and as
+many spurious flips appear; with two decimals, more than half. It takes 27 s.
 
 Takes a trajectory (or makes one with mdnum, every step of it) and looks at it again as if positions had been
 rounded to so many decimals:
