@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -110,7 +111,7 @@ def make(ok: bool = True) -> Demo:
 def demo(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Demo]:
     """Demonstrations that give what they are told to, in an empty folder."""
     given = {name: make() for name in demos.names()}
-    monkeypatch.setattr(demos, "load", lambda name: lambda: given[name])
+    monkeypatch.setattr(demos, "load", lambda name: SimpleNamespace(run=lambda: given[name]))
     monkeypatch.chdir(tmp_path)
     return given
 
