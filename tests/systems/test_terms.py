@@ -73,10 +73,15 @@ def of_objects(atoms, **tail):
     )
 
 
-def test_a_file_is_the_objects(file, tmp_path):
+def test_a_file_is_the_objects(file):
+    made = mdnum.build(file)
+    assert json.dumps(program(made)) == json.dumps(program(of_objects(made.structure)))
+
+
+@pytest.mark.nightly
+def test_a_run_of_a_file_is_that_of_the_objects(file, tmp_path):
     made = mdnum.build(file)
     objects = of_objects(made.structure)
-    assert json.dumps(program(made)) == json.dumps(program(objects))
     for one, out in ((made, "a"), (objects, "b")):
         assert mdnum.run(one, steps=20, out=tmp_path / out).summary["energy_budget_closes"]
     a, b = (RunFolder(tmp_path / out) for out in "ab")

@@ -191,8 +191,8 @@ def copied(outcome: Outcome, to: Path) -> Outcome:
 
 @pytest.mark.parametrize("damage", ["cut", "bits", "gone", "other"])
 def test_a_damaged_table_is_one_line(returned, tmp_path, damage):
-    outcome = copied(returned("md"), tmp_path)
-    file = tmp_path / "flips.parquet"
+    outcome = copied(returned("ball"), tmp_path)
+    file = tmp_path / "contacts.parquet"
     data = file.read_bytes()
     if damage == "gone":
         file.unlink()
@@ -200,10 +200,10 @@ def test_a_damaged_table_is_one_line(returned, tmp_path, damage):
         middle = len(data) // 2
         flipped = data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
         file.write_bytes({"cut": data[:middle], "bits": flipped, "other": b"PAR1"}[damage])
-    with pytest.raises(FolderError, match=r"flips\.parquet: .*(damaged|missing)") as caught:
-        outcome.table("flips")
+    with pytest.raises(FolderError, match=r"contacts\.parquet: .*(damaged|missing)") as caught:
+        outcome.table("contacts")
     assert "\n" not in str(caught.value)
-    assert outcome.table("series").num_rows == 61
+    assert outcome.table("steps").num_rows == 601
 
 
 def test_another_working_directory_changes_nothing(tmp_path, monkeypatch):
