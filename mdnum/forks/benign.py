@@ -24,15 +24,7 @@ from jaxtyping import Float
 from scipy.special import betaincinv
 
 from mdnum.errors import InputError, expect_at_least
-from mdnum.forks.ensemble import (
-    Change,
-    ensemble,
-    feature_names,
-    nodes_of,
-    planted,
-    starts,
-    steps_to_diverge,
-)
+from mdnum.forks.ensemble import Change, ensemble, feature_names, nodes_of, planted, starts, steps_to_diverge
 from mdnum.plain import result
 from mdnum.program import Progress, Twin
 from mdnum.rollout.engine import Start, first_state

@@ -61,6 +61,7 @@ class Loss(eqx.Module):
     unit: ClassVar[str] = ""
     # whether each frame shows it by itself, so that an ensemble has it too
     of_single_frames: ClassVar[bool] = False
+    needs_volume: ClassVar[bool] = False  # whether it is not defined without a box
     every: int = eqx.field(static=True, default=1)  # looks at every n-th step
     first: int = eqx.field(static=True, default=0)  # from this step on
 
@@ -93,7 +94,8 @@ class Loss(eqx.Module):
 
     def reason_unavailable(self, around: LossContext) -> str | None:
         """Return the reason why the loss is not defined for this system; None if the loss is defined."""
-        return None
+        lacks_volume = self.needs_volume and not float(around.volume) > 0
+        return "the box has no volume: it is not periodic everywhere" if lacks_volume else None
 
 
 class _OfLast(Loss):
@@ -202,26 +204,20 @@ class MeanPressure(Loss):
     """Pressure (2 K + virial) / (3 V), averaged over frames, energy/length³."""
 
     name, label, unit = "pressure", "pressure, averaged over steps", "{energy}/{length}³"
-    of_single_frames = True
+    of_single_frames = needs_volume = True
 
     def observe(self, frame, origin, around):
         return (2 * _kinetic(frame, around) + frame.virial) / (3 * around.volume)
-
-    def reason_unavailable(self, around: LossContext) -> str | None:
-        return _bulk(around)
 
 
 class MeanVolume(Loss):
     """Volume of the periodic box, averaged over frames, length³."""
 
     name, label, unit = "volume", "volume of the box, averaged over steps", "{length}³"
-    of_single_frames = True
+    of_single_frames = needs_volume = True
 
     def observe(self, frame, origin, around):
         return around.volume
-
-    def reason_unavailable(self, around: LossContext) -> str | None:
-        return _bulk(around)
 
 
 class MeanDensity(MeanVolume):
@@ -316,7 +312,7 @@ class RadialDistribution(Loss):
     """
 
     name, label = "rdf", "mean squared difference of g(r) from 1"
-    of_single_frames = True
+    of_single_frames = needs_volume = True
     r_max: float = eqx.field(static=True, kw_only=True)  # right edge of the last bin, length
     bins: int = eqx.field(static=True, kw_only=True, default=60)  # of equal width, from 0
     # the loss is the mean squared difference from this, shape (bins,), or from the same in all
@@ -354,7 +350,7 @@ class RadialDistribution(Loss):
 
     def reason_unavailable(self, around: LossContext) -> str | None:
         """Return the reason why g(r) is not defined (no volume, or a box that is too small), or None."""
-        if why := _bulk(around):
+        if why := super().reason_unavailable(around):
             return why
         half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2
         reach = self.r_max + 2 * self.width
@@ -413,11 +409,6 @@ def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Ar
     for k, share in enumerate(shares):
         counts = counts.at[first + jnp.int32(k + 1)].add(jnp.where(near, share, 0), mode="promise_in_bounds")
     return counts[2 : bins + 2]
-
-
-def _bulk(around: LossContext) -> str | None:
-    """Return a message if a system that is not periodic in all directions has no volume; otherwise None."""
-    return None if float(around.volume) > 0 else "the box has no volume: it is not periodic everywhere"
 
 
 def _correlation(frame: LossFrame, origin: LossFrame):

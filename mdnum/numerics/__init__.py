@@ -5,11 +5,7 @@ from __future__ import annotations
 import jax
 
 from mdnum.bits import changes_in_time, count_set, set_bits
-from mdnum.numerics.events import (
-    Hysteresis,
-    Ledger,
-    Threshold,
-)
+from mdnum.numerics.events import Hysteresis, Ledger, Threshold
 from mdnum.numerics.forked import check_not_forked
 from mdnum.numerics.roles import PrecisionPolicy, RolePrecision
 from mdnum.numerics.rounding import (

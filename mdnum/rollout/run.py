@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -79,8 +79,8 @@ class _Progress:
     last: Any = None  # shape (3, atoms), on the device until somebody asks
 
     def to_dict(self) -> dict[str, Any]:
-        parts = {name: getattr(self, name).to_dict() for name in ("tally", "health", "budget")}
-        return {**parts, "pressure": self.pressure.samples}
+        parts = {name: getattr(self, name).to_dict() for name in ("health", "budget")}
+        return {"tally": asdict(self.tally), **parts, "pressure": self.pressure.samples}
 
 
 @dataclass

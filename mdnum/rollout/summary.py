@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -97,10 +97,6 @@ class RunTally:
         self.jumps = float(jumps[-1])
         self.conserved.add(rows["time"], rows["conserved"])
         self.without_jumps.add(rows["time"], rows["conserved"] - jumps)
-
-    def to_dict(self) -> dict:
-        """Return the totals as plain values for a checkpoint."""
-        return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict) -> RunTally:
@@ -390,15 +386,6 @@ class Epoch:
             segment.epoch, segment.built, table.pairs, table.slots, table.occupancy, 1e3 * table.build_seconds
         )
 
-    def to_dict(self) -> dict:
-        """Return the statistics as plain values for a checkpoint."""
-        return {**self.__dict__, "lost": sorted(self.lost)}
-
-    @classmethod
-    def from_dict(cls, values: dict) -> Epoch:
-        """Restore the statistics from the values that `to_dict` returned."""
-        return cls(**{**values, "lost": set(values["lost"])})
-
 
 @dataclass
 class ListHealth:
@@ -488,13 +475,12 @@ class ListHealth:
 
     def to_dict(self) -> dict:
         """Return the counts of the monitor as plain values, for storage in a checkpoint."""
-        values = {k: v for k, v in self.__dict__.items() if k not in ("simulation", "current", "lost")}
-        current = None if self.current is None else self.current.to_dict()
-        return {**values, "lost": sorted(self.lost), "current": current}
+        epoch = self.current and {**vars(self.current), "lost": sorted(self.current.lost)}
+        values = {k: v for k, v in vars(self).items() if k not in ("simulation", "current", "lost")}
+        return {**values, "lost": sorted(self.lost), "current": epoch}
 
     @classmethod
     def from_dict(cls, simulation: Simulation, values: dict) -> ListHealth:
         """Restore a monitor from the values that `to_dict` returned."""
-        current = None if values["current"] is None else Epoch.from_dict(values["current"])
-        rest = {k: v for k, v in values.items() if k not in ("lost", "current")}
-        return cls(simulation, current=current, lost=set(values["lost"]), **rest)
+        epoch = values["current"] and Epoch(**{**values["current"], "lost": set(values["current"]["lost"])})
+        return cls(simulation, **{**values, "lost": set(values["lost"]), "current": epoch})

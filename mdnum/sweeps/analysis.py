@@ -13,15 +13,7 @@ from mdnum.sweeps.advice import FREE, advise, compared_with_end, end_of
 from mdnum.sweeps.design import Axis, label
 from mdnum.sweeps.plan import Plan, Setting
 from mdnum.sweeps.points import Workspace
-from mdnum.sweeps.statistics import (
-    Difference,
-    SeedMean,
-    corrected,
-    difference,
-    effects,
-    estimates,
-    paired,
-)
+from mdnum.sweeps.statistics import Difference, SeedMean, corrected, difference, effects, estimates, paired
 
 #: Value, error and degrees of freedom of a difference.
 Raw = tuple[float, float, float]

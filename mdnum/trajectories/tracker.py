@@ -13,14 +13,7 @@ from mdnum.errors import InputError
 from mdnum.md.ledger import FlipTable, Members
 from mdnum.reading import FrameError
 from mdnum.trajectories.frame import AtomIndices, Frame, furthest
-from mdnum.trajectories.lattice import (
-    INSIDE,
-    Participants,
-    Placed,
-    binned,
-    lattice_of,
-    own_images,
-)
+from mdnum.trajectories.lattice import INSIDE, Participants, Placed, binned, lattice_of, own_images
 from mdnum.trajectories.rules import Capped, Nearest, Rule
 from mdnum.trajectories.search import (
     Changed,
