@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell, transformed
 from mdnum.md.integrators import AtStep, Integrator, Masses, Number, Vector, quantity
-from mdnum.md.pairforce import VOIGT, symmetric
+from mdnum.md.pairforce import products, symmetric
 from mdnum.md.thermostats import Chain, rescaled
 
 Rate = Float[Array, "..."]  # a number, or a symmetric matrix (3, 3), float64
@@ -129,19 +129,18 @@ class Barostat(Integrator):
             message = f"{self.name} needs a box that is periodic along every axis, but {axis} is not periodic"
             raise InputError(message, where="dynamics.kind", remedy="Use nose-hoover, csvr or langevin")
 
-    def motion(self, v: Vector, masses: Masses) -> Float[Array, "3 3"]:
-        """Return the kinetic tensor Σ m v ⊗ v, an energy."""
-        v = v.astype(jnp.float64)
-        return (masses * v) @ v.T
-
-    def excess(self, v: Vector, at: AtStep) -> Rate:
-        """Return the tensor Π - p V at the set pressure p, or its mean diagonal for an isotropic box."""
-        given = self.pressure * volume(at.cell)
+    def motion(self, v: Vector, masses: Masses) -> Rate:
+        """Return the kinetic tensor Σ m v ⊗ v, an energy, or a third of its trace for an isotropic box."""
         if not self.anisotropic:
-            return (2 * self.kinetic(v, at.masses) + at.virial) / 3 - given
-        assert at.tensor is not None
-        whole = self.motion(v, at.masses) + at.tensor
-        return 0.5 * (whole + whole.T) - given * jnp.eye(3)
+            return 2 * super().kinetic(v, masses) / 3
+        v = v.astype(jnp.float64)
+        return symmetric(products(v, masses * v))
+
+    def excess(self, motion: Rate, at: AtStep) -> Rate:
+        """Return the tensor Π - p V at the set pressure p, or its mean diagonal for an isotropic box."""
+        virial = at.tensor if self.anisotropic else at.virial / 3
+        assert virial is not None
+        return motion + 0.5 * (virial + virial.T) - self.pressure * volume(at.cell) * unit(motion)
 
 
 def volume(cell: Cell) -> Number:
@@ -187,15 +186,10 @@ class MTK(Barostat):
         still = jnp.zeros((3, 3) if self.anisotropic else ())
         return BoxState(still, Chain.at_rest(self.chain), Chain.at_rest(self.chain), jnp.zeros(()))
 
-    def motion(self, v, masses):
-        # six sums take less time than a product of matrices, but more where v is expensive to compute
-        v = v.astype(jnp.float64)
-        return symmetric(jnp.sum(v[a] * (masses * v[b])) for a, b in VOIGT)
-
     def kinetic(self, v, masses):
         if not self.anisotropic:
             return super().kinetic(v, masses)
-        # the same sums as in `excess`, which XLA computes once
+        # the same sums as in `begin`, which XLA computes once
         return 0.5 * jnp.trace(self.motion(v, masses))
 
     def inertia(self, masses):
@@ -203,23 +197,23 @@ class MTK(Barostat):
         share = 3 if self.anisotropic else 1
         return (self.freedom(masses) + 3) / share * self.kT * self.pressure_relaxation**2
 
-    def _held(self, v, extra, masses, time):
-        """Advance the independent thermostat chains of box and atoms by the given time."""
+    def _held(self, v, motion, extra, masses, time):
+        """Advance the independent thermostat chains of box and atoms; scale `motion` with the velocities."""
         freedom, kT = self.freedom(masses), self.kT
         own, of_box = self._own(extra, masses)
-        scale, atoms = extra.atoms.act(self.kinetic(v, masses), freedom, kT, self.relaxation, time)
+        scale, atoms = extra.atoms.act(0.5 * trace(motion), freedom, kT, self.relaxation, time)
         slowed, chain = extra.chain.act(own, of_box, kT, self.pressure_relaxation, time)
         v = acted(v, scale).astype(v.dtype)
-        return v, extra._replace(rate=extra.rate * slowed, atoms=atoms, chain=chain)
+        return v, motion * scale**2, extra._replace(rate=extra.rate * slowed, atoms=atoms, chain=chain)
 
     def _own(self, extra, masses):
         """Return the kinetic energy of the box, and its number of degrees of freedom."""
         return 0.5 * self.inertia(masses) * jnp.sum(jnp.square(extra.rate)), 6 if self.anisotropic else 1
 
-    def _pushed(self, v, extra, at, time):
+    def _pushed(self, motion, extra, at, time):
         """Return the state after excess pressure and kinetic energy have acted on the box for a time."""
-        heat = 2 * self.kinetic(v, at.masses) / self.freedom(at.masses)
-        push = self.excess(v, at) + heat * unit(extra.rate)
+        heat = trace(motion) / self.freedom(at.masses)
+        push = self.excess(motion, at) + heat * unit(extra.rate)
         # of an isotropic box the three directions together
         share = 1 if self.anisotropic else 3
         return extra._replace(rate=extra.rate + time * share * push / self.inertia(at.masses))
@@ -236,12 +230,14 @@ class MTK(Barostat):
         first = jnp.where(at.step == 0, volume(at.cell), extra.volume)
         extra = extra._replace(volume=first)
         v = self._kicked(v, extra, at, time)
-        return self._held(v, self._pushed(v, extra, at, time), at.masses, time)
+        motion = self.motion(v, at.masses)
+        v, _, extra = self._held(v, motion, self._pushed(motion, extra, at, time), at.masses, time)
+        return v, extra
 
     def begin(self, x, v, extra, at):
         half = 0.5 * self.timestep
-        v, extra = self._held(v, extra, at.masses, half)
-        extra = self._pushed(v, extra, at, half)
+        v, motion, extra = self._held(v, self.motion(v, at.masses), extra, at.masses, half)
+        extra = self._pushed(motion, extra, at, half)
         v = self._kicked(v, extra, at, half)
         # the box still has to grow, with all that is in it
         way = self.timestep * growth(-self.timestep * extra.rate)
@@ -316,7 +312,7 @@ class CellRescaling(Barostat):
         The force on √V is the derivative of k_B T times the logarithm of the density of √V, √V exp(-(U + K +
         p V) / k_B T).
         """
-        root, excess = jnp.sqrt(volume(at.cell)), self.excess(v, at)
+        root, excess = jnp.sqrt(volume(at.cell)), self.excess(self.motion(v, at.masses), at)
         part = trace(excess) / 3
         return root, (2 * part + self.kT) / root, excess - part * unit(excess)
 

@@ -48,14 +48,13 @@ class DialedMTK(MTK):
     def freedom(self, masses):
         return super().freedom(masses) + self.dials["freedom"]
 
-    def excess(self, v, at):
-        more = (self.dials["kinetic"] - 1) * 2 / 3 * self.kinetic(v, at.masses)
-        return super().excess(v, _pressure(self.dials, at, self.start)) + more
+    def excess(self, motion, at):
+        return super().excess(self.dials["kinetic"] * motion, _pressure(self.dials, at, self.start))
 
-    def _pushed(self, v, extra, at, time):
-        heat = 2 * self.kinetic(v, at.masses) / self.freedom(at.masses)
+    def _pushed(self, motion, extra, at, time):
+        heat = 3 * motion / self.freedom(at.masses)
         less = (1 - self.dials["correction"]) * time * 3 * heat / self.inertia(at.masses)
-        pushed: Any = super()._pushed(v, extra, at, self.dials["push"] * time)
+        pushed: Any = super()._pushed(motion, extra, at, self.dials["push"] * time)
         return pushed._replace(rate=pushed.rate - less)
 
     def _kicked(self, v, extra, at, time):
@@ -81,9 +80,8 @@ class DialedRescaling(CellRescaling):
     dials: Any = eqx.field(kw_only=True)
     start: Any = eqx.field(kw_only=True)
 
-    def excess(self, v, at):
-        more = (self.dials["kinetic"] - 1) * 2 / 3 * self.kinetic(v, at.masses)
-        return super().excess(v, _pressure(self.dials, at, self.start)) + more
+    def excess(self, motion, at):
+        return super().excess(self.dials["kinetic"] * motion, _pressure(self.dials, at, self.start))
 
     def begin(self, x, v, extra, at):
         """As that of `CellRescaling`, for a number, with the dials."""
