@@ -21,7 +21,12 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 #: Sentences of each kind, and letters that a sentence has at least: shorter ones are labels.
 EACH, SHORTEST = 8, 30
-_END = re.compile(r"(?<=[.?!:])\s+(?=[A-Z`\[*-])")
+#: End of a sentence; not of the initial of a name, or of a shortened word of a journal's name.
+_END = re.compile(
+    r"(?<=[.?!:])(?<!\b[A-Z]\.)(?<!Phys\.)(?<!Chem\.)(?<!Comput\.)(?<!Lett\.)(?<!Rev\.)(?<!Sci\.)\s+(?=[A-Z`\[*-])"
+)
+#: Sections of a docstring that describe arguments and results one by one.
+_SECTION = re.compile(r"^(Args|Attributes|Returns|Yields|Raises):", re.M)
 _FIELD = re.compile(r"\{[a-z_]*:\? \w+ (\w+)\}|\{([\w.\[\]]+)(?::#? ?([^}]*))?\}")
 #: Keys whose texts are no sentences of a finding.
 _NO_SENTENCE = (
@@ -81,7 +86,7 @@ def docstrings() -> Iterator[tuple[str, str]]:
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (
                 text := ast.get_docstring(node)
             ):
-                for part in re.split(r"\n\s*\n", text.partition("\nArgs:")[0]):
+                for part in re.split(r"\n\s*\n", _SECTION.split(text)[0]):
                     if not part.startswith((" ", "Example", ">>>")):
                         yield from _split(file, part)
 
@@ -89,7 +94,9 @@ def docstrings() -> Iterator[tuple[str, str]]:
 def documents() -> Iterator[tuple[str, str]]:
     """Sentences of README and docs/, without tables, code and headings."""
     for file in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
-        text = re.sub(r"^(```|~~~|\$\$).*?^(```|~~~|\$\$)", "", file.read_text(), flags=re.S | re.M)
+        # code, formulas, marks that are not shown, and the lines of a notebook before its title
+        hidden = r"^(```|~~~|\$\$).*?^(```|~~~|\$\$)|<!--.*?-->|\A---\n.*?^---$"
+        text = re.sub(hidden, "", file.read_text(), flags=re.S | re.M)
         for part in re.split(r"\n\s*\n", re.sub(r"^(\||#|---|\s*:::).*$", "", text, flags=re.M)):
             yield from _split(file, part.lstrip("-*>0123456789. "))
 
