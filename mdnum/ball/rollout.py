@@ -81,11 +81,6 @@ class BallRun:
         touched = self.contact.any(axis=0)
         return np.where(touched, self.contact.argmax(axis=0) + 1, -1)
 
-    @property
-    def final(self) -> tuple[np.ndarray, np.ndarray]:
-        """Heights (m) and velocities (m/s) at the end of the run."""
-        return self.y[-1], self.v[-1]
-
     @cached_property
     def energy(self) -> Float[np.ndarray, "rows balls"]:
         """Mechanical energy per mass, (m/s)², of each kept state."""

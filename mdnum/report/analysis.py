@@ -190,7 +190,7 @@ class Scan:
         rows = {**flips, "ratio": ratio}
         if self.nearest:
             rows = {name: np.concatenate([self.nearest[name], values]) for name, values in rows.items()}
-        kept = np.sort(closest(rows["ratio"], self._most))
+        kept = np.sort(np.argsort(rows["ratio"], kind="stable")[: self._most])
         self.nearest = {name: values[kept] for name, values in rows.items()}
 
 
@@ -225,15 +225,6 @@ def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
         return 0.0
     quarter = np.quantile(ratio, 0.25)
     return float(0.25 * len(ratio) / quarter) if quarter > 0 else float(len(ratio))
-
-
-def closest(ratio: Float[np.ndarray, "flips"], most: int) -> Int[np.ndarray, "nearest"]:
-    """Return the rows of the flips with the smallest |margin| / rounding bound, the smallest first."""
-    if len(ratio) > most:
-        rows = np.argpartition(ratio, most)[:most]
-    else:
-        rows = np.arange(len(ratio))
-    return rows[np.argsort(ratio[rows], kind="stable")]
 
 
 def algebra_holds(series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:

@@ -172,11 +172,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
     sections = [
         Section("What was run", [pairs(_what(run))]),
         Section("Energy and its budget", list(_energy(run))),
-        *(
-            Section("Pressure", list(_pressure(run, parts)))
-            for parts in [run.summary.get("pressure")]
-            if parts
-        ),
+        Section("Pressure", list(_pressure(run))),
         Section("Flips per step", list(_flips_per_step(run))),
         Section("Margins in units of rounding", list(_margins(run))),
         Section("Chatter and residence", list(_chatter(run))),
@@ -230,28 +226,19 @@ def _what(run: RunView) -> list[tuple[str, str]]:
     # how many steps were made is said above; the file says how many were planned
     made = {key: value for key, value in (system.get("dynamics") or {}).items() if key != "steps"}
     function = run.cutoff.get("function") or {}
+    atoms, freedom = run.summary.get("atoms") or None, run.summary.get("degrees_of_freedom")
+    counted = TEXTS("freedom_all" if freedom == 3 * (atoms or 0) else "freedom_at_rest")
     return TEXTS.rows("what", **{
         **vars(units), **given, "about": system.get("about") or None, "steps": run.steps,
-        "atoms": run.summary.get("atoms") or None, "span": float(time[-1] - time[0]),
+        "atoms": atoms, "span": float(time[-1] - time[0]),
         "mean": float(np.mean(run.series["temperature"])),
-        **_freedom(run),
+        "freedom": freedom, "counted": None if freedom is None else counted,
         **{name: run.cutoff.get(name) for name in ("energy_jump", "force_jump")},
         **{key: function.get(key) for key in ("from", "to")},
         "breaks": sum(row.get("kinks", 1) for row in function.get("places", ())),
         "first": TEXTS(f"jumps_{run.cutoff['smoothness']}") if function else None,
         "dynamics": in_words(made, vars(units) | {"timestep": units.time}) if made else None,
     })  # fmt: skip
-
-
-def _freedom(run: RunView) -> dict[str, Any]:
-    """Return the number of degrees of freedom used for the temperature, with an explanation."""
-    freedom, atoms = run.summary.get("degrees_of_freedom"), run.summary.get("atoms") or 0
-    if freedom is None:
-        return dict.fromkeys(("freedom", "counted"))
-    return {
-        "freedom": freedom,
-        "counted": TEXTS("freedom_all" if freedom == 3 * atoms else "freedom_at_rest"),
-    }
 
 
 def _energy(run: RunView) -> Iterator[Any]:
@@ -309,9 +296,11 @@ def _energy(run: RunView) -> Iterator[Any]:
             )  # fmt: skip
 
 
-def _pressure(run: RunView, parts: Mapping[str, Any]) -> Iterator[Any]:
+def _pressure(run: RunView) -> Iterator[Any]:
     """Yield the contributions to the pressure, such as kinetic part, virial part and tail correction."""
-    units = run.units
+    units, parts = run.units, run.summary.get("pressure")
+    if not parts:
+        return
     rows = TEXTS.rows("pressure", **vars(units), **parts)
     terms = [
         (f"Virial part of {name}", f"{number(one['mean'], 4)} {units.pressure}")

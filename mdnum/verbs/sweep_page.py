@@ -161,7 +161,8 @@ def _sections(view: View) -> Iterator[Section]:
     s = view.summary
     yield Section("What moves what", [TEXTS("differences"), *_differences(view)], terminal=True)
     if s["advice"]:
-        told = TEXTS("settings", **_tolerances(view)) if s["tolerances"] else TEXTS("settings_none")
+        sizes = [f"{key} {number(one, 2)} {_unit(view, key)}".strip() for key, one in s["tolerances"].items()]
+        told = TEXTS("settings", tolerances=listed(sizes)) if sizes else TEXTS("settings_none")
         yield Section("What to use", [told, *_settings(view)], terminal=True)
     for axis in s["axes"]:
         yield Section(axis["key"], list(_plots(view, axis)))
@@ -213,14 +214,6 @@ def _with_error(row: Mapping[str, Any]) -> str:
         return number(value, 5)
     digits = 2 + int(np.floor(np.log10(abs(value))) - np.floor(np.log10(error))) if value else 2
     return f"{number(value, min(max(digits, 2), 12))} ± {number(error, 2)}"
-
-
-def _tolerances(view: View) -> dict[str, str]:
-    told = [
-        f"{name} {number(value, 2)} {_unit(view, name)}".strip()
-        for name, value in view.summary["tolerances"].items()
-    ]
-    return {"tolerances": listed(told)}
 
 
 def _settings(view: View) -> list[Any]:

@@ -11,6 +11,7 @@ from typing import Any
 from mdnum import systems
 from mdnum.plain import headed
 from mdnum.report.finding import conclude
+from mdnum.report.words import many
 from mdnum.systems.structures import ATOMS_IN_CELL
 from mdnum.verbs import Reply
 
@@ -73,6 +74,4 @@ def _size(system: Any) -> dict[str, int]:
 
 
 def _sized(row: Mapping[str, Any]) -> str:
-    noun = "atom" if "atoms" in row else "ball"
-    number = row[f"{noun}s"]
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+    return many(row["atoms"], "atom") if "atoms" in row else many(row["balls"], "ball")

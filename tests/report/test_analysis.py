@@ -79,7 +79,7 @@ def test_margins_in_units_of_rounding():
     flips["bound"] = np.array([1e-14, 2e-14, 0.0, 0.0])
     ratio = analysis.margins_in_bounds(flips)
     np.testing.assert_allclose(ratio, [3, 0.5, 0, np.inf])
-    assert analysis.closest(ratio, 2).tolist() == [2, 1]
+    assert analysis.scan(flips, nearest=2).nearest["ratio"].tolist() == [0.5, 0]
     # even over 1000 bounds: one in a thousand lies within one
     even = np.abs(np.random.default_rng(0).uniform(-1, 1, 40_000)) / 1e-3
     assert analysis.expected_ambiguous(even) == pytest.approx(40, rel=0.03)
