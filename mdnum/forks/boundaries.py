@@ -6,23 +6,25 @@ adjacent floats lead to different decisions, and every later quantity of the run
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from functools import lru_cache
+from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mdnum.errors import InputError, expect_at_least
-from mdnum.forks.processes import digests_elsewhere
-from mdnum.forks.worlds import program_of
+from mdnum.forks.worlds import packed, program_of, unpacked
 from mdnum.numerics.rounding import neighbor, ordinal
 from mdnum.plain import result
 from mdnum.program import DecisionHistory, Number, Program, Progress
+from mdnum.sweeps import engines
 from mdnum.systems import BallSystem, opened
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from mdnum.systems.simulation import Simulation
 
 #: Default for the largest number of boundaries, as many as a figure can label; more for a ball, whose runs
@@ -159,18 +161,25 @@ class NumberLine:
             self.run(place)
         return self.known[place].digest
 
-    def bisect(self, a: int, b: int, pending: list[tuple[int, int]]) -> tuple[int, int]:
-        """Bisect to adjacent ordinals with different histories; append the unused halves to `pending`."""
-        while b - a > 1:
-            middle = (a + b) // 2
-            here = self.digest(middle)
-            if here == self.digest(a):
-                a = middle
-                continue
-            if here != self.digest(b):
-                heapq.heappush(pending, (middle, b))
-            b = middle
-        return a, b
+    def changes(self, a: int, b: int) -> Iterator[tuple[int, int, dict[int, DecisionHistory]]]:
+        """Yield adjacent ordinals with different histories, upward, and the runs that were made to find them.
+
+        Cells whose ends have the same history are not searched.
+        """
+        pending = [(a, b)]
+        while pending:
+            (a, b), runs = pending.pop(), dict[int, DecisionHistory]()
+            while b - a > 1:
+                middle = (a + b) // 2
+                here = self.digest(middle)
+                runs[middle] = self.known[middle]
+                if here == self.digest(a):
+                    a = middle
+                    continue
+                if here != self.digest(b):
+                    pending.append((middle, b))
+                b = middle
+            yield a, b, runs
 
     def boundary(self, below: int, above: int) -> Boundary | None:
         """Find the first differing decision of the runs at two ordinals; None if a run fails earlier."""
@@ -211,6 +220,8 @@ def boundaries(
     loss: Callable[..., float] | None = None,
     confirm: bool = True,
     progress: Progress | None = None,
+    on: str | Executor | None = None,
+    workers: int | None = None,
 ) -> BoundaryMap:
     """Find the values of a parameter at which the decisions of a run change, within the resolution of a grid.
 
@@ -225,6 +236,7 @@ def boundaries(
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.
         cells: number of grid cells. If there are no more floats than this, a run is made for every float.
         progress: called with the number of items done, their total, and a dictionary: the phase and the unit.
+        on, workers: where to compute, as for `mdnum.sweep`; by default in this process.
 
     Raises:
         InputError: the parameter does not exist, the interval is empty, or a value is invalid.
@@ -240,24 +252,56 @@ def boundaries(
     line = NumberLine(program, checked(program, key, low, high), last, loss)
     places = _grid(line, low, high, cells)
     note = progress or (lambda done, total, info: None)
-    for k, place in enumerate(places):
-        note(k, len(places), {"phase": "running a grid", "unit": "runs"})
-        line.digest(place)
-    pending = [(a, b) for a, b in pairwise(places) if line.digest(a) != line.digest(b)]
-    heapq.heapify(pending)
-    found: list[tuple[int, int]] = []
-    while pending and len(found) < most:
-        total = min(most, len(found) + len(pending))
-        note(len(found), total, {"phase": "bisecting", "unit": "boundaries"})
-        found.append(line.bisect(*heapq.heappop(pending), pending))
-    edges = []
-    for k, place in enumerate(sorted(found)):
-        note(k, len(found), {"phase": "comparing both sides", "unit": "boundaries"})
-        edge = line.boundary(*place)
-        edges += [] if edge is None else [edge]
+    with engines.requested(on, workers) as engine:
+        own = line if engine is None else packed(system, line.number.key, last, loss)
+        runs = engines.in_order(_run, ((own, place) for place in places), engine)
+        for k, place in enumerate(places):
+            note(k, len(places), {"phase": "running a grid", "unit": "runs"})
+            line.known[place] = next(runs)
+        cells = [ends for ends in pairwise(places) if len({line.digest(place) for place in ends}) > 1]
+        edges, count = list[Boundary](), 0
+        # a cell is searched here only after those below it, and then not for more boundaries than are left
+        tasks = ((own, {end: line.known[end] for end in ends}, most - count) for ends in cells)
+        searched = engines.in_order(_searched, tasks, engine)
+        for k in range(len(cells)):
+            if count == most:
+                break
+            note(count, min(most, count + len(cells) - k), {"phase": "bisecting", "unit": "boundaries"})
+            for edge, runs_made in next(searched)[: most - count]:
+                line.known |= runs_made
+                edges += [] if edge is None else [edge]
+                count += 1
     if confirm and edges:
         edges = _confirmed(system, line, edges, note)
     return _mapped(line, edges)
+
+
+def _line_of(own: NumberLine | bytes) -> NumberLine:
+    return _unpacked_line(own) if isinstance(own, bytes) else own
+
+
+@lru_cache(1)
+def _unpacked_line(data: bytes) -> NumberLine:
+    system, key, steps, loss = unpacked(data)
+    program = program_of(system, steps)
+    return NumberLine(program, program.number(key), steps, loss)
+
+
+def _run(task: tuple[NumberLine | bytes, int]) -> DecisionHistory:
+    """Run the program at one ordinal."""
+    line, place = _line_of(task[0]), task[1]
+    line.digest(place)
+    return line.known[place]
+
+
+def _searched(
+    task: tuple[NumberLine | bytes, dict[int, DecisionHistory], int],
+) -> list[tuple[Boundary | None, dict[int, DecisionHistory]]]:
+    """Return the lowest boundaries in a cell with two known ends, and the runs made to find each."""
+    own, ends, most = task
+    line = _line_of(own)
+    line.known |= ends
+    return [(line.boundary(a, b), runs) for a, b, runs in islice(line.changes(*ends), most)]
 
 
 def checked(program: Program, key: str, low: float, high: float) -> Number:
@@ -287,17 +331,36 @@ def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
 
 
 def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progress) -> list[Boundary]:
-    """Repeat the runs on both sides of each boundary in a new process, and record any disagreement."""
-    sides = [side for boundary in found for side in (boundary.below, boundary.above)]
-    digests = digests_elsewhere(
-        system,
-        line.number.key,
-        line.steps,
-        [side.at for side in sides],
-        lambda done: note(done, len(sides), {"phase": "confirming in a fresh process", "unit": "runs"}),
-    )
-    same = [side.digest == digest for side, digest in zip(sides, digests, strict=True)]
-    return [replace(edge, confirmed=all(same[2 * k : 2 * k + 2])) for k, edge in enumerate(found)]
+    """Mark each boundary as confirmed or not, by repeating the runs on both sides in a fresh process."""
+    sides = [(edge.below, edge.above) for edge in found]
+    values = [side.at for both in sides for side in both]
+    digests = iter(digests_elsewhere(system, line.number.key, line.steps, values))
+    edges = []
+    for k, (edge, both) in enumerate(zip(found, sides, strict=True)):
+        note(2 * k, len(values), {"phase": "confirming in a fresh process", "unit": "runs"})
+        same = [next(digests) == side.digest for side in both]
+        edges.append(replace(edge, confirmed=all(same)))
+    return edges
+
+
+def digests_elsewhere(
+    system: Simulation | BallSystem, key: str, steps: int, values: Sequence[float]
+) -> Iterator[str]:
+    """Yield the digests of all decisions of runs in a fresh process, to confirm boundaries independently.
+
+    The system is restored there bit for bit, and its program is compiled again under the same environment.
+
+    Raises:
+        MdnumError: the process failed.
+    """
+    with engines.opened(None, 1) as fresh:
+        data = packed(system, key, steps)
+        yield from engines.in_order(_digest, ((data, value) for value in values), fresh)
+
+
+def _digest(task: tuple[bytes, float]) -> str:
+    system, key, steps = unpacked(task[0])
+    return program_of(system, steps).number(key).at(task[1]).history(steps).digest
 
 
 def _mapped(line: NumberLine, found: list[Boundary]) -> BoundaryMap:

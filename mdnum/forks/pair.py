@@ -11,6 +11,7 @@ from jaxtyping import Shaped
 
 from mdnum.errors import InputError, expect_at_least
 from mdnum.forks.choices import Choice, shipped, twin_or_reason, world_of
+from mdnum.forks.worlds import packed, unpacked
 from mdnum.numerics.verdicts import (
     FEWEST,
     PATIENCE,
@@ -29,9 +30,12 @@ from mdnum.numerics.verdicts import (
 )
 from mdnum.plain import result
 from mdnum.program import Decision, PairRows, Progress, Twin
+from mdnum.sweeps import engines
 from mdnum.systems import BallSystem
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from mdnum.systems.simulation import Simulation
 
 #: Split tolerance as a share of the longest cutoff or the largest initial height. Flips separate the runs of
@@ -347,6 +351,8 @@ def screen(
     steps: int | None = None,
     choices: Sequence[Choice] | None = None,
     progress: Callable[[int, int, str], None] | None = None,
+    on: str | Executor | None = None,
+    workers: int | None = None,
 ) -> list[Screened]:
     """Compare runs of a system for every numerical choice, without counterfactual runs; earliest fork first.
 
@@ -355,6 +361,7 @@ def screen(
         steps: last step of each run; default the system's own.
         choices: choices to test; default all built-in choices of the system's world.
         progress: called with the number of choices done, their total, and the name of the next choice.
+        on, workers: where to compute, as for `mdnum.sweep`; by default in this process.
 
     Raises:
         InputError: no choice is given, or steps is below 1.
@@ -363,23 +370,28 @@ def screen(
     if not choices:
         raise InputError("no choice to screen was given", remedy="Give at least one choice")
     rows: list[Screened] = []
-    for done, choice in enumerate(choices):
-        if progress is not None:
-            progress(done, len(choices), choice.name)
-        twin = twin_or_reason(choice, system)
-        if isinstance(twin, str):
-            rows.append(Screened(choice.name, twin, None, None, None, choice.must_hold, twin))
-            continue
-        found = fork(twin, steps, counterfactual=False, repeats=0)
-        dates = found.dates
-        failed = ", ".join(f"{word} of {name}" for name, word in found.failed.items())
-        date = dates.first_bit, dates.fork, dates.split
-        rows.append(
-            Screened(choice.name, twin.difference, *date, choice.must_hold, None, found.steps, failed)
-        )
+    with engines.requested(on, workers) as engine:
+        sent = system if engine is None else packed(system)
+        found = engines.in_order(_screened, [(sent, choice, steps) for choice in choices], engine)
+        for done, choice in enumerate(choices):
+            if progress is not None:
+                progress(done, len(choices), choice.name)
+            rows.append(next(found))
 
     def rank(row: Screened) -> tuple[float, ...]:
         dates = (np.inf if date is None else date for date in (row.fork, row.first_bit, row.split))
         return row.reason_unavailable is not None, *dates
 
     return sorted(rows, key=rank)
+
+
+def _screened(task: tuple[Any, Choice, int | None]) -> Screened:
+    system, choice, steps = task
+    twin = twin_or_reason(choice, unpacked(system)[0] if isinstance(system, bytes) else system)
+    if isinstance(twin, str):
+        return Screened(choice.name, twin, None, None, None, choice.must_hold, twin)
+    found = fork(twin, steps, counterfactual=False, repeats=0)
+    dates = found.dates
+    failed = ", ".join(f"{word} of {name}" for name, word in found.failed.items())
+    date = dates.first_bit, dates.fork, dates.split
+    return Screened(choice.name, twin.difference, *date, choice.must_hold, None, found.steps, failed)

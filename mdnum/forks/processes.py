@@ -1,12 +1,12 @@
-"""Separate processes that repeat decisions, or run one system in several differently compiled programs.
+"""Separate processes that run one system in several differently compiled programs.
 
 Programs of one system (compiled or not, batched, inside a gradient, for other processors) compute the same
 formulas, but may round differently. XLA flags apply to a whole process, so each variant of a program runs in
 its own process. Variants whose positions have equal hashes at every step are numerically the same program; if
 the hashes differ, the pattern of agreement between variants reveals the cause.
 
-`python -m mdnum.forks.processes FILE` executes the task described in a JSON file. For `digests_elsewhere`,
-the process prints one digest per line; for `variants`, the process writes a file with an array of positions.
+`python -m mdnum.forks.processes FILE` executes the task described in a JSON file, and writes a file with an
+array of positions.
 """
 
 from __future__ import annotations
@@ -22,15 +22,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from threading import Lock, Timer
-from types import MappingProxyType
+from threading import Lock
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError, MdnumError
-from mdnum.forks.worlds import program_of, varied
+from mdnum.forks.worlds import varied
 from mdnum.plain import result
 from mdnum.safe_path import environment, python
 from mdnum.systems import BallSystem, System, opened
@@ -202,7 +201,7 @@ def _ran(variant: Variant, question: Mapping[str, Any], file: Path) -> tuple[Ran
     # a program cached by another variant must not answer for this one; these flags are a CPU's
     settings = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
     begin = time.perf_counter()
-    failed = _ask(asked, file.with_suffix(".json"), timeout=_TIMEOUT, settings=settings)
+    failed = _ask(asked, file.with_suffix(".json"), settings)
     seconds = time.perf_counter() - begin
     x = np.zeros(0) if failed else np.load(out)
     if not len(x):
@@ -346,54 +345,6 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
     return ours
 
 
-# --- histories in a fresh process ---------------------------------------------------------------------
-
-
-def digests(system: Simulation | BallSystem, key: str, steps: int, values: Sequence[float]) -> list[str]:
-    """Compute digests of all decisions of a run, for each of several values of a parameter."""
-    number = program_of(system, steps).number(key)
-    return [number.at(value).history(steps).digest for value in values]
-
-
-def digests_elsewhere(
-    system: Simulation | BallSystem,
-    key: str,
-    steps: int,
-    values: Sequence[float],
-    progress: Callable[[int], None] | None = None,
-) -> list[str]:
-    """Compute digests of decisions in a new process, to confirm boundaries independently.
-
-    The system is written to a folder and read from there without rounding, and its program is compiled again
-    in the same environment.
-
-    Args:
-        progress: called with the number of known digests, at the start and after each one.
-
-    Raises:
-        MdnumError: the process failed.
-    """
-    found: list[str] = []
-
-    def heard(digest: str) -> None:
-        found.append(digest)
-        if progress is not None:
-            progress(len(found))
-
-    if progress is not None:
-        progress(0)
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        asked = {"key": key, "values": [value.hex() for value in values]}
-        failed = _ask({**_question(system, steps, folder), **asked}, folder / "question.json", heard)
-    if failed or len(found) != len(values):
-        raise MdnumError(
-            f"the process that confirms boundaries failed: {failed or 'no message'}",
-            remedy="Run `mdnum doctor`",
-        )
-    return found
-
-
 def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
     """Return a system in a form from which another process can recreate it, bit for bit.
 
@@ -419,48 +370,23 @@ def _question(system: Simulation | BallSystem, steps: int, folder: Path) -> dict
     return {"path": str(path), "steps": steps, "code": is_allowed()}
 
 
-def _ask(
-    question: Mapping[str, Any],
-    file: Path,
-    heard: Callable[[str], None] = lambda line: None,
-    timeout: float | None = None,
-    settings: Mapping[str, str] = MappingProxyType({}),
-) -> str:
+def _ask(question: Mapping[str, Any], file: Path, settings: Mapping[str, str]) -> str:
     """Run a process that executes a task; return the reason if the process fails, and "" otherwise.
 
-    `heard` is called with each line that the process prints; `settings` are environment variables.
+    `settings` are environment variables.
     """
     file.write_text(json.dumps(question))
-    command, late = python("-m", "mdnum.forks.processes", str(file)), []
-    # what it prints on stderr may be long, and nobody reads a pipe meanwhile
-    with tempfile.TemporaryFile("w+", errors="replace") as errors:
-        with subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            text=True,
-            env=environment(**settings),
-        ) as process:
-            assert process.stdout is not None
-            timer = Timer(timeout or 0.0, lambda: (late.append(timeout), process.kill()))
-            try:
-                if timeout is not None:
-                    timer.start()
-                for line in process.stdout:
-                    heard(line.strip())
-            except BaseException:
-                process.kill()
-                raise
-            finally:
-                timer.cancel()
-        if not process.returncode:
-            return ""
-        errors.seek(0)
-        lines = [line.strip() for line in errors if line.strip()]
-    if late:
-        return f"took longer than {timeout:g} s"
-    return lines[-1] if lines else f"ended with exit code {process.returncode}"
+    try:
+        done = subprocess.run(
+            python("-m", "mdnum.forks.processes", str(file)), stdin=subprocess.DEVNULL, capture_output=True,
+            text=True, errors="replace", env=environment(**settings), timeout=_TIMEOUT,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return f"took longer than {_TIMEOUT:g} s"
+    if not done.returncode:
+        return ""
+    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    return lines[-1] if lines else f"ended with exit code {done.returncode}"
 
 
 def main() -> None:
@@ -468,10 +394,6 @@ def main() -> None:
     question: dict[str, Any] = json.loads(Path(sys.argv[-1]).read_text())
     with allow_code(question["code"]):
         system = opened(question["path"])
-    if "values" in question:
-        for value in question["values"]:
-            print(*digests(system, question["key"], question["steps"], [float.fromhex(value)]), flush=True)
-        return
     if question["reduction"]:
         system = varied(system, {"precision.reduction": question["reduction"]})
     assert not isinstance(system, BallSystem)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from mdnum.ball.limits import DTYPES, rounded
 from mdnum.program import Program, Twin
-from mdnum.systems import BallSystem
+from mdnum.systems import BallSystem, opened
+from mdnum.systems.code import allow_code, is_allowed
 from mdnum.systems.toml import flat
 
 if TYPE_CHECKING:
@@ -42,6 +44,27 @@ def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Pro
     from mdnum.systems.build import build
 
     return MdProgram(build(system))
+
+
+def packed(system: Simulation | BallSystem, *more: Any) -> bytes:
+    """Pickle a system, with further objects, for other processes, which `unpacked` restores bit for bit.
+
+    A system that was loaded from a file is built again from the file: its code is a module only here.
+    """
+    import cloudpickle
+
+    own = system if isinstance(system, BallSystem) else system.file or system
+    return cloudpickle.dumps((is_allowed(), own, *more))
+
+
+@lru_cache(1)
+def unpacked(data: bytes) -> tuple[Any, ...]:
+    """Restore what `packed` pickled; the last one is kept, so that its programs are compiled once."""
+    import cloudpickle
+
+    allowed, own, *more = cloudpickle.loads(data)
+    with allow_code(allowed):
+        return opened(own), *more
 
 
 def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> Any:

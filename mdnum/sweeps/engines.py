@@ -1,7 +1,7 @@
-"""Execution of a sweep's tasks by a `concurrent.futures.Executor`; by default in processes on all cores.
+"""Execution of tasks by a `concurrent.futures.Executor`; by default in processes on all cores.
 
-An engine (executor) only starts processes. Whether a point was computed is determined from the folder of the
-point, not from the engine, so that a worker process that dies loses only its current point.
+An engine (executor) only starts processes. Whether a point of a sweep was computed is determined from the
+folder of the point, not from the engine, so that a worker process that dies loses only its current point.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ import pickle
 import secrets
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager, suppress
 from copy import deepcopy
@@ -24,10 +25,11 @@ from pathlib import Path
 from time import sleep
 from typing import Any
 
-from mdnum.errors import InputError
+from mdnum.errors import InputError, MdnumError
 from mdnum.provenance import cores
 from mdnum.reading import whole_text
 from mdnum.safe_path import guard
+from mdnum.sweeps.points import code
 from mdnum.systems import toml
 
 #: Number of times that the process of a task may die before the task counts as failed; the last time the task
@@ -69,12 +71,19 @@ def _pinned(width: int) -> None:
 
 
 def _answered(
-    work: Callable[[Any], Any], task: Any, caller: tuple[str, int], width: int
+    work: Callable[[Any], Any], task: Any, caller: tuple[str, int, str], width: int
 ) -> tuple[Any, Exception | None]:
     """Return a task's result or its exception, so that only errors of the engine itself are raised."""
-    if (socket.gethostname(), os.getpid()) != caller:
+    host, pid, versions = caller
+    if (socket.gethostname(), os.getpid()) != (host, pid):
         _pinned(width)
     try:
+        if code() != versions:
+            raise InputError(
+                "a worker has another version of mdnum, jax or numpy than the process that started it",
+                where=f"{sys.prefix} on {socket.gethostname()}",
+                remedy="Use the same environment: results depend on these versions",
+            )
         return work(task), None
     except Exception as error:
         with suppress(Exception):
@@ -83,7 +92,7 @@ def _answered(
         return None, RuntimeError(f"{type(error).__name__}: {error}")
 
 
-class _Engine:
+class Engine:
     """An executor of tasks, which can be replaced when broken, and closed at the end."""
 
     def __init__(
@@ -110,7 +119,7 @@ class _Engine:
                 self.end(self.executor)
 
 
-def _local(workers: int | None) -> _Engine:
+def _local(workers: int | None) -> Engine:
     """Return an engine that starts local processes, which do not import the main script of the user."""
     from loky import get_reusable_executor  # noqa: F401 (its pool starts processes by fork and exec)
     from loky.backend.context import get_context
@@ -118,13 +127,13 @@ def _local(workers: int | None) -> _Engine:
 
     count = workers or cores()
     context, of = get_context("loky"), (os.getpid(),)
-    return _Engine(
+    return Engine(
         lambda: ProcessPoolExecutor(count, context=context, initializer=guard, initargs=of), count,
         max(1, cores() // count), lambda pool: pool.shutdown(wait=False, kill_workers=True),  # type: ignore[call-arg]
     )  # fmt: skip
 
 
-def _dask(address: str, workers: int | None) -> _Engine:
+def _dask(address: str, workers: int | None) -> Engine:
     try:
         from dask.distributed import Client
     except ImportError:
@@ -138,7 +147,7 @@ def _dask(address: str, workers: int | None) -> _Engine:
         return clients[0].get_executor(pure=False, retries=0)
 
     try:
-        engine = _Engine(make, 1, 1, lambda _: clients[0].close(timeout=5))
+        engine = Engine(make, 1, 1, lambda _: clients[0].close(timeout=5))
     except OSError as error:
         remedy = "Start the scheduler and a worker: dask scheduler; dask worker tcp://host:port"
         raise InputError(f"no dask scheduler responds: {error}", where=address, remedy=remedy) from None
@@ -148,7 +157,7 @@ def _dask(address: str, workers: int | None) -> _Engine:
     return engine
 
 
-def _executorlib(file: str, workers: int | None) -> _Engine:
+def _executorlib(file: str, workers: int | None) -> Engine:
     """Return an engine from executorlib, with the class (default SLURM jobs) and keywords in a TOML file."""
     try:
         import executorlib  # pyright: ignore[reportMissingImports]
@@ -197,7 +206,7 @@ def _executorlib(file: str, workers: int | None) -> _Engine:
             # of those at work: the others have ended their jobs
             subprocess.run(["scancel", f"--name={job}"], capture_output=True)
 
-    return _Engine(
+    return Engine(
         make, int(keywords.get("max_workers", 1)), int(resources.get("threads_per_core", 1)), end,
         ExecutorlibSocketError, lambda: all(thread.is_alive() for thread in feeders),
     )  # fmt: skip
@@ -211,17 +220,22 @@ def _ends_with(parent: int) -> dict[str, Any]:
 
 
 @contextmanager
-def opened(on: str | Executor | None, workers: int | None) -> Iterator[_Engine]:
+def opened(on: str | Executor | Engine | None, workers: int | None) -> Iterator[Engine]:
     """Context manager: make an engine from None (local processes), a dask address, a file or an executor.
+
+    An engine remains open.
 
     Raises:
         InputError: the engine is unknown, or its package is not installed.
     """
+    if isinstance(on, Engine):
+        yield on
+        return
     if on is None:
         engine = _local(workers)
     elif not isinstance(on, str):
         width = workers or getattr(on, "_max_workers", cores())
-        engine = _Engine(lambda: on, width, max(1, cores() // width))
+        engine = Engine(lambda: on, width, max(1, cores() // width))
     elif on.startswith(("tcp://", "tls://", "ucx://")):
         engine = _dask(on, workers)
     elif on.endswith(".toml"):
@@ -238,7 +252,7 @@ def computed(
     work: Callable[[Any], Any],
     tasks: Sequence[Any],
     *,
-    on: str | Executor | None = None,
+    on: str | Executor | Engine | None = None,
     workers: int | None = None,
     lost: Callable[[Any, str], bool] = lambda task, why: True,
 ) -> Iterator[tuple[Any, Any]]:
@@ -257,7 +271,7 @@ def computed(
         InputError: no such engine, or an engine that fails repeatedly.
     """
     waiting, alone, tries, idle = deque(range(len(tasks))), deque[int](), [0] * len(tasks), 0
-    caller = socket.gethostname(), os.getpid()
+    caller = socket.gethostname(), os.getpid(), code()
     with opened(on, workers) as engine:
         running: dict[Future[Any], int] = {}
         try:
@@ -310,6 +324,48 @@ def computed(
         finally:
             for future in running:
                 future.cancel()
+
+
+@contextmanager
+def requested(on: str | Executor | None, workers: int | None) -> Iterator[Engine | None]:
+    """Context manager of the engine that was requested; None, which stands for this process, if none was."""
+    if on is None and workers is None:
+        yield None
+        return
+    with opened(on, workers) as engine:
+        yield engine
+
+
+def in_order(
+    work: Callable[[Any], Any], tasks: Iterable[Any], engine: Engine | None, *, keep: bool = False
+) -> Iterator[Any]:
+    """Yield the results of tasks in the order of the tasks.
+
+    Args:
+        work: function that processes a task; the result must not depend on the process.
+        tasks: with None as engine, a task is taken and processed only when its result is requested.
+        keep: whether to yield the error of a task instead of raising it.
+
+    Raises:
+        MdnumError: a task failed, or three processes that were working on it ended without a result.
+    """
+    if engine is None:
+        yield from map(work, tasks)
+        return
+    found, next_one = dict[int, Any](), 0
+    for (k, _), result in computed(partial(_numbered, work), list(enumerate(tasks)), on=engine):
+        found[k] = result
+        if isinstance(result, BaseException) and not isinstance(result, MdnumError):
+            found[k] = MdnumError(f"a worker gave no result: {type(result).__name__}: {result}")
+        while next_one in found:
+            result, next_one = found.pop(next_one), next_one + 1
+            if isinstance(result, MdnumError) and not keep:
+                raise result
+            yield result
+
+
+def _numbered(work: Callable[[Any], Any], task: tuple[int, Any]) -> Any:
+    return work(task[1])
 
 
 def _error(future: Future[Any]) -> BaseException | None:

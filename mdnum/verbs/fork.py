@@ -28,6 +28,8 @@ from mdnum.verbs.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_
 from mdnum.verbs.frame import Keep, Outcome, View
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from matplotlib.figure import Figure as Canvas
 
     from mdnum.forks import Fork
@@ -131,7 +133,12 @@ def _asked_by_default(system: Any) -> Mapping[str, Any]:
 
 @frame.keywords_checked
 def fork_screen(
-    system: Simulation | System | BallSystem | str | Path, *, steps: int | None = None, **keep: Unpack[Keep]
+    system: Simulation | System | BallSystem | str | Path,
+    *,
+    steps: int | None = None,
+    on: str | Executor | None = None,
+    workers: int | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Run a system once per choice, and rank the choices by the step at which decisions first differ.
 
@@ -143,6 +150,7 @@ def fork_screen(
     Args:
         system: as for `fork`.
         steps: last step; by default that of the [fork] table, or the system's own.
+        on, workers: where to compute, as for `mdnum.sweep`; by default in this process.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
@@ -159,7 +167,7 @@ def fork_screen(
         def note(done: int, count: int, name: str) -> None:
             answer.log(done, count, {"phase": f"{name} ({done + 1} of {count})"})
 
-        answer.result = screen(loaded, steps, progress=note)
+        answer.result = screen(loaded, steps, progress=note, on=on, workers=workers)
         ran = [row for row in answer.result if row.reason_unavailable is None]
         left = [row for row in answer.result if row.reason_unavailable is not None]
         answer.summary = basics(loaded, steps) | {

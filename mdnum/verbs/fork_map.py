@@ -21,6 +21,8 @@ from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step, of_md
 from mdnum.verbs.frame import Keep, Outcome, View
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from mdnum.forks.boundaries import Boundary
     from mdnum.rollout.program import Loss
     from mdnum.systems import BallSystem, System
@@ -72,6 +74,8 @@ def fork_map(
     most: int | None = None,
     loss: Loss | None = None,
     confirm: bool = True,
+    on: str | Executor | None = None,
+    workers: int | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
     """Find the values of a parameter at which decisions of a run change, each between two adjacent floats.
@@ -91,6 +95,8 @@ def fork_map(
             default the mean squared displacement from the start. The loss of a ball is that of its file.
         confirm: whether to run both sides of every boundary again in a new process; not for a simulation made
             from objects, which exists only in this process.
+        on, workers: where to compute, as for `mdnum.sweep`; by default in this process. The confirmation
+            always has a process of its own on this machine.
         keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
@@ -123,7 +129,7 @@ def fork_map(
     with frame.answering("map", f"fork-{loaded.name}", loaded, **keep) as answer:
         answer.result = found = boundaries(
             loaded, spelled.key, low, high, last, cells=cells, most=most, loss=loss, confirm=confirm,
-            progress=answer.log,
+            progress=answer.log, on=on, workers=workers,
         )  # fmt: skip
         answer.folder.told = {"units": {"parameter": spelled.unit, "loss": lost[1]}}
         edges, intervals = [_row(edge) for edge in found.boundaries], plain(found.intervals)

@@ -234,7 +234,7 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
         return [str(one).removeprefix(str(place)), digest(file)] if file.is_file() else str(one)
 
     values = {**asked, **asked.get("keep", {}), **asked.get("asked", {})}
-    for name in ("keep", "asked", "out", "report", "progress"):
+    for name in ("keep", "asked", "out", "report", "progress", "on", "workers"):
         values.pop(name, None)
     try:
         if values.get("system") is not None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import socket
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +14,7 @@ import numpy as np
 from mdnum.errors import FolderError, InputError, MdnumError
 from mdnum.sweeps.measures import Sample, chosen, measured
 from mdnum.sweeps.plan import resolved
-from mdnum.sweeps.points import Workspace, code, write_result
+from mdnum.sweeps.points import Workspace, write_result
 from mdnum.systems.code import allow_code
 from mdnum.verbs import sweep_measures  # noqa: F401  adds measures
 
@@ -60,12 +58,6 @@ def work(task: Task) -> list[dict[str, Any]]:
     """
     place, told = Workspace(Path(task.workspace)), []
     for point in task.points:
-        if point["state"]["code"] != code():
-            raise InputError(
-                "a worker has another version of mdnum, jax or numpy than the sweep",
-                where=f"{sys.prefix} on {socket.gethostname()}",
-                remedy="Use the environment of the sweep: stored points depend on these versions",
-            )
         address, status, why = point["address"], "there", ""
         if not enough(place.result(address), task.measures):
             with place.claimed(address) as mine:
