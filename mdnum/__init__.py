@@ -92,6 +92,7 @@ if TYPE_CHECKING:
     from mdnum.verbs.conform import conform as conform
     from mdnum.verbs.demos import demonstrate as demonstrate
     from mdnum.verbs.flips import flips as flips
+    from mdnum.verbs.flips import flips_each as flips_each
     from mdnum.verbs.fork import fork as fork
     from mdnum.verbs.fork import fork_benign as fork_benign
     from mdnum.verbs.fork import fork_folders as fork_folders

@@ -127,8 +127,10 @@ def _local(workers: int | None) -> Engine:
 
     count = workers or cores()
     context, of = get_context("loky"), (os.getpid(),)
+    # loky replaces a worker that has grown by 300 MB, which compiled programs take soon; guard limits memory
+    env = {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e15"}
     return Engine(
-        lambda: ProcessPoolExecutor(count, context=context, initializer=guard, initargs=of), count,
+        lambda: ProcessPoolExecutor(count, context=context, initializer=guard, initargs=of, env=env), count,
         max(1, cores() // count), lambda pool: pool.shutdown(wait=False, kill_workers=True),  # type: ignore[call-arg]
     )  # fmt: skip
 

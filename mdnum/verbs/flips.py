@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -16,11 +18,14 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from mdnum.errors import InputError, MdnumError, expect_at_least, expect_path
+from mdnum.plain import headed
 from mdnum.store import RunFolder
+from mdnum.store.files import default_folder
 from mdnum.store.tables import TableStream, as_numpy
+from mdnum.verbs import Reply
 from mdnum.verbs.flips_page import judge, page
 from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, as_python, ending, selected, stem
-from mdnum.verbs.frame import Answer, Keep, Outcome, Progress, Verb, answering, keywords_checked, refuse
+from mdnum.verbs.frame import Answer, Keep, Outcome, Progress, Verb, answering, keywords_checked, refuse, say
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Pass
@@ -154,6 +159,103 @@ def flips(
             of = opened.count or 0
             one.interrupted = one.rows.drain(one.answer.folder, one.passes, one.found, of, one.answer.log)
     return one.answer.outcome
+
+
+@partial(keywords_checked, more=[*inspect.signature(flips).parameters][2:-1])
+def flips_each(
+    trajectories: Sequence[str | Path],
+    *,
+    out: str | Path = "runs",
+    on: str | Executor | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> list[Outcome | MdnumError]:
+    """Find the flips in each of several trajectories, such as replicas, independently of each other.
+
+    Example:
+        >>> mdnum.flips_each(["a.xtc", "b.xtc"], topology="a.gro", cutoffs=[4.0], workers=2)
+
+    Args:
+        trajectories: files, as for `flips`.
+        out: folder in which a new folder is created for each trajectory.
+        on, workers: where to compute, as for `mdnum.sweep`; by default in this process.
+        progress: see `mdnum.verbs.frame.Keep`.
+        options: options of `flips`, which apply to every trajectory.
+
+    Returns:
+        an outcome for each trajectory, or the error if the trajectory cannot be used, in the order of the
+        trajectories.
+
+    Raises:
+        InputError: no such engine, or an engine that fails repeatedly.
+    """
+    from mdnum.sweeps import engines
+
+    if isinstance(trajectories, str | Path):
+        raise InputError("expected several files", where=str(trajectories), remedy="Give a list of files")
+    if options.get("topology") is not None:
+        options["topology"] = Path(options["topology"]).absolute()
+    tasks = [(Path(one).absolute(), Path(out).absolute(), options) for one in trajectories]
+    made = list[Outcome | MdnumError]()
+    with engines.requested(on, workers) as engine:
+        results = engines.in_order(_examined, tasks, engine, keep=True)
+        for done, (file, *_) in enumerate(tasks):
+            say(progress, f"{file.name} ({done + 1} of {len(tasks)})", done, len(tasks), unit="files")
+            made.append(one := next(results))
+            if isinstance(one, Outcome) and one.summary["interrupted"]:
+                raise KeyboardInterrupt
+    return made
+
+
+def _examined(task: tuple[Path, Path, Mapping[str, Any]]) -> Outcome | MdnumError:
+    file, out, options = task
+    folder = None
+    try:
+        folder = default_folder(f"flips-{file.name.partition('@')[0].partition('.')[0]}", out)
+        return replace(flips(file, out=folder, progress=False, **options), result=None)
+    except MdnumError as error:
+        with suppress(OSError):
+            folder and folder.rmdir()  # nothing was written
+        return error
+
+
+def command(
+    trajectory: str, other: str | None = None, more: Sequence[str] | None = None, *, each: bool = False,
+    on: str | None = None, workers: int | None = None, **given: Any,
+) -> Outcome | Reply:  # fmt: skip
+    """Execute `mdnum flips`.
+
+    Raises:
+        InputError: more than two trajectories, or an option of several, without `--each`.
+    """
+    if each:
+        given |= {name: one for name, one in {"on": on, "workers": workers}.items() if one is not None}
+        return _replied([one for one in (trajectory, other, *(more or ())) if one is not None], **given)
+    remedy = "Add --each to examine each trajectory separately"
+    refuse({"on": on is not None, "workers": workers is not None}, "of --each", remedy)
+    if more:
+        raise InputError("more than two trajectories cannot be compared", where=more[0], remedy=remedy)
+    return flips(trajectory, other, **given)
+
+
+def _replied(trajectories: Sequence[str], **given: Any) -> Reply:
+    rows, fine = [], True
+    for file, one in zip(trajectories, flips_each(trajectories, **given), strict=True):
+        if isinstance(one, Outcome):
+            found = [finding.code for finding in one.findings if finding.severity in ("warning", "error")]
+            told = {"folder": one.path, "frames": one.summary["frames"], "headline": one.verdict.headline,
+                    "flips": [rule["flips"] for rule in one.summary["rules"]], "error": None}  # fmt: skip
+        else:
+            found, told = [], dict.fromkeys(("folder", "frames", "headline", "flips")) | {"error": str(one)}
+        rows.append({"file": file, **told, "findings": found})
+        fine = fine and not found and isinstance(one, Outcome)
+    lines = [
+        (row["file"], row["error"] or row["headline"], ", ".join(row["findings"]), row["folder"])
+        for row in rows
+    ]
+    shown = [("", ("file", "result", "warnings and errors", "folder"), lines)]
+    return Reply(headed("flips-each", {"files": rows}), shown, "complete" if fine else "failed")
 
 
 @dataclass

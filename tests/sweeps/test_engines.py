@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from mdnum.errors import InputError
-from mdnum.sweeps.engines import computed
-from mdnum.verbs.sweep_worker import Task, work
+from mdnum.sweeps.engines import computed, in_order, requested
 
 
 class Twice(Exception):
@@ -43,11 +42,38 @@ def test_an_exception_of_the_work_is_an_answer():
     assert isinstance(found[2], RuntimeError) and str(found[2]) == "Twice: read by nobody"
 
 
-def test_a_worker_of_other_code_computes_nothing(tmp_path):
-    point = {"address": "0" * 32, "state": {"code": "another", "system": {}}, "settings": {}}
-    with pytest.raises(InputError, match="another version of mdnum"):
-        work(Task(str(tmp_path), (point,), "argon/crystal-108", {}, {"energy": ""}, False, False))
-    assert not list((tmp_path / "workspace").iterdir())
+def test_a_worker_of_other_code_computes_nothing(tmp_path, monkeypatch):
+    versions = iter(["of this process", "of the worker"])
+    monkeypatch.setattr("mdnum.sweeps.engines.code", lambda: next(versions))
+    with ThreadPoolExecutor(1) as pool:
+        ((_, error),) = computed(noted, [str(tmp_path)], on=pool)
+    assert isinstance(error, InputError) and "another version of mdnum" in str(error)
+    assert not list(tmp_path.iterdir())
+
+
+def doubled(task: int) -> int:
+    if task == 3:
+        raise InputError("three")
+    return 2 * task
+
+
+def test_results_come_in_the_order_of_tasks_and_here_no_sooner_than_requested():
+    taken: list[int] = []
+
+    def tasks():
+        for task in (2, 1, 3, 4):
+            taken.append(task)
+            yield task
+
+    here = in_order(doubled, tasks(), None)
+    assert (next(here), taken) == (4, [2])
+    with ThreadPoolExecutor(2) as pool, requested(pool, 2) as engine, requested(None, None) as none:
+        assert none is None and engine is not None
+        kept = [*in_order(doubled, tasks(), engine, keep=True)]
+        assert [one for one in kept if isinstance(one, int)] == [4, 2, 8] and str(kept[2]) == "three."
+        # the engine serves several calls
+        with pytest.raises(InputError, match="three"):
+            list(in_order(doubled, tasks(), engine))
 
 
 SWEEP = """

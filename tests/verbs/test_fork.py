@@ -235,7 +235,8 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch, name):
     ]
     seen = []
 
-    def screen(system, steps, progress):
+    def screen(system, steps, progress, on, workers):
+        assert (on, workers) == (None, None)
         progress(0, 4, "early")
         return rows
 
