@@ -331,7 +331,7 @@ def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
 
 
 def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progress) -> list[Boundary]:
-    """Mark each boundary as confirmed or not, by repeating the runs on both sides in a fresh process."""
+    """Mark each boundary as confirmed or not, by repeating the runs on both sides in a new process."""
     sides = [(edge.below, edge.above) for edge in found]
     values = [side.at for both in sides for side in both]
     digests = iter(digests_elsewhere(system, line.number.key, line.steps, values))
@@ -346,7 +346,7 @@ def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progr
 def digests_elsewhere(
     system: Simulation | BallSystem, key: str, steps: int, values: Sequence[float]
 ) -> Iterator[str]:
-    """Yield the digests of all decisions of runs in a fresh process, to confirm boundaries independently.
+    """Yield digests of all decisions of runs in a new process, to confirm boundaries independently.
 
     The system is restored there bit for bit, and its program is compiled again under the same environment.
 

@@ -225,7 +225,7 @@ def _ends_with(parent: int) -> dict[str, Any]:
 def opened(on: str | Executor | Engine | None, workers: int | None) -> Iterator[Engine]:
     """Context manager: make an engine from None (local processes), a dask address, a file or an executor.
 
-    An engine remains open.
+    An engine that is passed on remains open.
 
     Raises:
         InputError: the engine is unknown, or its package is not installed.
