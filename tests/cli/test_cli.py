@@ -300,10 +300,11 @@ def test_every_option_is_a_parameter_of_what_is_called():
             called = inspect.unwrap(getattr(VERBS[entry], said["calls"]))
             if getattr(called, "__name__", "") == "command":
                 # which passes on what it does not need
-                called = inspect.unwrap(
-                    {"ball": bounce, "conform": conform, "fork map": fork_map, "sweep": mdnum.sweep}[entry]
-                )
-                options -= {"demo", "dry_run"}
+                options -= {*inspect.signature(called).parameters, "demo"}
+                called = inspect.unwrap({
+                    "ball": bounce, "conform": conform, "flips": mdnum.flips, "fork map": fork_map,
+                    "sweep": mdnum.sweep,
+                }[entry])  # fmt: skip
             parameters = inspect.signature(called).parameters
             more = passed_on if any(one.kind is one.VAR_KEYWORD for one in parameters.values()) else set()
             assert options - {"settings", "potential"} <= {*parameters, *more}, (entry, said["help"])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ase import Atoms
@@ -11,6 +14,7 @@ from small_systems import LENNARD_JONES, crystal, make
 from mdnum.errors import InputError
 from mdnum.forks.boundaries import boundaries, digests_elsewhere
 from mdnum.forks.worlds import program_of
+from mdnum.plain import plain
 from mdnum.systems.build import build
 from mdnum.systems.parameters import numbers
 
@@ -67,6 +71,25 @@ def test_a_crossing_in_closed_form_is_found_where_it_is(crossings):
     few = boundaries(meeting(), "timestep", 0.04, 0.105, 9, cells=32, most=2, confirm=False)
     assert [edge.above.at for edge in few.boundaries] == [edge.above.at for edge in found.boundaries[:2]]
     assert len(few.unresolved) == 4 and few.boundaries[0].confirmed is None
+
+
+@pytest.mark.parametrize("processes", [False, pytest.param(True, marks=pytest.mark.nightly)])
+def test_workers_find_the_same_to_the_last_bit(crossings, processes):
+    with ThreadPoolExecutor(2) as pool:
+        on = {"workers": 2} if processes else {"on": pool}
+        found = boundaries(meeting(), "timestep", 0.04, 0.105, 9, cells=32, confirm=processes, **on)
+        few = boundaries(meeting(), "timestep", 0.04, 0.105, 9, cells=32, most=2, confirm=False, on=pool)
+    assert plain(found.intervals) == plain(crossings.intervals)
+    assert found.evaluations == crossings.evaluations > few.evaluations
+    for name in ("at", "loss", "energy"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(crossings, name))
+    told = [plain(replace(edge, confirmed=None)) for edge in crossings.boundaries]
+    assert [plain(replace(edge, confirmed=None)) for edge in found.boundaries] == told
+    assert all(edge.confirmed is (True if processes else None) for edge in found.boundaries)
+    # what else workers had begun does not show
+    alone = boundaries(meeting(), "timestep", 0.04, 0.105, 9, cells=32, most=2, confirm=False)
+    assert plain(few.boundaries) == told[:2] and few.unresolved == alone.unresolved
+    np.testing.assert_array_equal(few.at, alone.at)
 
 
 def test_the_last_step_alone_makes_no_jump_and_an_earlier_one_does(crossings):

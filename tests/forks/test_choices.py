@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib import metadata
 from typing import Any
@@ -433,6 +434,15 @@ def test_a_screen_ranks_by_fork_and_then_by_seed_with_what_does_not_apply_last(c
     assert noise.reason_unavailable is not None and noise.held is None and noise.steps == 0
     with pytest.raises(InputError, match="no choice to screen"):
         screen(crystal, 10, [])
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.nightly)])
+def test_a_screen_by_workers_is_the_same(workers: int):
+    """In the gate threads, which unpack the system as processes do."""
+    ball, choices = load("ball/drop"), [parse(word, "ball") for word in ("noise", "contact=later", "start")]
+    with ThreadPoolExecutor(1) as pool:
+        rows = screen(ball, 40, choices, on=pool if workers == 1 else None, workers=workers)
+    assert rows == screen(ball, 40, choices) and len(rows) == 3 and rows[0].first_bit is not None
 
 
 @pytest.mark.parametrize(

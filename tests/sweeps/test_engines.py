@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -13,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+import mdnum
 from mdnum.errors import InputError
 from mdnum.sweeps.engines import computed, in_order, requested
 
@@ -153,6 +156,24 @@ def often(task: tuple[str, int]) -> int:
     return os.getpid()
 
 
+def once(task: tuple[str, int]) -> int:
+    """One task kills its worker when it is begun for the first time."""
+    folder, k = task
+    first = not list(Path(folder).glob(f"{k}-*"))
+    Path(folder, f"{k}-{time.time_ns()}").touch()
+    if k == 3 and first:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return k
+
+
+@pytest.mark.nightly
+def test_what_a_killed_worker_had_is_computed_again_and_what_had_ended_is_not(tmp_path):
+    with requested(None, 2) as engine:
+        assert list(in_order(once, [(str(tmp_path), k) for k in range(8)], engine)) == [*range(8)]
+    begun = [int(file.name.partition("-")[0]) for file in tmp_path.iterdir()]
+    assert begun.count(3) >= 2 and set(begun) == {*range(8)} and begun.count(0) == 1
+
+
 @pytest.mark.nightly
 def test_workers_of_executorlib_live_over_tasks_and_are_replaced(tmp_path):
     pytest.importorskip("executorlib")
@@ -165,3 +186,86 @@ def test_workers_of_executorlib_live_over_tasks_and_are_replaced(tmp_path):
     assert isinstance(answers.pop(3), Exception) and len(answers) == 7
     assert len({*answers.values()}) < 7 and os.getpid() not in answers.values()
     _until(lambda: not any(_lives(pid) for pid in answers.values()))
+
+
+SLURM = """
+ClusterName=one
+SlurmctldHost={host}(127.0.0.1)
+SlurmUser=root
+SlurmdUser=root
+AuthType=auth/munge
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/spool
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/slurmd.pid
+SlurmctldLogFile={folder}/slurmctld.log
+SlurmdLogFile={folder}/slurmd.log
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_Core
+ReturnToService=2
+MpiDefault=none
+JobAcctGatherType=jobacct_gather/none
+NodeName={host} NodeAddr=127.0.0.1 CPUs={cores} RealMemory=1000 State=UNKNOWN
+PartitionName=main Nodes={host} Default=YES MaxTime=INFINITE State=UP
+"""
+
+
+@pytest.fixture
+def slurm(tmp_path, monkeypatch):
+    """A cluster of this machine alone; its daemons end with the test."""
+    pytest.importorskip("executorlib")
+    programs = ("munged", "slurmctld", "slurmd", "sbatch", "scancel")
+    path = os.pathsep.join([os.environ["PATH"], "/usr/sbin"])
+    lacking = [name for name in programs if shutil.which(name, path=path) is None]
+    if lacking or os.getuid() != 0:
+        pytest.skip(f"no {lacking[0]} is installed" if lacking else "daemons of SLURM start only as root")
+    monkeypatch.setenv("PATH", path)
+    folder = tmp_path / "slurm"
+    for name in ("state", "spool"):
+        (folder / name).mkdir(parents=True)
+    host = socket.gethostname().partition(".")[0]
+    (folder / "slurm.conf").write_text(SLURM.format(host=host, folder=folder, cores=os.cpu_count()))
+    monkeypatch.setenv("SLURM_CONF", str(folder / "slurm.conf"))
+    munge = not Path("/run/munge/munge.socket.2").exists()
+    words = [["munged", "--foreground", "--force"]] * munge + [
+        ["slurmctld", "-D"],
+        ["slurmd", "-D", "-N", host],
+    ]
+    daemons = []
+    with (folder / "output").open("w") as output:
+        for one in words:
+            daemons.append(subprocess.Popen(one, stdout=output, stderr=output))
+        try:
+            idle = ["sinfo", "--noheader", "--format=%T"]
+            _until(lambda: subprocess.run(idle, capture_output=True, text=True).stdout.strip() == "idle", 60)
+            yield
+        finally:
+            for one in reversed(daemons):
+                one.terminate()
+            for one in daemons:
+                one.wait(20)
+
+
+@pytest.mark.nightly
+def test_a_job_of_slurm_that_is_canceled_loses_no_point(slurm, tmp_path):
+    """Of four points, one is computed again by another job."""
+    file = tmp_path / "jobs.toml"
+    file.write_text("max_workers = 2\n[resource_dict]\nrun_time_max = 600\n")
+    system = mdnum.load("argon/crystal-108")
+    over, points = {"neighbors.skin": [0.2, 0.25, 0.35]}, tmp_path / "points"
+    with ThreadPoolExecutor(1) as thread:
+        sweep = thread.submit(
+            mdnum.sweep, system, over, seeds=1, steps=4000, measure="energy", on=str(file), points_in=points,
+            out=tmp_path / "sweep", report=False,
+        )  # fmt: skip
+        _until(lambda: sweep.done() or any((points / "claims").glob("*")), 240)
+        jobs = subprocess.run(
+            ["squeue", "--noheader", "--states=R", "--format=%i"], capture_output=True, text=True
+        )
+        first, *_ = jobs.stdout.split()
+        subprocess.run(["scancel", "--signal=KILL", first], check=True)
+        made = sweep.result()
+    assert made.summary["points"] == made.summary["computed"] == 4 and not made.summary["failed"]
+    assert len(list((points / "workspace").iterdir())) == 4
