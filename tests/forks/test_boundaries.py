@@ -73,7 +73,14 @@ def test_a_crossing_in_closed_form_is_found_where_it_is(crossings):
     assert len(few.unresolved) == 4 and few.boundaries[0].confirmed is None
 
 
-@pytest.mark.parametrize("processes", [False, pytest.param(True, marks=pytest.mark.nightly)])
+def test_a_worker_finds_the_same_boundary(crossings):
+    with ThreadPoolExecutor(1) as pool:
+        found = boundaries(meeting(), "timestep", 0.1, 0.105, 9, cells=2, confirm=False, on=pool)
+    assert plain(found.boundaries) == plain([replace(crossings.boundaries[-1], confirmed=None)])
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("processes", [False, True])
 def test_workers_find_the_same_to_the_last_bit(crossings, processes):
     with ThreadPoolExecutor(2) as pool:
         on = {"workers": 2} if processes else {"on": pool}
