@@ -215,8 +215,9 @@ def _examined(task: tuple[Path, Path, Mapping[str, Any]]) -> Outcome | MdnumErro
         folder = default_folder(f"flips-{file.name.partition('@')[0].partition('.')[0]}", out)
         return replace(flips(file, out=folder, progress=False, **options), result=None)
     except MdnumError as error:
-        with suppress(OSError):
-            folder and folder.rmdir()  # nothing was written
+        if folder is not None:
+            with suppress(OSError):  # it has files
+                folder.rmdir()
         return error
 
 
