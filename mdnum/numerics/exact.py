@@ -223,10 +223,6 @@ def _compare(yes: Callable[[Any, Any], bool], no: Callable[[Any, Any], bool]) ->
     return lambda a, b, **_: True if yes(a, b) else False if no(a, b) else None
 
 
-def _select(condition: bool | None, no: Any, yes: Any, **_: Any) -> Any:
-    return no.union(yes) if condition is None else yes if condition else no
-
-
 def _both(a: bool | None, b: bool | None, **_: Any) -> bool | None:
     return False if a is False or b is False else None if a is None or b is None else True
 
@@ -256,7 +252,8 @@ _IN_BALLS: dict[str, Callable[..., Any]] = {
         ("convert_element_type", "broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient"),
         lambda a, **_: a,
     ),
-    "select_n": _select,
+    # either case where the condition is not proven
+    "select_n": lambda is_yes, no, yes, **_: no.union(yes) if is_yes is None else yes if is_yes else no,
     "and": _both,
     "or": lambda a, b, **_: _not(_both(_not(a), _not(b))),
     "not": lambda a, **_: _not(a),

@@ -207,12 +207,6 @@ class Growth:
         """Whether the separation grows significantly, so that the fit is not a line through noise."""
         return bool(np.isfinite(self.rate) and self.rate > 0 and self.r_squared > FITS)
 
-    def steps_to(self, start: float, end: float) -> float | None:
-        """Return the number of steps in which a separation grows from `start` to `end`, or None."""
-        if not (np.isfinite(self.rate) and self.rate > 0 and start > 0):
-            return None
-        return max(0.0, float(np.log(end / start) / self.rate))
-
 
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
     """Return the mean slope of a logarithm, its standard error, and whether growth is faster than linear.

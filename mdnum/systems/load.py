@@ -202,20 +202,13 @@ class System:
                 False, the text refers to the original files of this system by absolute paths.
         """
         spec = self.spec.model_dump(mode="python", exclude_none=True)
-        structure = spec["structure"]
-        potentials = [table for table, _ in self._potentials(spec)]
-        if not beside:
-            for table in (structure, *potentials):
-                for key in ("file", "function"):
-                    if key in table:
-                        table[key] = str((self.folder / table[key]).resolve())
-            return toml.dump({"name": self.name, **spec})
-        kept = {key: structure[key] for key in ("masses", "velocities") if key in structure}
-        spec["structure"] = {"file": STRUCTURE_FILE, **kept}
-        for table in potentials:
-            for key in ("file", "function"):
-                if key in table:
-                    table[key] = Path(table[key]).name
+        structure, tables = spec["structure"], [table for table, _ in self._potentials(spec)]
+        if beside:
+            kept = {key: structure[key] for key in ("masses", "velocities") if key in structure}
+            spec["structure"] = {"file": STRUCTURE_FILE, **kept}
+        for table in tables if beside else (structure, *tables):
+            for key in {"file", "function"} & table.keys():
+                table[key] = Path(table[key]).name if beside else str((self.folder / table[key]).resolve())
         return toml.dump({"name": self.name, **spec})
 
     def write(self, folder: str | Path) -> Path:
