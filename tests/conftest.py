@@ -30,7 +30,7 @@ _NIGHTLY = Path(__file__).with_name("nightly.txt")
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark the cases that nightly.txt lists as nightly.
 
-    Without workers, a line that names no case of the files given is an error; the nightly looks.
+    Without workers, a line that names no case of the files given, or no file, is an error; the nightly looks.
     """
     listed = set(_NIGHTLY.read_text().splitlines())
     for item in items:
@@ -39,7 +39,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if hasattr(config, "workerinput"):
         return
     read = {item.nodeid.split("::")[0] for item in items}
-    gone = {name for name in listed - {item.nodeid for item in items} if name.split("::")[0] in read}
+    gone = {
+        name
+        for name in listed - {item.nodeid for item in items}
+        if (file := name.split("::")[0]) in read or not (config.rootpath / file).exists()
+    }
     if gone and not any("::" in word for word in config.args):
         raise pytest.UsageError(f"{_NIGHTLY.name} lists cases that are not there: {', '.join(sorted(gone))}")
 
