@@ -43,7 +43,8 @@ def test_each_file_is_examined_as_if_alone_and_an_error_leaves_the_others(folder
         found(mdnum.flips(folder / one, cutoffs=3.0, report=False)) for one in ("a.extxyz", "b.extxyz@1:")
     ]
     with ThreadPoolExecutor(2) as pool:
-        for options in ({}, {"on": pool}):
+        several: list[dict[str, Any]] = [{}, {"on": pool}]
+        for options in several:
             made = mdnum.flips_each(FILES, cutoffs=3.0, report=False, out=f"out-{len(options)}", **options)
             first, error, second, again = made
             assert isinstance(error, mdnum.InputError) and "no.extxyz" in str(error)
