@@ -43,19 +43,15 @@ def test_each_file_is_examined_as_if_alone_and_an_error_leaves_the_others(folder
         found(mdnum.flips(folder / one, cutoffs=3.0, report=False)) for one in ("a.extxyz", "b.extxyz@1:")
     ]
     with ThreadPoolExecutor(2) as pool:
-        several: list[dict[str, Any]] = [{}, {"on": pool}]
-        for options in several:
-            made = mdnum.flips_each(FILES, cutoffs=3.0, report=False, out=f"out-{len(options)}", **options)
-            first, error, second, again = made
-            assert isinstance(error, mdnum.InputError) and "no.extxyz" in str(error)
-            assert [found(one) for one in (first, second, again)] == [*alone, alone[0]]
-            assert len(alone[0][1]) > 3 and alone[0] != alone[1]
-            names = {one.name for one in Path(f"out-{len(options)}").iterdir()}
-            assert (
-                names
-                == {"flips-a-1", "flips-a-2", "flips-b-1"}
-                == {one.path.name for one in made if one != error}
-            )
+        made = mdnum.flips_each(FILES, cutoffs=3.0, report=False, out="here", on=pool)
+    first, error, second, again = made
+    assert isinstance(error, mdnum.InputError) and "no.extxyz" in str(error)
+    assert [found(one) for one in (first, second, again)] == [*alone, alone[0]]
+    assert len(alone[0][1]) > 3 and alone[0] != alone[1]
+    names = {one.name for one in Path("here").iterdir()}
+    assert (
+        names == {one.path.name for one in (first, second, again)} == {"flips-a-1", "flips-a-2", "flips-b-1"}
+    )
 
 
 def test_from_the_command_line_a_line_for_each(folder, capsys):
