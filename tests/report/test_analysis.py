@@ -106,4 +106,4 @@ def test_a_run_without_flips():
     assert seen.stays.total == 0 and analysis.median(seen.stays.inside) is None
     assert seen.alternates and len(seen.busiest.i) == 0
     ratio = analysis.margins_in_bounds(empty)
-    assert analysis.expected_ambiguous(ratio) == 0 and len(analysis.closest(ratio, 5)) == 0
+    assert analysis.expected_ambiguous(ratio) == 0 and len(seen.nearest["ratio"]) == 0
