@@ -56,7 +56,7 @@ def test_every_finding_has_its_entry_with_a_severity_and_a_sentence(pages):
             assert entry.lstrip().startswith(f"**{severity}**:"), f"{path.stem} {code}"
     assert codes > 180
     # a remedy is shown, and what a field holds is a word
-    assert "Raise neighbors.skin, or shorten dynamics.timestep." in page
+    assert "Increase the skin (neighbors.skin)" in page
     assert not re.search(r"\{\w+", page)
 
 
