@@ -305,7 +305,7 @@ def _certain(view: View) -> Iterator[Any]:
         if ambiguous:
             text += "; " + TEXTS("certified_after", n=ambiguous, steps=s["ambiguous_steps"][name])
         if first is not None:
-            text += ", " + TEXTS("certified_first", **first)
+            text += "; " + TEXTS("certified_first", **first)
         if not s["lists_complete"][name]:
             text += "; " + TEXTS("certified_listed")
         rows.append((f"Certified, {name}", text))

@@ -77,14 +77,14 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 def agreeing(view: View) -> str:
     """Return a phrase on how many repeats agree that runs split later if decisions are imposed."""
-    said = ""
+    said: list[str] = []
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
             kind = "_other" if said else "" if count["threshold"] else "_any"
             known = count.get("displacement")
             displaced = TEXTS("displaced", displacement=known, unit=view.units.length) if known else ""
-            said += TEXTS(f"agreeing{kind}", **count, displaced=displaced)
-    return said
+            said.append(TEXTS(f"agreeing{kind}", **count, displaced=displaced))
+    return ", and ".join(said)
 
 
 def _evidence(view: View) -> Iterator[str]:
@@ -100,7 +100,7 @@ def _evidence(view: View) -> Iterator[str]:
     if decision is None:
         return
     values = {**decision, "subject": subject(summary), "unit": view.units.length}
-    values |= {"runs": " and ".join(decision["ambiguous_in"])}
+    values |= {"runs": " and ".join(f"run {name}" for name in decision["ambiguous_in"])}
     yield TEXTS(decided(decision), **values, **sides(decision), counted=summary.get("counted"))
     yield TEXTS("rounding" if decision["ambiguous_in"] else "no_rounding", **values)
     if decision.get("protected") is not None:

@@ -148,7 +148,7 @@ def test_an_interval_is_a_key_and_two_numbers():
         (("forecast", "argon/crystal-108", "0"), "expected a length above 0"),
         (("forecast", "ball/drop", "1e-6"), "mdnum ball records"),
         (("processes", "ball/drop"), "mdnum ball --demo determinism"),
-        (("benign", "ball/drop", "start"), "no ensemble"),
+        (("benign", "ball/drop", "start"), "Ensembles of runs"),
         (("map", "argon/crystal-108", "sigma"), "KEY=LOW:HIGH"),
         (("map", "argon/crystal-108", "sigma=2:1"), "from 2.0 to 1.0"),
         (("map", "ball/drop", "k=2:1"), "from 2.0 to 1.0"),

@@ -548,7 +548,7 @@ def test_the_page_has_a_figure_and_a_table_for_everything_there_is(crystal):
     assert f"step {s['protected_until']}" in certain["Protected"]
     growth = dict(part(own, "Growth", Table).rows)
     assert "doubles in 34.7 steps" in growth["A and B, free"]
-    assert "1.05 times as fast" in growth["Lyapunov exponent"] and "1,702" in growth["An ulp of the start"]
+    assert "1.05 times this rate" in growth["Lyapunov exponent"] and "1,702" in growth["An ulp of the start"]
     # repeats are ranges
     repeated = [{"free": 380, "imposed": 399}, {"free": 370, "imposed": None}]
     other = {"repeated_other": repeated[:1], "count_other": COUNT | {"pairs": 6, "displacement": 1e-8}}
