@@ -127,7 +127,7 @@ def test_what_is_no_choice_is_refused_with_those_there_are(word: str, message: s
         (CRYSTAL, "order@alone", "for balls"),
         (CRYSTAL, "ulps=cutoff.in_sigma:+1", "it has no number cutoff.in_sigma"),
         (CRYSTAL, "ulps=cutoff.raduis:+1", "there are potential.sigma, potential.epsilon, cutoff.radius"),
-        ("silicon/tersoff-512", "energy-shift", "part of this potential"),
+        ("silicon/tersoff-512", "energy-shift", "own cutoff"),
         (BATH, "relabel", "belongs to labels"),
         (BATH, "rotate", "belongs to axes"),
         (TILTED, "rotate=yzx", "axes yzx"),
