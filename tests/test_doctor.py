@@ -99,16 +99,14 @@ def test_subnormal_numbers_are_computed_with_and_not_compared(tmp_path: Path):
     if compiler is None or sys.platform != "linux" or subprocess.run(build, capture_output=True).returncode:
         pytest.skip("no compiler here, or another processor")
     seen = _asked("d.subnormals().seen", LD_PRELOAD=str(library))
-    assert [part.split()[:1] + part.split()[-1:] for part in seen.split(", ")] == [
-        ["flushed", "numpy"], ["flushed", "jax"],
-    ]  # fmt: skip
+    assert all(f"flushed to zero by {name}" in seen for name in ("numpy", "jax"))
 
 
 def test_what_jax_does_with_subnormal_numbers_is_what_its_multiplication_does():
     product = jax.jit(lambda x, y: x * y)(jnp.full(20, 2.0**-1000), jnp.full(20, 2.0**-60))
     kept = np.asarray(product).view(np.int64).all()
-    by_numpy, by_jax = doctor.subnormals().seen.split(", ")
-    assert by_numpy == "kept by numpy" and by_jax.split()[0] == ("kept" if kept else "flushed")
+    seen = doctor.subnormals().seen
+    assert "kept by numpy" in seen and f"{'kept' if kept else 'flushed to zero'} by jax" in seen
 
 
 def test_a_lost_float64_is_unsafe():
