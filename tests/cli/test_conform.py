@@ -186,10 +186,10 @@ def test_no_answer_is_told_from_a_wrong_one(function, code: str, tone: str, plac
     cases = [once("two", "few", _PLACES), once("other", "outside", places)]
     verdict, findings = _judged(function, cases)
     assert set(findings) == {code} and verdict.tone == tone
-    assert findings[code].values["cases"] == 1 and "1 of 2 cases" in verdict.headline
+    assert findings[code].values["cases"] == 1 and "1 of 2 test cases" in verdict.headline
     cases.append(once("four", "few", [*_PLACES, [0, 0.9, 0], [0, 0.95, 0]]))
     verdict, findings = _judged(function, cases)
-    assert "2 of 3 cases" in verdict.headline  # pairs of the four are missing, too
+    assert "2 of 3 test cases" in verdict.headline  # pairs of the four are missing, too
 
 
 def test_what_fails_only_after_another_goes_below_it():
@@ -229,7 +229,7 @@ def test_time_that_is_up_is_reported():
     cases = [once(f"{n}", "few", _PLACES) for n in range(5)]
     found = examine(from_object(_leaves, "it"), asked=cases, deadline=TwoQuestions())
     assert (found.asked, found.left, found.questions) == (2, 3, 5)
-    assert "2 of 5 cases" in _verdict(found).headline
+    assert "2 of 5 test cases" in _verdict(found).headline
 
 
 def test_one_mistake_has_one_script_and_names_all_areas():
@@ -572,7 +572,7 @@ def test_a_list_that_hangs_does_not_outlive_who_asks_it(mine: Path, by: signal.S
     summary = RunFolder.open("out").summary
     assert summary["status"] == "stopped" and summary["left"] > 100 and not summary["failures"]
     if by != signal.SIGKILL:
-        assert summary["asked"] >= 5 and "continues it" in summary["verdict"] and "right pairs" in out
+        assert summary["asked"] >= 5 and "continues the test" in summary["verdict"] and "right pairs" in out
         assert "5 of " in out and "cube of 2.1 cutoffs" in summary["headline"]
     # of most areas nothing was asked; after a kill, what was saved last counts
     assert f"{summary['asked']} of " in summary["headline"]
@@ -637,7 +637,7 @@ def test_a_script_is_run_before_it_is_named(
     asked = sum(row["asked"] for row in summary["areas"])
     wrong = sum(row["failed"] for row in summary["areas"])
     # right, of how many, and how many crashed
-    assert summary["headline"].startswith(f"hangs:{name}: ")
+    assert summary["headline"].startswith(f"hangs:{name} found ")
     counts = re.findall(r"\b\d+\b", summary["headline"].replace(f"hangs:{name}", ""))
     assert counts == [str(asked - wrong), str(asked), str(wrong)]
     script = mine / "out" / failure["script"]

@@ -139,4 +139,4 @@ def test_a_leap_is_told_and_wrapping_is_none(tmp_path):
     found = mdnum.flips(tmp_path / "a.traj", cutoffs=[4.0], out=tmp_path / "f", report=False).summary
     assert found["leaps"] == {"frames": 2, "frame": 3, "atom": 9, "distance": pytest.approx(1e5, rel=1e-3)}
     said = next(one for one in found["findings"] if one["code"] == "LEAP")
-    assert said["severity"] == "warning" and "at frame 3" in said["title"] and "Atom 9" in said["text"]
+    assert said["severity"] == "warning" and "at frame 3" in said["title"] and "atom 9" in said["text"]

@@ -122,7 +122,7 @@ def test_frames_far_apart_bound_the_factor_from_one_side(tmp_path: Path) -> None
     found = told(tmp_path, frames)
     flight = found.summary["flight"]
     assert flight["at_least"] and 100 < flight["factor"] < 1000
-    assert "lower bound" in finding(found, "VELOCITIES_ODD").text
+    assert "even larger" in finding(found, "VELOCITIES_ODD").text
 
 
 def test_known_factors_are_told_apart() -> None:
