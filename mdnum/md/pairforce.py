@@ -311,7 +311,7 @@ def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...
     return [tuple(None if one is None else next(each) for one in model.weights)] if model.weights else []
 
 
-def _forces(sums: Sequence[Float[Array, "atoms"]], decisions: Decisions | None) -> Forces:
+def _forces(sums: Sequence[Float[Array, "..."]], decisions: Decisions | None) -> Forces:
     """Return forces from sums of `PairForce._terms`, in which every pair is counted for both of its atoms."""
     fx, fy, fz, energy, *virial = sums
     half = jnp.asarray(0.5, energy.dtype)
@@ -408,7 +408,7 @@ class Guarded(eqx.Module):
 VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
-def products(a: Float[Array, "rows atoms"], b: Float[Array, "rows atoms"]) -> Float[Array, "6"]:
+def products(a: Float[Array, "_ atoms"], b: Float[Array, "_ atoms"]) -> Float[Array, "6"]:
     """Return the sums over atoms of a_i b_j in Voigt order, of the first three rows of a and b.
 
     Eight partial sums are added at a time, which XLA computes in vectors: at 4,000 atoms in a third of the
