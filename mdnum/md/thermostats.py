@@ -33,7 +33,7 @@ class Chain(NamedTuple):
         return cls(jnp.zeros(links), jnp.zeros(links))
 
     def act(
-        self, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
+        self, kinetic: Number, freedom: int | Number, kT: Number, relaxation: Number, time: Number
     ) -> tuple[Number, Chain]:
         """Advance the chain by a time; return the scale factor of the velocities, and the chain.
 
@@ -66,7 +66,7 @@ class Chain(NamedTuple):
                 kick(k, t)
         return scale, Chain(jnp.stack(rate), jnp.stack(way))
 
-    def energy(self, freedom: int, kT: Number, relaxation: Number) -> Number:
+    def energy(self, freedom: int | Number, kT: Number, relaxation: Number) -> Number:
         """Return the energy of all links (eq. 2.8 of Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635)."""
         shares = jnp.ones(len(self.rate)).at[0].set(freedom)
         return kT * jnp.sum(shares * (0.5 * jnp.square(relaxation * self.rate) + self.way))
