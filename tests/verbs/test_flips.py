@@ -265,6 +265,7 @@ def test_a_coarse_file_is_one(examined) -> None:
         ((0.01, 0.0, 0.03), "fewer than 3.0 % of", None),
         ((None, None, None), "No upper bound", "cannot be estimated"),
     ],
+    ids=["many", "some", "few", "no bound"],
 )
 def test_what_is_lost_between_frames_is_a_range_and_a_finding_where_it_is_much(
     examined, share, told, variant
