@@ -11,8 +11,8 @@ from mdnum.errors import InputError
 
 if numba.config.DISABLE_JIT:  # pyright: ignore
     raise InputError(
-        "NUMBA_DISABLE_JIT is set, but the functions that XLA calls must be compiled",
-        remedy="Unset NUMBA_DISABLE_JIT",
+        "the environment variable NUMBA_DISABLE_JIT is set, but mdnum needs Numba to compile functions",
+        remedy="Unset the variable",
     )
 
 #: Note of the command line for a process that could not store all compiled functions.

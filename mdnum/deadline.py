@@ -39,7 +39,7 @@ class Deadline:
     def __init__(self, minutes: float | None = None):
         if minutes is not None and not (math.isfinite(minutes) and minutes > 0):
             raise InputError(
-                f"--time {minutes:g} leaves no time for the run", remedy="Give a number of minutes above 0"
+                f"--time {minutes:g} leaves no time to compute", remedy="Give a number of minutes above 0"
             )
         self.minutes = minutes
         self._end = math.inf if minutes is None else time.monotonic() + 60 * minutes

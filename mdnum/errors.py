@@ -139,4 +139,4 @@ def expect_path(given: object, remedy: str) -> None:
     if not isinstance(given, str | os.PathLike):
         shape = getattr(given, "shape", None)
         kind = type(given).__name__ + ("" if shape is None else f" of shape {shape}")
-        raise InputError(f"{kind} given where a path is expected", remedy=remedy)
+        raise InputError(f"an object of type {kind} was given; expected a path", remedy=remedy)

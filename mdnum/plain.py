@@ -63,7 +63,7 @@ def plain(value: Any) -> Any:
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Iterable):
         return [plain(item) for item in value]
-    raise TypeError(f"{type(value).__name__} cannot be converted to plain data")
+    raise TypeError(f"an object of type {type(value).__name__} cannot be converted to plain data")
 
 
 @dataclass_transform(frozen_default=True)

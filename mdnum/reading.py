@@ -127,8 +127,8 @@ def reading(
             ) from error
         if isinstance(error, ImportError) or "install" in str(error):
             raise InputError(
-                f"reading this file needs a package that is not installed ({said})",
-                remedy="Install the package, or convert the file to xtc or extxyz",
+                f"a package that is needed to read the file is not installed ({said})",
+                remedy="Install the package, or convert the file to the format xtc or extxyz",
                 where=where,
             ) from error
         if any(one in said for one in _NO_ATOMS):
@@ -213,7 +213,7 @@ class _Lines(io.TextIOWrapper):
     def readline(self, size: int = -1, /) -> str:
         line = super().readline(_LONGEST_LINE if size < 0 else size)
         if len(line) == _LONGEST_LINE and size < 0:
-            raise ValueError(f"a line is longer than {_LONGEST_LINE:,} characters")
+            raise ValueError(f"the file has a line of more than {_LONGEST_LINE:,} characters")
         self._at_end = 0 if line else self._at_end + 1
         if self._at_end > _PATIENCE:
             raise ValueError("the file ends before the amount of data that its header announces")

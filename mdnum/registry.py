@@ -104,8 +104,8 @@ class Registry(Generic[T]):
                 taken = _package(added[point.name])
             if taken:
                 raise InputError(
-                    f"package {_package(point)} adds the {self.noun} {point.name!r}, which {taken} "
-                    "already provides",
+                    f"the {self.noun} {point.name!r} of package {_package(point)} is already provided by "
+                    f"{taken}",
                     remedy=f"Uninstall {_package(point)}, or use a version that gives it another name",
                 )
             added[point.name] = point
@@ -162,7 +162,7 @@ class Registry(Generic[T]):
             raise InputError(
                 f"{self.noun} {name!r} of package {_package(point)} cannot be used: "
                 f"{type(error).__name__}: {error}",
-                remedy=f"Correct or uninstall {_package(point)}",
+                remedy=f"Correct the package {_package(point)}, or uninstall it",
             ) from error
         return loaded
 

@@ -117,5 +117,5 @@ def get(name: str) -> Units:
     except KeyError:
         raise InputError(
             f"unknown units {name!r}; known unit systems are {', '.join(_ALL)}",
-            remedy="metal means Å, eV, amu and ps; lj means reduced units; ball means m and s",
+            remedy="Choose metal for Å, eV, amu and ps, lj for reduced units, or ball for m and s",
         ) from None

@@ -123,10 +123,10 @@ class _Builder:
             return self.best  # on which no atom feels another: the forces say so
         if made is None:
             raise InputError(
-                "the calculator computed no energy, neither for single elements nor for water "
-                f"({why}; saved in {saved})",
+                f"the calculator computed no energy, neither for single elements nor for water ({why}; "
+                f"structure saved in {saved})",
                 where=self.name,
-                remedy="Give a structure that the calculator supports: --structure FILE",
+                remedy="Give a structure that the calculator supports with --structure FILE",
             )
         return self._mixed(made)
 

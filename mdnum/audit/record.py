@@ -66,9 +66,8 @@ def load_calculator(words: str) -> LoadedCalculator:
     made = make()
     if not _is_calculator(made):
         raise InputError(
-            f"the object is a {type(made).__name__}, not an ASE calculator (an object with "
-            "get_potential_energy "
-            "and get_forces)",
+            f"the given object is of type {type(made).__name__}; expected an ASE calculator, with the "
+            "methods get_potential_energy and get_forces",
             where=text,
             remedy=_WAYS,
         )
@@ -90,11 +89,11 @@ def _of_system(text: str) -> LoadedCalculator:
         if "." in text and "/" not in text and not text.endswith(".toml"):
             module, _, last = text.rpartition(".")
             raise InputError(
-                f"{text!r} is not an mdnum system",
-                remedy=f"For a class, put a colon before its name: {module}:{last}",
+                f"no system of mdnum has the name {text!r}",
+                remedy=f"For a Python class, put a colon before the class name: {module}:{last}",
             ) from error
         raise InputError(
-            f"{error.message}, and it is not a class or a Python file",
+            f"{error.message}, and the given name is neither a Python class nor a Python file",
             where=error.where,
             remedy=f"{error.remedy}. {_WAYS}" if error.remedy else _WAYS,
         ) from error

@@ -50,7 +50,7 @@ def read_structure(words: str | Path) -> Atoms:
         raise InputError(
             several if chosen else f"the file has no structure {which} (it has {count})",
             where=text,
-            remedy="Select a structure by its index: file@0 is the first, file@-1 the last",
+            remedy="Select one structure by its index: file@0 is the first structure, file@-1 the last",
         )
     atoms = chosen[0]
     if not len(atoms):

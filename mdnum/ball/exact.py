@@ -155,7 +155,7 @@ class ExactImpact(_Motion):
         """
         if self.restitution == 1:
             raise InputError(
-                "a ball of restitution 1 never comes to rest",
+                "a ball with restitution 1 never comes to rest",
                 remedy="Choose a restitution below 1",
                 where="restitution",
             )
@@ -237,7 +237,7 @@ class ExactPenalty(_Motion):
         _positive("damping", self.damping, zero=True)
         if self.damping**2 == 4 * self.k:
             raise InputError(
-                "the closed form does not hold at critical damping", remedy="Change the damping by one ulp"
+                "the closed form does not hold at critical damping", remedy="Change the damping slightly"
             )
 
     def state(self, t: Times) -> tuple[Known, Known]:
@@ -273,7 +273,7 @@ def _bounced(p: Parameters, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             break
     else:
         raise InputError(
-            f"more than {_MOST:,} contacts occur before the last requested time",
+            f"the ball makes more than {_MOST:,} contacts with the floor before the last requested time",
             remedy="Request earlier times",
         )
     return y, v
@@ -326,14 +326,14 @@ def _positive(name: str, value: float, *, zero: bool = False, most: float = np.i
 def _numbers(n: Counts, least: int = 1) -> Float[np.ndarray, "*counts"]:
     n = np.asarray(n, np.float64)
     if np.any(n < least) or np.any(n != np.floor(n)) or np.any(np.isinf(n)):
-        raise InputError(f"impact number {n!r}; expected an integer of at least {least}")
+        raise InputError(f"the impact number is {n!r}; expected an integer of at least {least}")
     return n
 
 
 def _later(t: Times) -> Float[np.ndarray, "*times"]:
     t = np.asarray(t, np.float64)
     if not np.all(t >= 0):
-        raise InputError("a requested time lies before the start", remedy="Request times of at least 0")
+        raise InputError("a requested time is negative", remedy="Request times of at least 0")
     return t
 
 

@@ -91,7 +91,7 @@ class BallProgram:
         kinds = [type(one.problem.world.contact).__name__ for one in (self, other)]
         if kinds[0] != kinds[1] or (self.problem.world.lift is None) != (other.problem.world.lift is None):
             raise InputError(
-                f"{kinds[0]} and {kinds[1]} make different kinds of decisions",
+                f"the contacts {kinds[0]} and {kinds[1]} make different kinds of decisions",
                 remedy="Compare programs with the same kind of contact",
             )
         if self.size != other.size:
@@ -226,7 +226,7 @@ class BallProgram:
         problem, world = self.problem, self.problem.world
         if word not in START and not world.has(word):
             known = ", ".join([*world.parameters, *START])
-            raise InputError(f"{key!r} is not a parameter that can be varied", remedy=f"Use one of: {known}")
+            raise InputError(f"{key!r} is not a parameter that can be varied", remedy=f"Use one of {known}")
 
         def at(value: float) -> BallProgram:
             filled = np.full(np.atleast_1d(np.asarray(problem.y0)).shape, value)
@@ -328,7 +328,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
             ends[name] = int(broken.argmax()) - 1
     last = min([a.steps, *ends.values()])
     if last < 0:
-        raise InputError("an initial height is not finite in this precision", remedy="Use a wider dtype")
+        raise InputError("an initial height or velocity overflows the dtype", remedy="Use a wider dtype")
     return last, {name: "blow-up" if ends.get(name) == last else "" for name in "AB"}
 
 

@@ -117,7 +117,7 @@ class World(eqx.Module):
         path = self._place(name)
         if path is None:
             raise InputError(
-                f"this ball has no parameter {name!r}", remedy=f"Choose one of {', '.join(self.parameters)}"
+                f"the ball has no parameter {name!r}", remedy=f"Choose one of {', '.join(self.parameters)}"
             )
         return path
 
@@ -250,16 +250,15 @@ def _check(world: World) -> None:
         if not isinstance(contact, Impact):
             raise InputError(
                 "the event-located integrator needs an impact contact",
-                remedy="A penalty or a projection has no instant of contact; use another integrator",
+                remedy="Use an impact contact, or another integrator for penalty and projection contacts",
             )
         _count("max_impacts", integrator.max_impacts)
     if isinstance(contact, Projection):
         gain = float(contact.alpha) * float(contact.k)
         if gain >= 2:
             raise InputError(
-                f"alpha * k = {gain:g}: each iteration leaves {abs(1 - gain):g} of the penetration,"
-                " so the projection cannot converge",
-                remedy="Choose alpha * k below 2; at alpha * k = 1 one iteration is enough",
+                f"alpha * k = {gain:g}; the iterated projection out of the floor converges only below 2",
+                remedy="Choose alpha * k below 2; at alpha * k = 1, one iteration is enough",
             )
         _check_stop(contact.stop, world.policy, gain)
     if (stop := getattr(integrator, "stop", None)) is not None:
@@ -275,8 +274,8 @@ def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
         _check_stop(rule.rule, policy, gain)
         if not float(rule.enter) >= float(rule.rule.tol):
             raise InputError(
-                f"enter = {rule.enter} is below tol = {rule.rule.tol}",
-                remedy="Set enter to at least tol: a solve starts above enter and ends below tol",
+                f"the stopping rule has enter = {rule.enter}, below tol = {rule.rule.tol}",
+                remedy="Set enter to at least tol, the residual below which iteration ends",
             )
         return
     tol = float(rule.tol)
@@ -286,12 +285,12 @@ def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
     role = max(usable, key=lambda one: usable[one])
     if not tol >= usable[role]:
         raise InputError(
-            f"tol = {tol:g} is too small for the role {role} in {getattr(policy, role)}",
+            f"the tolerance tol = {tol:g} is too small for {role} computed in {getattr(policy, role)}",
             remedy=f"The smallest usable tolerance is {usable[role]:.3g}",
         )
     limit = limits.largest(policy.decision)
     if tol > limit:
-        raise InputError(f"tol = {tol:g} exceeds the largest {policy.decision} number, {limit:g}")
+        raise InputError(f"the tolerance {tol:g} exceeds the largest {policy.decision} number, {limit:g}")
 
 
 def _count(name: str, value: int) -> None:

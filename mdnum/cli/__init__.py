@@ -119,7 +119,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         sys.exit(EXIT_STOPPED)
     except MemoryError as error:
         needed = f"more memory is needed than there is ({error})"
-        asked = InputError(needed, remedy="Reduce the number of atoms, balls or steps")
+        asked = InputError(needed, remedy="Reduce the number of atoms, balls or steps of the simulation")
     except OSError as error:
         # a full disk, a folder without write permission: the person's to mend, not a bug to trace
         where = str(error.filename) if error.filename else None
@@ -129,7 +129,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
             sys.exit(EXIT_STOPPED)
         if (seen := _no_device(error)) is None:
             raise
-        asked = InputError(seen, remedy="Set JAX_PLATFORMS to cpu, or unset it")
+        asked = InputError(seen, remedy="Set the environment variable JAX_PLATFORMS to cpu, or unset it")
     else:
         compiled = sys.modules.get("mdnum.compiled")
         print_lines([] if compiled is None or compiled.all_kept() else [compiled.NOT_KEPT])

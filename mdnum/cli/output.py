@@ -58,7 +58,7 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
     for setting in settings or ():
         key, value = assigned(setting, "--set cutoff.kind=switched")
         if key in overrides:
-            raise InputError(f"--set gives {key!r} twice", remedy="Keep one of them")
+            raise InputError(f"the key {key!r} is given twice with --set", remedy="Give each key only once")
         overrides[key] = value
     return overrides
 

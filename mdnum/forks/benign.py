@@ -237,15 +237,15 @@ def calibrate(
     if members < FEWEST:
         raise InputError(
             f"members = {members}: too few runs in the ensemble for a statistical limit",
-            remedy=f"Give at least {FEWEST}",
+            remedy=f"Give at least {FEWEST} members",
         )
     expect_at_least(0, held_out=held_out)
     expect_at_least(1, tries=tries, steps=1 if steps is None else steps)
     changes = planted(simulation) if changes is None else changes
     if not any(change.must_fail for change in changes):
         raise InputError(
-            "no deliberate change has must_fail = True, so the test could not fail",
-            remedy="Add a deliberate change that the test must detect",
+            "no deliberate change has must_fail = True, so the test's sensitivity is not checked",
+            remedy="Add a deliberate change with must_fail = True, which the test must detect",
         )
     tried = [steps] if steps is not None else _windows(simulation, start)
     nodes = nodes_of(simulation, start or first_state(simulation))
@@ -304,12 +304,12 @@ def choose(windows: Sequence[Window], name: str) -> Window:
         if not one.ok
     )
     raise InputError(
-        f"the deliberate changes cannot be distinguished from rounding errors after {steps} steps (step "
-        f"{best.step}: {missed})",
+        f"after {steps} steps the deliberate changes cannot be distinguished from rounding errors (best at "
+        f"step {best.step}: {missed})",
         where=name,
         remedy=(
-            "Compare at an earlier step, before the runs of the ensemble have split, or start "
-            "from a hotter fluid"
+            "Compare at an earlier step, before the runs of the ensemble diverge, or start from a hotter "
+            "fluid"
         ),
     )
 
@@ -388,9 +388,9 @@ def _check(twin: Twin) -> None:
     a, b = (() if key is None else np.asarray(jax.random.key_data(key)) for key in keys)
     if not np.array_equal(a, b):
         raise InputError(
-            "the runs have different random noise, so they diverge at the first step in any case",
+            "the two runs use different random noise, so they diverge at the first step",
             where="dynamics.seed",
-            remedy="Give both runs the same seed; compare runs of different seeds by their averages",
+            remedy="Give both runs the same seed; compare runs with different seeds by their averages",
         )
 
 

@@ -177,7 +177,7 @@ def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
     """
     if not simulation.rule.safe:
         raise InputError(
-            "with this rebuild rule the neighbor list may miss pairs, which are then not certified",
+            "with the chosen rebuild rule the neighbor list may miss pairs, whose decisions go unchecked",
             remedy="Set neighbors.rebuild.every = 1 and neighbors.rebuild.check = true",
             where="neighbors.rebuild",
         )

@@ -111,12 +111,12 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
             raise InputError(
                 "this folder holds a result of `mdnum fork`, not a run",
                 where=str(folder.path),
-                remedy="Give two folders of `mdnum run`, `mdnum ball` or `mdnum flips`; `mdnum report DIR` "
-                "shows a fork",
+                remedy="Give two folders of `mdnum run`, `mdnum ball` or `mdnum flips`; show a result "
+                "of `mdnum fork` with `mdnum report DIR`",
             )
     where = f"{first.path} and {second.path}"
     if first.kind != second.kind:
-        kinds = f"these are folders of {first.kind} and {second.kind}"
+        kinds = f"the folders hold runs of different kinds, {first.kind} and {second.kind}"
         raise InputError(kinds, where=where, remedy="Compare two molecular-dynamics runs, or two ball runs")
     with first.explained(), second.explained():
         return _compared(first, second, where)
@@ -201,9 +201,9 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
     if names_of[0] != names_of[1] or between[0] != between[1]:
         seen = " and ".join(f"{one} {two or ''}".rstrip() for one, two in zip(names_of, between, strict=True))
         raise InputError(
-            f"the runs use different membership rules: {seen}",
+            f"the two runs decide by different rules which pairs are neighbors: {seen}",
             where=where,
-            remedy="Compare runs with the same rule",
+            remedy="Compare runs that use the same membership rule",
         )
     differences = [(name, *(each[name] for each in summaries)) for name in _GIVEN]
     frames = [folder.read("frames", ["rule", "number"]) for folder in (first, second)]
@@ -328,7 +328,7 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
     different = next((text for is_same, text in _same_system(one, other) if not is_same), None)
     if different is not None:
         raise InputError(
-            f"the runs are of different systems: {different}",
+            f"the two runs are of different systems: {different}",
             where=where,
             remedy="Compare two runs of the same system",
         )

@@ -92,7 +92,7 @@ def tangents(
     check_kick(simulation.integrator)
     if not isinstance(force, PairForce):
         raise InputError(
-            "decisions cannot be imposed on a many-body potential",
+            "pair decisions cannot be imposed on a many-body potential",
             remedy="Linearize a system with a pair potential",
         )
     dtype, clock = simulation.policy.dtype("state"), _CLOCK * float(simulation.integrator.timestep)
@@ -100,7 +100,7 @@ def tangents(
     tangent = np.asarray(dx, np.float64).T, np.asarray(dv, np.float64).T
     first = _length(tangent, clock)
     if not (np.isfinite(first) and first > 0):
-        raise InputError("the perturbation is zero or not finite", remedy="Give a nonzero direction")
+        raise InputError("the perturbation is zero or not finite", remedy="Give a nonzero perturbation")
     for segment in Engine(simulation, steps).segments():
         order = segment.table.order
         tables = simulation.tables(segment.table)
@@ -276,7 +276,7 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
     last = simulation.steps if steps is None else steps
     if last < 10 * BLOCKS:
         raise InputError(
-            f"steps = {last} is too small for a growth rate", remedy=f"Give at least {10 * BLOCKS}"
+            f"steps = {last} is too small for a growth rate", remedy=f"Give at least {10 * BLOCKS} steps"
         )
     dx = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
     dx -= dx.mean(axis=0)

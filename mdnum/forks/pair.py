@@ -183,7 +183,7 @@ def counterfactuals(
     most = repeats_asked(repeats, runs, reason or "such runs are disabled")
     if back and not runs:
         raise InputError(
-            f"A can be run with B's decisions only if B is run with A's decisions, which is not done: "
+            "the option back was given, but run B is not repeated with the decisions of run A: "
             f"{reason or 'such runs are disabled'}",
             remedy="Omit the option `back`",
         )
@@ -200,13 +200,13 @@ def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such ru
         return REPEATS if counterfactual else 0
     if repeats < 0 or 0 < repeats < FEWEST:
         raise InputError(
-            f"repeats = {repeats}; expected 0 or at least {FEWEST}",
+            f"repeats = {repeats}; expected either 0 or at least {FEWEST} repeats",
             remedy="Fewer repeats cannot give a significant result" if repeats > 0 else None,
         )
     if repeats and not counterfactual:
         raise InputError(
             f"repeats = {repeats}, but B is not run with A's decisions, so there is no run to repeat: {why}",
-            remedy="Set repeats = 0, or omit it",
+            remedy="Set repeats = 0, or omit the option",
         )
     return repeats
 
@@ -368,7 +368,7 @@ def screen(
     """
     choices = list(shipped(world_of(system)).values()) if choices is None else choices
     if not choices:
-        raise InputError("no choice to screen was given", remedy="Give at least one choice")
+        raise InputError("no numerical choice was given", remedy="Give at least one choice")
     rows: list[Screened] = []
     with engines.requested(on, workers) as engine:
         sent = system if engine is None else packed(system)

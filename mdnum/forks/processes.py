@@ -150,7 +150,7 @@ def variants(
 
     check_one_box(system.integrator, "variants in processes of their own")
     if not system.pairwise:
-        raise InputError("variants of a many-body potential are not supported", where=system.name)
+        raise InputError("variants of a many-body potential cannot be compared", where=system.name)
     if steps < 1 or not which:
         raise InputError("expected at least one step and one variant", where=f"steps = {steps}")
     with tempfile.TemporaryDirectory() as scratch:
@@ -354,9 +354,9 @@ def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
     own = system if isinstance(system, BallSystem) else system.file
     if own is None:
         raise InputError(
-            "a system made from Python objects cannot be recreated in another process",
+            "a system made of Python objects cannot be recreated in another process",
             where=system.name,
-            remedy="Give a system file",
+            remedy="Give the system as a system file",
         )
     return own
 

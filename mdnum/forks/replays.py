@@ -169,7 +169,7 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
     first, last = (None if part is None else int(part) for part in named.groups()[2:])
     if first is not None and last is not None and first > last:
         raise InputError(
-            f"the range of steps {first} to {last} is empty",
+            f"the range of steps {first} to {last} ends before it begins",
             where="pin",
             remedy="Give the smaller step first",
         )
@@ -185,13 +185,13 @@ def check_pins(fork: Fork) -> None:
     a, b = fork.twin.a, fork.twin.b
     if a.imposable or b.imposable:
         raise InputError(
-            "decisions cannot be imposed on a many-body potential",
+            "pair decisions cannot be imposed on a many-body potential",
             remedy="Use a system with a pair potential",
         )
     if b.frame is not None and not b.frame.is_same:
         raise InputError(
             "the two runs have different atom labels or axes",
-            remedy="Vary a choice that keeps labels and axes",
+            remedy="Vary a choice that keeps atom labels and axes",
         )
 
 
@@ -251,7 +251,7 @@ def minimal_cause(
     """
     split = fork.dates.split
     if fork.dates.fork is None or split is None or fork.decision is None:
-        raise InputError("the runs did not split", remedy="Use more steps or a smaller split tolerance")
+        raise InputError("the two runs did not split", remedy="Use more steps or a smaller split tolerance")
     check_pins(fork)
     atoms = fork.twin.a.size
     # pairs that differ before the split, in the order in which they first do

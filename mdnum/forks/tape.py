@@ -71,7 +71,7 @@ def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
         ValueError: the tapes have different numbers of atoms.
     """
     if a.atoms != b.atoms:
-        raise ValueError(f"the recorded runs have {a.atoms} and {b.atoms} atoms; expected the same number")
+        raise ValueError(f"the two recorded runs have {a.atoms} and {b.atoms} atoms; expected equal numbers")
     step, differing = 0, np.setxor1d(a.first, b.first)
     if not len(differing):
         last = min(a.steps, b.steps)

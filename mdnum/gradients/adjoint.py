@@ -378,9 +378,9 @@ class StretchReversal:
         force: Any = simulation.force
         if guard is not None and not simulation.imposable:
             raise InputError(
-                "the contribution of flips is known only for pair potentials, and for energies of "
-                "exactly the pairs in the list",
-                remedy="Use the method symmetric for a many-body potential",
+                "flips of pair decisions can be included in the gradient only for pair potentials whose "
+                "energy is summed over the listed pairs",
+                remedy="Use the gradient method symmetric for a many-body potential",
                 where=simulation.name,
             )
         if simulation.integrator.moves_cell:

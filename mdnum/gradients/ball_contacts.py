@@ -106,16 +106,16 @@ class Implicit(BallMethod):
         contact = problem.world.contact
         if not isinstance(contact, Projection):
             raise InputError(
-                f"{type(contact).__name__} has no iterated projection, so it has no fixed point to "
-                "differentiate",
-                remedy="Use the method unrolled, or event-aware for an impact contact.",
+                f"the contact {type(contact).__name__} is not solved by iteration, so the implicit gradient "
+                "method has no fixed point to differentiate",
+                remedy="Use the gradient method unrolled, or for an impact contact event-aware.",
             )
         gain = float(contact.alpha) * float(contact.k)
         condition = max(1.0, gain + self.regularization) / min(1.0, gain + self.regularization)
         if condition > LIMIT:
             raise InputError(
                 f"the matrix 1 - dG/dy has condition number {condition:.3g}; expected at most {LIMIT:g}",
-                remedy="Regularize the solve; the derivative is then that of the regularized problem.",
+                remedy="Set a regularization; the derivative is then that of the regularized problem.",
             )
         rule = FixedPointRule(self.regularization, self.at_iterate)
         attached = _with_contact(problem, replace(contact, derivative=rule))
@@ -194,7 +194,7 @@ class SoftFloor(BallMethod):
         """
         eps = _suitable(problem) if self.eps is None else self.eps
         if not eps > 0:
-            raise InputError(f"eps = {eps}", remedy="Choose a width above 0.", where="eps")
+            raise InputError(f"the width eps is {eps}", remedy="Choose an eps above 0.", where="eps")
         soft = softened(problem, eps)
         # the soft floor's own stiffness and width are not what these names mean in the given program
         own = () if isinstance(problem.world.contact, Penalty) else (*_SOLVER, "eps", "rest_speed")
@@ -227,7 +227,7 @@ def softened(problem: BallProblem, eps: float) -> BallProblem:
         raise InputError(
             f"the ball crosses the contact layer of width {eps:g} m in {1 / rate:.3g} s, too fast for "
             f"a time step of {h:g} s",
-            remedy=f"Choose eps of at least {_RESOLVED * speed * h:.2g} or a shorter time step.",
+            remedy=f"Choose an eps of at least {_RESOLVED * speed * h:.2g} m, or a shorter time step.",
             where="eps",
         )
     soft = SoftImpact(
@@ -295,8 +295,8 @@ class ThroughContacts(BallMethod):
             events, flagged = _events(problem, run)
         if flagged:
             raise NumericalError(
-                f"contacts that only graze the floor: {int(flagged)}; their times have no derivative",
-                remedy="Change the start or the time step so that the ball hits the floor, or smooth it.",
+                f"the ball only grazes the floor in {int(flagged)} contacts, whose times have no derivative",
+                remedy="Change the start or the time step so that the ball hits, or smooth the contact.",
             )
         use = used(problem, names, slopes, run, own=located or smooth)
         for name in names:

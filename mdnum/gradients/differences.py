@@ -165,7 +165,7 @@ def nonzero(problem: Problem, name: str) -> float:
     here = float(parameters.value(problem.simulation, name))
     if here == 0:
         raise InputError(
-            f"{name} is 0, but the finite-difference step is relative to its value",
+            f"the parameter {name} is 0, but the finite-difference step is a fraction of the parameter",
             remedy="Differentiate with respect to another parameter",
         )
     return here
@@ -280,7 +280,7 @@ class Replicas:
     def __post_init__(self):
         if self.count < 2 or self.settle < 0:
             seen = f"replicas = {self.count}, settle = {self.settle}"
-            raise InputError(f"{seen}; expected at least 2 replicas, and at least 0 steps to settle")
+            raise InputError(f"{seen}; expected at least 2 replicas, and 0 or more steps before each start")
 
     def of(self, problem: Problem) -> list[Problem]:
         """Return a list of problems, one for each replica (initial state)."""
@@ -320,7 +320,7 @@ def settled(simulation: Simulation, steps: int) -> Simulation:
     """
     *_, last = Engine(simulation, steps).segments()
     if last.closes in FAILURES:
-        raise NumericalError(f"a replica ended with a {last.closes} at step {last.last} of its preparation")
+        raise NumericalError(f"the preparation of a replica ended with a {last.closes} at step {last.last}")
     x, v, images = (last.unsorted(name, last.rows - 1) for name in ("x", "v", "images"))
     cell = last.cell_of(last.rows - 1)
     x = unwrapped(np.asarray(cell.matrix), x, images)

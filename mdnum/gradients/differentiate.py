@@ -83,8 +83,8 @@ def differentiable(
     def at(values: Values) -> Problem:
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
             raise InputError(
-                "a rollout was called inside jit or vmap, but neighbor lists are built on the host",
-                remedy="Call the rollout, and jax.grad of it, outside of jit and vmap",
+                "a rollout was called inside jit or vmap, but neighbor lists are built outside compiled code",
+                remedy="Call the rollout, or jax.grad of the rollout, outside of jit and vmap",
             )
         return problem.at(_in_full(problem, values, full))
 
@@ -148,8 +148,8 @@ def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str,
         (name,) = parameters.resolve(problem.simulation, [word])
         if name not in full:
             raise InputError(
-                f"a value was given for {word}, which is not a parameter of this gradient",
-                remedy=f"Add it to the parameters, which are {', '.join(full)}",
+                f"a value was given for {word}, which is not a parameter of the gradient",
+                remedy=f"Add {word} to the parameters, which are {', '.join(full)}",
             )
         out[name] = np.asarray(value)
     return out

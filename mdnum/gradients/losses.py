@@ -449,7 +449,7 @@ def parse(text: str, simulation: Simulation, steps: int) -> Loss:
         if not equals or key not in known:
             raise InputError(
                 f"{part!r} is not an option of the loss {name}",
-                remedy=f"Its options are {', '.join(known)}; write for example {name}:every=10",
+                remedy=f"The options of this loss are {', '.join(known)}; write for example {name}:every=10",
             )
         try:
             options[key] = int(value) if "int" in known[key] else float(value)

@@ -113,9 +113,7 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
         below = [name for name in known if name.startswith(f"{word}.")]
         whole = next((key for key in _INTEGERS if word in (key, key.rpartition(".")[2])), None)
         if whole is not None and whole not in known:
-            raise InputError(
-                f"no loss is differentiable with respect to {whole}: {_INTEGERS[whole]}", where=word
-            )
+            raise InputError(f"the parameter {whole} has no derivative: {_INTEGERS[whole]}", where=word)
         if shared := parameters.shared_radius(simulation.model, word):
             message = f"{', '.join(shared)} have the same radius and share one decision per pair"
             remedy = "Differentiate by cutoff.radius, which moves all terms, or give different radii"

@@ -56,7 +56,7 @@ class Problem:
         if not self.loss.looks_at(np.arange(self.steps + 1), self.steps).any():
             raise InputError(
                 f"the loss {self.loss.name} is evaluated at none of the steps 0 to {self.steps}",
-                remedy="Run longer, or evaluate the loss earlier or more often",
+                remedy="Run more steps, or evaluate the loss at earlier or more steps",
             )
         around = surroundings(self.simulation)
         why = self.loss.reason_unavailable(around)
@@ -168,7 +168,7 @@ class Method:
         full = self.known(problem, names)
         why = self.reason_unavailable(problem, full)
         if why is not None:
-            raise InputError(f"the method {self.name} is not applicable: {why}")
+            raise InputError(f"the gradient method {self.name} is not applicable: {why}")
         return full
 
     def differentiate(self, problem: Any, names: tuple[str, ...], progress: Progress | None) -> Gradient:

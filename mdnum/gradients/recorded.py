@@ -103,7 +103,7 @@ def passed(
     lost = not all(np.isfinite(one).all() for one in gradient.values())
     if lost and not problem.simulation.pairwise and (operation := second_derivative(problem.simulation)):
         raise NumericalError(
-            f"second derivatives of the energy function are not finite, first in {operation}",
+            f"a second derivative of the energy function is not finite, in the operation {operation}",
             where=problem.simulation.model.name,
             remedy="Mask the argument of that operation, not only its result",
         )

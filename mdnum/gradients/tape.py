@@ -200,9 +200,9 @@ class RunTape:
         skin = self.simulation.rule.skin
         if segment.closes == "displacement" and segment.moved > skin:
             raise NumericalError(
-                f"the neighbor list may miss pairs at step {segment.last}: an atom moved {segment.moved:.3g} "
-                f"since the list was built, and the skin is {skin:.3g}",
-                remedy="Use a smaller time step if one step moves atoms that far; otherwise use a wider skin",
+                f"the neighbor list may miss pairs at step {segment.last}: since the list was built an atom "
+                f"has moved {segment.moved:.3g}, more than the skin of {skin:.3g}",
+                remedy="Use a wider skin, or a smaller time step if atoms move that far in one step",
             )
         ledger = None if self._recorder is None else self._recorder.flips(segment)
         stretch = stretch_of(segment, self._next, ledger)
@@ -342,8 +342,8 @@ class ReversibleTape(RunTape):
     def _astray(self, step: int, last: int) -> None:
         where = f"at step {step}" if last - step <= 1 else f"between steps {step} and {last}"
         raise NumericalError(
-            f"the reversed run did not retrace the forward run: it deviated {where}",
-            remedy="The neighbor list may have missed pairs: rebuild it more often (neighbors.rebuild)",
+            f"the reversed run did not retrace the forward run: positions or velocities deviated {where}",
+            remedy="Rebuild the neighbor list more often (neighbors.rebuild); it may have missed pairs",
             where=self.simulation.name,
         )
 

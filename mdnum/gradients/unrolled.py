@@ -255,7 +255,7 @@ class ChunkedProgram:
         if not bool(record.finite):
             raise NumericalError(
                 f"the differentiated run blew up at step {int(record.place.step) - 1}",
-                remedy="Use a smaller time step, or a start without overlapping atoms",
+                remedy="Use a smaller time step, or starting positions without overlapping atoms",
             )
         return Snapshot(between, record.place, self.list_of(at)[0].slots)
 

@@ -50,12 +50,12 @@ class Cell(eqx.Module):
         flags = np.broadcast_to(np.asarray(pbc, bool), (3,))
         norms = np.linalg.norm(matrix, axis=1)
         if not np.all(np.isfinite(matrix)):
-            raise InputError("the cell has entries that are not finite numbers")
+            raise InputError("the lattice vectors of the cell contain numbers that are not finite")
         if np.any(flags & (norms == 0)):
             axis = "abc"[int(np.argmax(flags & (norms == 0)))]
             raise InputError(
-                f"axis {axis} is periodic but its lattice vector is zero",
-                remedy="Give the structure a cell or set structure.pbc = false for that axis",
+                f"axis {axis} of the structure is periodic, but its lattice vector is zero",
+                remedy="Give the axis a lattice vector, or set structure.pbc = false for this axis",
             )
         try:
             full = complete(matrix, flags)

@@ -182,10 +182,10 @@ def _ends(made: Cutoff, power: int) -> bool:
     off = ~(np.abs(2 * r * (slope - derivatives[1](jnp.asarray(r**2)))) <= 1e-9)
     if off.any():
         raise ValueError(
-            f"the slope is not the derivative of the energy at r = {r[off.argmax()]:g}, r_cut = 2"
+            f"the cutoff's slope is not the derivative of its energy at r = {r[off.argmax()]:g}, r_cut = 2"
         )
     if made.switches and not np.allclose(energy[r < 1.6], r[r < 1.6] ** (-2 * power), rtol=1e-12):
-        raise ValueError("the switching function changes the energy below the onset")
+        raise ValueError("the switching function changes the energy at distances below the switching onset")
 
     edges = np.array([1.6**2 * (1 - 2**-46), 1.6**2 * (1 + 2**-46), 4 * (1 - 2**-46)])
     for order in range(min(claimed + 1, _ORDERS) + 1):
@@ -198,7 +198,7 @@ def _ends(made: Cutoff, power: int) -> bool:
             if order <= claimed or (order == 0 and place == "the onset"):
                 raise ValueError(
                     f"the {_DERIVATIVES[order]} jumps by {jump:g} at {place}, which contradicts the "
-                    f"declared smoothness of {claimed}"
+                    f"declared smoothness {claimed} of the cutoff"
                 )
             ends = True
     inside, steep = (float(value[2]) for value in cut(edges))

@@ -50,51 +50,51 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
-        raise InputError("no such table", where=where, remedy="Correct the key potential.file") from None
+        raise InputError("no such table file", where=where, remedy="Correct the key potential.file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"the potential table cannot be read ({error})", where=where) from error
     try:
         count, *elements = lines[3].split()
         if int(count) != len(elements):
-            raise ValueError(f"line 4 announces {count} elements but names {len(elements)}")
+            raise ValueError(f"line 4 gives the number of elements as {count}, but names {len(elements)}")
         first, drho, second, dr, r_cut = (float(word) for word in lines[4].split())
         n_rho, n_r = int(first), int(second)
     except (IndexError, ValueError) as error:
         raise InputError(
-            f"this is not a setfl table: lines 4 and 5 must name the elements and the grids ({error})",
+            f"the file is not a setfl table: lines 4 and 5 must name the elements and the grids ({error})",
             where=where,
-            remedy="Give a file in LAMMPS's eam/alloy format",
+            remedy="Give a file in the eam/alloy format of LAMMPS",
         ) from error
     if len(elements) != 1:
         raise InputError(
-            f"the table is for {len(elements)} elements ({', '.join(elements)}); only tables of one "
-            "element are supported",
+            f"the potential table is for {len(elements)} elements ({', '.join(elements)}); expected a table "
+            "for a single element",
             where=where,
-            remedy="Give a table of a single element",
+            remedy="Give a table for a single element",
         )
     if others := sorted(set(symbols) - set(elements)):
         raise InputError(
-            f"the table is for {elements[0]}, but the structure holds {', '.join(others)}",
+            f"the potential table is for {elements[0]}, but the structure also holds {', '.join(others)}",
             where=where,
-            remedy="Correct the structure, or the key potential.file",
+            remedy="Correct the structure, or give another table with the key potential.file",
         )
     # the line of the element: atomic number, mass, lattice constant, lattice; not needed
     words = " ".join(lines[6:]).split()
     expected = n_rho + 2 * n_r
     if len(words) != expected:
-        raise InputError(f"expected {expected} numbers after line 6; found {len(words)}", where=where)
+        raise InputError(f"the table has {len(words)} numbers after line 6; expected {expected}", where=where)
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError as error:
-        raise InputError(f"a number in the table cannot be read ({error})", where=where) from error
+        raise InputError(f"a number in the potential table cannot be read ({error})", where=where) from error
     if not np.isfinite(numbers).all() or min(drho, dr, r_cut) <= 0 or min(n_rho, n_r) < 5:
         raise InputError("the table contains numbers that are not finite, or empty grids", where=where)
     # many files end one step before their cutoff: the last cubic is carried on, as ASE does it
     if r_cut > n_r * dr * (1 + 1e-9):
         raise InputError(
-            f"the table ends at r = {(n_r - 1) * dr:g}, before its cutoff {r_cut:g}",
+            f"the potential table ends at r = {(n_r - 1) * dr:g}, before its cutoff {r_cut:g}",
             where=where,
-            remedy="Lower the cutoff in line 5 or extend the table",
+            remedy="Lower the cutoff in line 5 of the table, or extend the table",
         )
     embedding, density, r_pair = np.split(numbers, [n_rho, n_rho + n_r])
     return Setfl(elements[0], tuple(lines[:3]), drho, dr, r_cut, embedding, density, r_pair)

@@ -227,7 +227,7 @@ def energy_function(
         InputError: a convention that is not known, or that takes a graph; units that are not known.
     """
     if not (np.isfinite(r_cut) and r_cut > 0):
-        raise InputError(f"the interaction radius is {r_cut}; expected a length above 0")
+        raise InputError(f"the cutoff radius is {r_cut}; expected a finite length above 0")
     parts = list(given) if isinstance(given, tuple | list) else [given]
     lists = next((part for part in parts if hasattr(part, "allocate")), None)
     # (neighbor_fn, init_fn, energy_fn), or (energy_fn, neighbor_fn, displacement_fn)
@@ -273,9 +273,9 @@ def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Con
     names = [one.name.lower() for one in placed]
     if placed and (names[0] in _GRAPHS or "Graph" in str(placed[0].annotation)):
         raise InputError(
-            f"{name} takes a graph, not a neighbor list, so mdnum cannot pass its neighbor list",
-            remedy="Wrap it in a function energy(parameters, R, neighbor, cell) that makes the graph from "
-            "neighbor.idx and mdnum.md.jaxmd.displacement(cell)",
+            f"the energy function {name} takes a graph instead of a neighbor list",
+            remedy="Call it from a function energy(parameters, R, neighbor, cell) that makes the graph "
+            "from neighbor.idx and mdnum.md.jaxmd.displacement(cell)",
         )
     open_ended = any(one.kind == kinds.VAR_KEYWORD for one in given)
     allowed = {one.name for one in given}
@@ -296,6 +296,6 @@ def _scales(units: Any, name: str) -> tuple[float, float]:
         return LENGTHS[length], ENERGIES[energy]
     except (ValueError, KeyError):
         raise InputError(
-            f"{name}: unknown units {units!r}",
+            f"{units!r} is not a known pair of units for the energy function {name}",
             remedy=f"Give a length unit ({', '.join(LENGTHS)}) and an energy unit ({', '.join(ENERGIES)})",
         ) from None

@@ -113,9 +113,9 @@ class FixedPointUnits:
         """
         if not cell.orthorhombic:
             raise InputError(
-                "a fixed-point state needs an orthorhombic box along x, y and z",
+                "fixed-point positions are supported only in an orthorhombic box with edges along x, y and z",
                 where="precision.state",
-                remedy='Use state = "float64" for other boxes',
+                remedy='Set state = "float64" for other boxes',
             )
         matrix = np.round(np.asarray(cell.matrix, np.float64) / self.spacing)
         if np.max(np.abs(matrix)) >= 2**50:
@@ -342,9 +342,9 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
     """
     if type(integrator) not in (VelocityVerlet, Langevin):
         raise InputError(
-            f"fixed-point arithmetic supports nve and langevin, not {integrator.name}",
+            f"fixed-point arithmetic supports the integrators nve and langevin, not {integrator.name}",
             where="precision.state",
-            remedy='Use state = "float64"',
+            remedy='Use nve or langevin, or set state = "float64"',
         )
     timestep = float(integrator.timestep)
     impulse = units.force * (0.5 * timestep)
@@ -360,8 +360,8 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
         period = _period(kept)
         if period < 1:
             raise InputError(
-                f"friction x timestep = {loss:.3g}; in fixed-point arithmetic it must lie between "
-                "1e-7 and 10",
+                f"friction x timestep = {loss:.3g}; expected a product between 1e-7 and 10 in fixed-point "
+                "arithmetic",
                 where="dynamics.friction",
             )
         decay = kept / 2**_SHIFT
@@ -410,9 +410,9 @@ def counted(x: Float[Array, "*shape"], zero: jax.Array) -> jax.Array:
 def _counted_jvp(primals, tangents):
     # a derivative of 0 would be taken for an answer
     raise InputError(
-        "a step in fixed-point arithmetic has no derivative",
+        "a step in fixed-point arithmetic has no derivative, because numbers are rounded to integers",
         where="precision.state",
-        remedy="Use --methods reversible or symmetric: both treat rounding as the identity",
+        remedy="Use --methods reversible or symmetric, which differentiate as if nothing were rounded",
     )
 
 

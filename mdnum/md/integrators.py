@@ -314,7 +314,7 @@ class KickDrift(Integrator):
         own = ("kick", "init", "finish", "begin", "deform")
         if other := [name for name in own if getattr(cls, name) is not getattr(KickDrift, name)]:
             raise TypeError(
-                f"{cls.__name__} overrides {other[0]}; derive the class from Integrator, not from KickDrift"
+                f"the class {cls.__name__} overrides {other[0]}; derive it from Integrator, not KickDrift"
             )
 
     def kick(self, v: Vector, time: Number, acceleration: Vector) -> Vector:
@@ -351,14 +351,14 @@ def without_kick(integrator: Integrator) -> str | None:
 def check_kick(integrator: Integrator) -> None:
     """Raise `InputError` if the equations of motion of an integrator cannot be linearized."""
     if why := without_kick(integrator):
-        raise InputError(f"the equations of the run cannot be linearized: {why}", where="dynamics.kind")
+        raise InputError(f"the equations of motion cannot be linearized: {why}", where="dynamics.kind")
 
 
 def check_one_box(integrator: Integrator, what: str) -> None:
     """Raise `InputError` if an integrator changes the box although a fixed box is required."""
     if integrator.moves_cell:
         raise InputError(
-            f"{what} need a fixed box, but {integrator.name} changes the box", where="dynamics.kind"
+            f"{what} need a fixed box, but the integrator {integrator.name} changes it", where="dynamics.kind"
         )
 
 

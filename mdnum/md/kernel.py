@@ -265,13 +265,13 @@ def _written(
         if isinstance(value, _Value):
             if value.kind != kind:
                 raise TypeError(
-                    "a number was given where a decision is expected, or a decision where a number "
-                    "is expected"
+                    "an operation of the potential mixes numbers with truth values in a way that cannot be "
+                    "compiled"
                 )
             return value.name
         known = not isinstance(value, Tracer | jax.Array)
         if np.size(value) != 1 or kind not in ("VEC", "BOOL", "LONG" if known else ""):
-            raise TypeError("the value is an array, or of an unsupported type")
+            raise TypeError("a constant of the potential is not a single number of a supported type")
         if known:
             return _number(value, kind)
         constants.setdefault(id(value), value)
@@ -353,7 +353,7 @@ def _written(
             "select_n": given[0] != "BOOL",
         }
         if line is None or not kind or unlike.get(name):
-            raise TypeError("the operation has no counterpart in the compiled loop")
+            raise TypeError("an operation of the potential is not supported in the compiled loop")
         operands = list(map(text, inputs, given))
         if kind == "VEC" and name in ("mul", "div"):
             return [product(*operands) if name == "mul" else quotient(*operands)]

@@ -290,9 +290,9 @@ class ChannelForce(PairForce):
 
     def judge(self, positions):
         raise InputError(
-            "each term with its own radius has its own decision, but here a single decision per pair "
-            "is expected",
-            remedy="Give all terms the same cutoff radius",
+            "the terms of the potential have different cutoff radii, so there is no single decision for "
+            "each pair of atoms",
+            remedy="Give all terms of the potential the same cutoff radius",
         )
 
 

@@ -209,18 +209,18 @@ class PairFunction(PairPotential):
         self.shared = {key: value for key, value in parameters.items() if key not in own}
         if arguments[:1] not in (["r"], ["r2"]):
             raise InputError(
-                f"the first argument is called {arguments[0] if arguments else 'nothing'!r}; expected r, the "
-                "distance, or r2, its square",
+                "the first argument of the pair function is called "
+                f"{arguments[0] if arguments else 'nothing'!r}; expected r, the distance, or r2, its square",
                 where=_name_of(function),
-                remedy="Name the first argument r or r2",
+                remedy="Rename the first argument of the function to r or r2",
             )
         try:
             inspect.signature(function).bind(0.0, **parameters)
         except TypeError as error:
             raise InputError(
-                f"{error}; the function takes {', '.join(arguments[1:])}",
+                f"{error}; the pair function takes the parameters {', '.join(arguments[1:])}",
                 where=_name_of(function),
-                remedy="Give a value for every parameter by name",
+                remedy="Give a value for every parameter of the function by name",
             ) from None
 
     name = property(lambda self: _name_of(self.function))  # type: ignore[assignment]

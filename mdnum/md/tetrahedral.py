@@ -113,7 +113,7 @@ class Tersoff(ManyBody):
 
     def __post_init__(self) -> None:
         if self.m not in (1, 3):
-            raise InputError(f"Tersoff's exponent m is {self.m}; expected 1 or 3")
+            raise InputError(f"the exponent m of the Tersoff potential is {self.m}; expected 1 or 3")
 
     @property
     def r_cut(self) -> Any:
@@ -184,5 +184,5 @@ def named(
     made, sets = _SETS[kind]
     if parameters not in sets:
         known = f"{'are' if len(sets) > 1 else 'is'} {' and '.join(sets)}"
-        raise InputError(f"{kind} has no parameters called {parameters!r}; known {known}")
+        raise InputError(f"{kind} has no set of parameters called {parameters!r}; known {known}")
     return made(**sets[parameters], pbc=pbc)

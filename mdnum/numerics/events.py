@@ -29,7 +29,7 @@ class Threshold:
 
     def __post_init__(self):
         if self.comparison not in INCLUSIVE:
-            raise InputError(f"comparison {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
+            raise InputError(f"the comparison is {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
 
     def margin(self, quantity):
         """Return threshold minus quantity, which is positive if the decision is "yes".
@@ -67,8 +67,8 @@ class Hysteresis:
         # traced values are checked where they were made
         if isinstance(enter, float | int) and isinstance(leave, float | int) and leave < enter:
             raise InputError(
-                f"the threshold for leaving, {leave:g}, is below the one for entering, {enter:g}",
-                remedy="Set the threshold for leaving to at least the one for entering",
+                f"the threshold for leaving is {leave:g}, below the threshold for entering, {enter:g}",
+                remedy="Set the threshold for leaving to at least the threshold for entering",
             )
 
     def margin(self, quantity, before):

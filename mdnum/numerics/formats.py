@@ -73,7 +73,7 @@ def format_of(name: str) -> FloatFormat:
         InputError: no format has this name.
     """
     if name not in FORMATS:
-        raise InputError(f"unknown format {name!r}; known formats are {', '.join(FORMATS)}")
+        raise InputError(f"{name!r} is not a known number format; known formats are {', '.join(FORMATS)}")
     return FORMATS[name]
 
 
@@ -170,6 +170,6 @@ def check_scale(scale: float) -> None:
     """
     if not (scale > 0 and math.frexp(scale)[0] == 0.5):
         raise InputError(
-            f"the scale {scale:g} is not a power of two",
-            remedy="Give a power of two, for which scaling is exact",
+            f"the scale of the number format is {scale:g}; expected a power of two",
+            remedy="Give a power of two, with which scaling causes no rounding",
         )

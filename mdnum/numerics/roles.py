@@ -45,7 +45,7 @@ def check_role(role: str, dtype: str) -> None:
         raise InputError(
             f"{dtype} is not supported as the {role} precision of molecular dynamics: {_TOO_SHORT[role]}",
             where=f"precision.{role}",
-            remedy=f"Use {' or '.join(WIDE)}; pair forces may be {dtype} (precision.force)",
+            remedy=f"Use {' or '.join(WIDE)}; only pair forces can be computed in {dtype} (precision.force)",
         )
     expect_known("dtype", [dtype], known, where=f"precision.{role}")
 

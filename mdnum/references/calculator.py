@@ -114,7 +114,7 @@ class MdnumCalculator(ClassicalCalculator):
         where = "MdnumCalculator"
         if (system is None) == (potential is None):
             remedy = "Write MdnumCalculator('argon/liquid-864'), or potential=... and cutoff=..."
-            raise InputError("give either a system or a potential", remedy=remedy, where=where)
+            raise InputError("expected either a system or a potential", remedy=remedy, where=where)
         if isinstance(system, System | Simulation) and overrides:
             remedy = "Pass the name of the system, or load it with the overrides"
             raise InputError("overrides have no effect on a loaded system", remedy=remedy, where=where)
@@ -158,7 +158,7 @@ class MdnumCalculator(ClassicalCalculator):
                 near = int(np.argmin(r))
                 pair = f"; the closest pair is {evaluation.i[near]}-{evaluation.j[near]} at {r[near]:.4g}"
             raise NumericalError(
-                f"an energy or a force is not finite{pair}", where="MdnumCalculator",
+                f"the computed energy or a force is not finite{pair}", where="MdnumCalculator",
                 remedy="Relax the structure with a softer potential, or move the atoms apart",
             )  # fmt: skip
         if "energies" in self.implemented_properties:

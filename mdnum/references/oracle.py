@@ -136,8 +136,8 @@ def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
     for axis in np.flatnonzero(pbc):
         if not lengths[axis] > 0.0:
             raise InputError(
-                f"direction {axis} is periodic but has no cell vector",
-                remedy="Give the structure a cell, or set pbc to false along it",
+                f"direction {axis} of the structure is periodic, but has no cell vector",
+                remedy="Give this direction a cell vector, or set pbc to false along it",
                 where="pair oracle",
             )
     return completed(cell, pbc)

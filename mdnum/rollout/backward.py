@@ -137,9 +137,9 @@ class BackwardRun:
     ):
         if simulation.fixed_point is None:
             raise InputError(
-                "only fixed-point steps can be reversed",
+                "the run uses floating-point steps, which cannot be reversed exactly",
                 where="precision.state",
-                remedy='Use state = "lattice"',
+                remedy='Set state = "lattice" for reversible fixed-point steps',
             )
         self.simulation = simulation
         self.baths = dict(baths or {})
@@ -183,7 +183,7 @@ class BackwardRun:
             return
         self._check_bath()
         if step not in self.baths:
-            raise NumericalError(f"the bits that friction discarded before step {step} were not stored")
+            raise NumericalError(f"the velocity bits lost to friction before step {step} were not stored")
         self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
@@ -191,6 +191,6 @@ class BackwardRun:
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(
-                f"the reversed run did not retrace the forward run: at step {step} the store of "
-                "discarded bits is not empty"
+                f"the reversed run did not retrace the forward run: at step {step}, bits of the velocities "
+                "are left that friction had not removed"
             )

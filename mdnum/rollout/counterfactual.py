@@ -52,8 +52,8 @@ class Counterfactual:
     ):
         if not simulation.imposable or not leader.imposable:
             raise InputError(
-                "decisions cannot be imposed on a many-body potential",
-                remedy="Compare the two runs without a counterfactual",
+                "pair decisions cannot be imposed on a many-body potential",
+                remedy="Compare the two runs without a counterfactual run",
             )
         self.simulation, self.guard, self.failed = simulation, guard, ""
         self._ahead: list[Rows] = []

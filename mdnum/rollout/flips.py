@@ -205,7 +205,7 @@ class PairRecorder:
         """Return the number of pairs, given a number that counts each pair twice."""
         if both % 2:
             raise MdnumError(
-                "the decision of a pair differs between its two atoms", remedy="Report this as a bug"
+                "a pair is inside the cutoff for only one of its two atoms", remedy="Report this as a bug"
             )
         return both // 2
 
@@ -307,8 +307,8 @@ class PairRecorder:
         )  # fmt: skip
         if contradicted:
             raise MdnumError(
-                "a recorded margin contradicts its decision",
-                remedy="Run `mdnum doctor`; the compiled arithmetic differs from the expected arithmetic",
+                "the recorded margin of a pair decision contradicts the decision",
+                remedy="Run `mdnum doctor`: the compiled code probably computes with unexpected rounding",
             )
         margin, bound, jump, distance, speed, force_jump, by_box = numbers
         if self.simulation.pairwise and self.simulation.model.weights:

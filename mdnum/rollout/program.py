@@ -93,8 +93,8 @@ class MdProgram:
         """
         if self.size != other.size:
             raise InputError(
-                f"the runs have {self.size} and {other.size} atoms; expected the same number",
-                remedy="Compare runs of the same structure",
+                f"the two runs have {self.size} and {other.size} atoms; expected the same number",
+                remedy="Compare two runs of the same structure",
             )
 
     def lockstep(

@@ -335,7 +335,7 @@ class Rollout:
         raise NumericalError(
             what,
             where=self.simulation.name,
-            remedy=f"Everything up to step {kept} is in {self.folder.path}. {remedy}",
+            remedy=f"The results up to step {kept} are stored in {self.folder.path}. {remedy}",
             folder=self.folder.path,
         )
 
@@ -378,7 +378,7 @@ def run(
         if system is not given or save_every is not None or overrides:
             raise InputError(
                 "a resumed run keeps its own system, settings and save_every",
-                remedy="Give only the folder; to extend the run, also give steps",
+                remedy="Give only the folder, and a number of steps to extend the run",
                 where=str(resume),
             )
         finished = _finished(Path(resume), steps, given)
@@ -406,7 +406,7 @@ def _fresh(simulation: Simulation, layout: Layout, out, steps, save_every, progr
     last = simulation.steps if steps is None else steps
     every = simulation.save_every if save_every is None else save_every
     if last < 0 or every < 0:
-        raise InputError("steps and save_every must not be negative")
+        raise InputError("the number of steps or save_every is negative; expected 0 or more")
     folder = RunFolder.create(Path(out) if out is not None else default_folder(simulation.name), layout)
     simulation.write(folder.path)
     folder.write_provenance(provenance.collect(simulation))
@@ -437,7 +437,7 @@ def _resumed(
     folder = RunFolder.open(path)
     if folder.summary.get("status") == "failed":
         raise FolderError(
-            f"this run failed: {folder.summary.get('error', 'see its report')}",
+            f"the run failed and cannot be resumed: {folder.summary.get('error', 'see its report')}",
             where=str(path),
             remedy=f"Start a new run. {folder.summary.get('remedy', _SHORTER)}",
         )
@@ -445,7 +445,7 @@ def _resumed(
     with folder.explained():
         state = folder.load_checkpoint()
         if steps is not None and steps < int(np.asarray(state["state_step"])) - 1:
-            raise FolderError(f"the run is already past step {steps}", where=str(path))
+            raise FolderError(f"the run is already beyond the requested step {steps}", where=str(path))
         folder.check_start()
         simulation = again(path, given)
         last = int(state["steps"]) if steps is None else steps

@@ -55,7 +55,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             arrays = _arrays(file)
         meta, store = (json.loads(str(arrays.pop(name))) for name in (_META, _STORE))
         if not isinstance(meta, dict) or not isinstance(store, dict):
-            raise ValueError("the row counts of the checkpoint are not a table")
+            raise ValueError("the checkpoint does not contain a number of rows for each table")
         return arrays | meta, store
     except FolderError:
         raise
@@ -73,10 +73,10 @@ def _arrays(file: BinaryIO) -> dict[str, np.ndarray]:
         members = archive.infolist()
         # members that are not packed and share no bytes cannot hold more than the file
         if any(one.compress_type != zipfile.ZIP_STORED for one in members):
-            raise ValueError("the file is compressed, but mdnum writes checkpoints uncompressed")
+            raise ValueError("the checkpoint file is compressed, but mdnum writes it uncompressed")
         held = sum(one.file_size for one in members)
         if held > size:
-            raise ValueError(f"its header claims {held:,} bytes, but the file has {size:,}")
+            raise ValueError(f"the header states {held:,} bytes of data, but the file has only {size:,}")
         return {one.filename.removesuffix(".npy"): _array(archive, one) for one in members}
 
 
@@ -87,7 +87,7 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         shape, _, dtype = header(stream)
         claimed = math.prod(shape) * dtype.itemsize
         if dtype.hasobject or claimed != member.file_size - stream.tell():
-            raise ValueError(f"{member.filename} claims {claimed:,} bytes that the file does not contain")
+            raise ValueError(f"{member.filename} should have {claimed:,} bytes, but has another size")
     with archive.open(member) as stream:
         return npy.read_array(stream, allow_pickle=False)
 
@@ -100,7 +100,7 @@ def _split(state: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, A
             array = np.asarray(value)
             if array.dtype.kind not in "biufcU":
                 raise TypeError(
-                    f"checkpoint: {key!r} has dtype {array.dtype}, which an npz file cannot restore"
+                    f"the array {key!r} has dtype {array.dtype}, which an npz file cannot restore"
                 )
             arrays[key] = array
         else:
@@ -167,7 +167,7 @@ class FrameFile:
         if self.mark()[2] < size:
             raise FolderError(
                 f"the trajectory is shorter than its checkpoint says ({frames} frames)",
-                remedy="The folder was changed afterward; run again in a new folder",
+                remedy="Run again in a new folder: the old one was changed after the checkpoint",
                 where=str(self.path),
             )
         with disk_errors(self.path), opened(self.path, "r+b") as file:

@@ -173,7 +173,7 @@ def _refuse(seen: os.stat_result, path: Path, in_place: bool) -> None:
     if stat.S_ISLNK(seen.st_mode):
         raise _linked(path)
     if not stat.S_ISREG(seen.st_mode):
-        raise FolderError("not a regular file", remedy="Remove it or use another folder", where=str(path))
+        raise FolderError("the path is not a regular file", remedy="Use another folder", where=str(path))
     if in_place and seen.st_nlink > 1:
         seen_so = "the file has a second name (a hard link), and would change there too"
         raise FolderError(seen_so, remedy="Replace the file by a copy", where=str(path))
@@ -181,8 +181,8 @@ def _refuse(seen: os.stat_result, path: Path, in_place: bool) -> None:
 
 def _linked(path: Path) -> FolderError:
     return FolderError(
-        "the file is a link; files of a result folder must lie in the folder itself",
-        remedy="If the file is yours, replace the link by a copy",
+        "the file is a link; expected a regular file in the result folder",
+        remedy="If you trust the file that the link leads to, replace the link by a copy",
         where=str(path),
     )
 
@@ -243,11 +243,11 @@ def load(root: Path) -> Manifest | None:
         held = json.loads(text)
         stated = held.pop("digest")
         if stated != digest_of(_canonical(held)):
-            raise ValueError("the digest of the manifest does not match its content")
+            raise ValueError("the checksum in the manifest does not match the manifest's content")
         files = {str(name): [str(one) for one in allowed] for name, allowed in held["files"].items()}
         # names of files in the folder, or in one of the folders in it
         if not all(map(_INSIDE.fullmatch, files)):
-            raise ValueError("the manifest lists files outside of the folder")
+            raise ValueError("the manifest lists files outside of its result folder")
         layout = None
         if "kind" in held:
             # an earlier mdnum described columns of its own alone
@@ -255,7 +255,7 @@ def load(root: Path) -> Manifest | None:
         return Manifest(layout, bool(held["finished"]), files, str(held.get("version", "")))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FolderError(
-            "the manifest is damaged, so the other files cannot be verified",
+            "the manifest is damaged, so the other files in the folder cannot be verified",
             remedy="Restore the folder from a copy; its parquet files can still be read one at a time",
             where=str(path),
         ) from error

@@ -131,13 +131,13 @@ class RunFolder:
         """
         folder = cls(Path(path), layout)
         if folder.path.exists() and not folder.path.is_dir():
-            raise FolderError("is a file, not a folder", remedy="Choose another folder", where=str(path))
+            raise FolderError("the path is a file", remedy="Choose another folder", where=str(path))
         folder._usable()
         try:
             folder.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise FolderError(
-                f"the folder cannot be created: {error.strerror}", remedy="Choose another", where=str(path)
+                f"the folder cannot be created: {error.strerror}", remedy="Use another path", where=str(path)
             ) from error
         with disk_errors(folder.path):
             folder._take_lock()
@@ -599,7 +599,7 @@ class RunFolder:
     def _stream(self, name: str) -> TableStream:
         if name not in self._streams:
             if not self.layout.columns(name):
-                raise ValueError(f"folders of kind {self.kind!r} have no table {name!r}")
+                raise ValueError(f"a result folder of kind {self.kind!r} has no table {name!r}")
             own = self.layout.described
             describe = lambda schema: described(schema, name, self.about, own)  # noqa: E731
             args = (self.path, name, self.layout)
@@ -726,7 +726,7 @@ class RunFolder:
         text = manifest.read_text(self.path / name)
         held = _parsed(self.path / name, text) if text else {}
         if not isinstance(held, dict):
-            raise FolderError("the file is damaged: it has no JSON object", where=str(self.path / name))
+            raise FolderError("the file is damaged: it is not a JSON object", where=str(self.path / name))
         return held
 
 
@@ -742,8 +742,8 @@ def restoring(path: Path) -> Iterator[None]:
     except _OF_WRONG_VALUES as error:
         seen = " ".join(str(error).split())[:200]
         raise FolderError(
-            f"the file has content that mdnum does not write there ({type(error).__name__} {seen})",
-            remedy="Restore the file from a copy, or start in a new folder",
+            f"the file has content that mdnum never writes into it ({type(error).__name__} {seen})",
+            remedy="Restore the file from a copy, or start again in a new folder",
             where=str(path),
         ) from error
 
@@ -774,7 +774,7 @@ def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
     """Raise the error for a run folder that is not empty, with a remedy."""
     if not any(name in (*_FILES, "parts", manifest.NAME) for name in present):
         seen = f"is not empty (it holds {present[0]!r})"
-        raise FolderError(seen, remedy="Choose an empty or a new folder", where=str(path))
+        raise FolderError(seen, remedy="Choose an empty or a new folder for the results", where=str(path))
     made = manifest.load(path)
     remedy = "Choose another folder, or remove this folder"
     if manifest.resumable(path):

@@ -59,7 +59,7 @@ class Layout:
                 f"invalid kind {self.kind!r}, command {self.command!r} or resumes_from {self.resumes_from!r}"
             )
         if len(self.further) > _MOST_COLUMNS:
-            raise ValueError(f"the names of files are too long: {self.further[:100]!r}")
+            raise ValueError(f"the text with the names of further files is too long: {self.further[:100]!r}")
         if len(self.tables) > _MOST_TABLES or not all(map(_TABLE.fullmatch, self.tables)):
             raise ValueError(f"too many tables, or invalid names of tables: {list(self.tables)[:3]}")
         _ = self._columns
@@ -68,12 +68,12 @@ class Layout:
                 if "*" not in column and column not in self.columns(table):
                     raise ValueError(f"{table}.{column} is described, but the table has no such column")
                 if (len(said) != 2 and type(said) is not str) or len("".join(said)) > _MOST_COLUMNS:
-                    raise ValueError(f"{table}.{column}: {said!r:.100} is not [unit, description]")
+                    raise ValueError(f"{table}.{column} is {said!r:.100}; expected [unit, description]")
         for table, values in self.usual.items():
             for column, value in values.items():
                 kind, _ = self.columns(table)[column]
                 if type(value) not in TYPES[kind] or (type(value) is int and abs(value) >= 1 << 31):
-                    raise ValueError(f"{table}.{column} is of type {kind}, but {value!r} is not")
+                    raise ValueError(f"{value!r} in {table}.{column} is not of its type {kind}")
 
     @cached_property
     def always(self) -> tuple[str, ...]:

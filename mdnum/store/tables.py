@@ -51,7 +51,7 @@ class TableStream:
         describe: Callable[[pa.Schema], pa.Schema] = pa.Schema.remove_metadata, in_parts: bool = False,
     ):  # fmt: skip
         if not re.fullmatch(r"[a-z][a-z_]*", name):
-            raise FolderError(f"there is no table {name!r}", where=str(root))
+            raise FolderError(f"the folder has no table {name!r}", where=str(root))
         self.name = name
         self._root = root
         self._check = check
@@ -103,8 +103,8 @@ class TableStream:
                 continue
             if start > rows:
                 raise FolderError(
-                    f"rows {rows} to {start - 1} of table {self.name!r} are missing",
-                    remedy="A file of this table was removed; run again in a new folder",
+                    f"rows {rows} to {start - 1} of the table {self.name!r} are missing",
+                    remedy="Start the run again in a new folder, because a file of the table was removed",
                     where=str(self.parts_folder),
                 )
             count = self._row_count(path)
@@ -127,10 +127,10 @@ class TableStream:
         missing = [name for name in schema.names if name not in columns and name not in self._usual]
         unknown = [name for name in columns if name not in schema.names]
         if missing or unknown:
-            raise ValueError(f"table {self.name!r}: missing columns {missing}, unexpected columns {unknown}")
+            raise ValueError(f"table {self.name!r} has missing columns {missing}, unexpected {unknown}")
         lengths = {name: len(one) for name, one in columns.items() if not isinstance(one, str)}
         if len(set(lengths.values())) > 1:
-            raise ValueError(f"table {self.name!r}: the columns have different lengths: {lengths}")
+            raise ValueError(f"the columns of the table {self.name!r} have different lengths: {lengths}")
         self._schema, rows = schema, max(lengths.values())
         if not rows:
             return
@@ -175,7 +175,7 @@ class TableStream:
         else:
             if self._writing is None:
                 if self.flushed:
-                    raise ValueError(f"table {self.name!r} is complete: no rows can be appended")
+                    raise ValueError(f"the table {self.name!r} is complete, so no rows can be appended")
                 self._writing = _Writing(self._write_merged)
             self._writing.put(table)
         self.flushed += self._buffered
@@ -188,8 +188,8 @@ class TableStream:
         have = sum(count for _, count in files)
         if have < rows:
             raise FolderError(
-                f"table {self.name!r} has {have} rows, but its checkpoint counts {rows}",
-                remedy="The folder was changed afterward; run again in a new folder",
+                f"the table {self.name!r} has {have} rows, fewer than the {rows} rows at the last checkpoint",
+                remedy="Run again in a new folder: the old one was changed after the checkpoint",
                 where=str(self.merged_path.parent),
             )
         # parts of a merge that was killed before it removed them: their rows are in the merged file
@@ -326,8 +326,8 @@ class TableStream:
         if other or missing:
             seen = f"column {other[0]!r} holds {found[other[0]]}" if other else f"no column {missing[0]!r}"
             raise FolderError(
-                f"the file is not a valid table {self.name!r} ({seen})",
-                remedy="Run again in a new folder",
+                f"the file does not contain a valid table {self.name!r} ({seen})",
+                remedy="Start the run again in a new folder",
                 where=str(path),
             )
 
@@ -347,7 +347,7 @@ class _Writing:
         while (table := self._tables.get()) is not None:
             yield table
         if not self._whole:
-            raise RuntimeError("rows of the table are missing")
+            raise RuntimeError("some rows of the table are missing")
 
     def put(self, table: pa.Table | None) -> None:
         """Add a table to the queue when there is space; raise the error of the writing thread, if any."""
@@ -439,7 +439,7 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
     except (OSError, pa.ArrowException, MemoryError) as error:
         seen = " ".join(str(error).split())[:200]
         raise FolderError(
-            f"the file is damaged: not a readable parquet file ({seen})",
+            f"the file is damaged: it cannot be read as a parquet file ({seen})",
             where=str(path),
             remedy=_RESTORE,
         ) from error

@@ -89,7 +89,7 @@ def checked(axis: Axis) -> Axis:
         raise InputError(f"{axis.key} = {bad[0]} is not finite", remedy=_REMEDY)
     if len({*seen}) < len(seen):
         again = next(one for one in seen if seen.count(one) > 1)
-        raise InputError(f"{axis.key} has the value {again} twice", remedy="Give each value once")
+        raise InputError(f"the value {again} is given twice for {axis.key}", remedy="Give each value once")
     return axis
 
 
@@ -98,7 +98,7 @@ def _range(text: str, low: Any, high: Any, step: Any) -> tuple[Any, ...]:
     if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in numbers):
         raise InputError(f"--over {text!r} is not a range of numbers", remedy=_REMEDY)
     if not all(map(math.isfinite, numbers)) or step <= 0 or high < low:
-        raise InputError(f"--over {text!r} is not an ascending range", remedy=_REMEDY)
+        raise InputError(f"--over {text!r} is not an ascending range of finite numbers", remedy=_REMEDY)
     count = math.floor((high - low) / step + 1e-9) + 1
     if count > _MOST_VALUES:
         raise InputError(f"--over {text!r} has {count:,} values", remedy=f"Give at most {_MOST_VALUES:,}")

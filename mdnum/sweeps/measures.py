@@ -416,7 +416,7 @@ def chosen(words: Sequence[str], world: str) -> list[Measure]:
         InputError: no such measure in this world, or a measure is repeated.
     """
     if twice := [word for word in words if list(words).count(word) > 1]:
-        raise InputError(f"--measure names {twice[0]} twice", remedy="Give each measure once")
+        raise InputError(f"the measure {twice[0]} is given twice", remedy="Give each measure once")
     measures = [_named(word) for word in words]
     if other := [measure.name for measure in measures if measure.world != world]:
         known = ", ".join(name for name in MEASURES.shipped if MEASURES[name].world == world)
@@ -456,8 +456,8 @@ def _of_file(word: str) -> Measure:
             top = one.partition(".")[0]
             if not top or any((file.parent / end).exists() for end in (f"{top}.py", f"{top}/__init__.py")):
                 raise InputError(
-                    f"the file imports {one} from its folder, which the digest of the measure does not cover",
-                    where=str(file), remedy="Put everything that the measure needs into one file",
+                    f"the file imports {one} from its folder, so changes of {one} would not be noticed",
+                    where=str(file), remedy="Put all code that the measure needs into one file",
                 )  # fmt: skip
 
     def value(run: Sample) -> Value:

@@ -215,7 +215,7 @@ def _axes(over: Any) -> list[Axis]:
     else:
         axes = [parse(text) for text in texts]
     if not axes:
-        raise InputError("no choice is varied", remedy="Give --over KEY=VALUE,VALUE,…")
+        raise InputError("no setting is varied", remedy="Give --over KEY=VALUE,VALUE,…")
     return axes
 
 

@@ -46,7 +46,7 @@ def parts(place: str, folder: Path, where: str = "potential.function") -> tuple[
     """
     file, _, name = place.rpartition(":")
     if not file.endswith(".py") or not name.isidentifier():
-        raise InputError(f"{place!r} is not of the form FILE.py:NAME", where=where)
+        raise InputError(f"the given text is {place!r}; expected the form FILE.py:NAME", where=where)
     return folder / file, name
 
 
@@ -63,9 +63,9 @@ def function(place: str, folder: Path, where: str = "potential.function") -> Cal
     file, name = parts(place, folder, where)
     if not is_allowed():
         raise InputError(
-            f"{where} names Python code ({file}:{name}), which is not executed without permission",
+            f"{where} names Python code ({file}:{name}), which is executed only with permission",
             where=where,
-            remedy="Read the code, then add --allow-code, or allow_code=True in Python",
+            remedy="Read the code, then give --allow-code, or allow_code=True in Python",
         )
     if not file.is_file():
         raise InputError("no such file", where=str(file), remedy=f"Correct the file name in {where}")

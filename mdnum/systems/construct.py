@@ -309,20 +309,20 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
     if not (ends := np.abs(u[-1] - u[-2]) <= _STEEP * _INSIDE * np.max(np.abs(u[-4:]), axis=0)).all():
         kind = int(np.argmin(ends))
         raise InputError(
-            f"u of the pair {pairs_of[kind]} is {u[-2, kind]:.6g} at its cutoff {r_cut[kind]:g}, but "
-            f"{u[-1, kind]:.6g} just inside; expected a function that continues smoothly across the cutoff",
+            f"the pair energy of {pairs_of[kind]} is {u[-2, kind]:.6g} at the cutoff {r_cut[kind]:g}, but "
+            f"{u[-1, kind]:.6g} just inside; expected a function that is smooth across the cutoff",
             where=potential.name,
-            remedy="Remove the truncation from the function: the cutoff truncates it",
+            remedy="Remove the truncation from the function, because mdnum truncates it at the cutoff",
         )
     differs = ~np.isclose(u, swapped, rtol=_SYMMETRIC, atol=_SYMMETRIC * scale, equal_nan=True)
     if differs.any():
         k, kind = np.unravel_index(np.argmax(differs), u.shape)
         first, second = pairs_of[kind].split("-")
         raise InputError(
-            f"u is {u[k, kind]:.6g} for {first}, {second} at {r[k, kind]:.6g}, but {swapped[k, kind]:.6g} "
-            f"for {second}, {first}; expected the same value in either order",
+            f"the pair energy at distance {r[k, kind]:.6g} is {u[k, kind]:.6g} for the species {first}, "
+            f"{second}, but {swapped[k, kind]:.6g} for {second}, {first}; expected equal energies",
             where=potential.name,
-            remedy="Combine the values of both species symmetrically, as (a + b) / 2",
+            remedy="Combine the parameters of the two species symmetrically, for example as (a + b) / 2",
         )
 
 
@@ -336,7 +336,7 @@ def common(terms: Mapping[str, Term]) -> Cut:
     if len(set(compared.values())) != 1:
         seen = ", ".join(f"{name} {compare!r}" for name, compare in compared.items()) or "no term"
         message = f"all terms must use the same comparison; found {seen}"
-        raise InputError(message, where="cutoff.compare", remedy="Give all terms the same comparison")
+        raise InputError(message, where="cutoff.compare", remedy="Give all terms the same cutoff.compare")
     return next(iter(terms.values())).cutoff
 
 
@@ -492,7 +492,7 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
         raise InputError(
             f"the potential has no parameters for {', '.join(unknown)}, only for {', '.join(old)}",
             where=simulation.name,
-            remedy="Give a potential for all species",
+            remedy="Give a potential with parameters for all species of the structure",
         )
     model = simulation.model
     if simulation.pairwise:
@@ -524,10 +524,10 @@ def in_fixed_point(simulation: Simulation) -> Simulation:
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(
-            'state = "lattice" needs float64 forces, and makes decisions and sums in fixed point; '
-            "no other precision can be given",
+            'with state = "lattice", forces are computed in float64, and decisions and sums in fixed '
+            "point; other precisions are not supported",
             where="precision",
-            remedy="Omit the keys force, decision and accumulate",
+            remedy="Omit the keys force, decision and accumulate of the table [precision]",
         )
     kT = units.k_B * simulation.draw.temperature
     own = masses * np.linalg.norm(simulation.velocities, axis=1)

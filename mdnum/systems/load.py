@@ -90,8 +90,8 @@ def find(name: str | Path) -> tuple[str, Path]:
     raise InputError(
         f"there is neither a shipped system nor a file called {text!r}",
         remedy=(
-            f"{hint}`mdnum systems list` lists the shipped systems; give your own system as the "
-            "path of a .toml file"
+            f"{hint}List the shipped systems with `mdnum systems list`, or give your own system as the path "
+            "of a .toml file"
         ),
     )
 
@@ -307,9 +307,9 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
     """
     if not changes:
         raise InputError(
-            f"variant {name!r} changes no key",
+            f"the variant {name!r} changes no key of the system",
             where=where,
-            remedy="Add a key to the variant, or remove the variant",
+            remedy="Add a changed key to the variant, or remove the variant",
         )
     data = base.model_dump(exclude_none=True, exclude={"variants", "name"})
     values = {toml.dotted(key): value for key, value in changes.items()}
@@ -318,7 +318,7 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
             raise InputError(
                 f"variant {name!r} changes {'.'.join(key)}, which does not affect the arithmetic of a run",
                 where=where,
-                remedy="Remove it",
+                remedy="Remove this key from the variant",
             )
     apply_overrides(data, values, BallSpec)
     BallSpec.follow(data, values)
@@ -328,10 +328,10 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
         raise InputError(f"variant {name!r}: {error.message}", remedy=error.remedy, where=where) from None
     if spec.balls != base.balls:
         raise InputError(
-            f"variant {name!r} has {spec.balls} balls, but the system has {base.balls}; "
-            "their decisions cannot be compared",
+            f"the variant {name!r} has {spec.balls} balls, but the system has {base.balls}, so their "
+            "decisions cannot be compared",
             where=where,
-            remedy="Use the same number of balls in both",
+            remedy="Use the same number of balls in the variant and in the system",
         )
     return spec
 
@@ -362,7 +362,11 @@ def copy(name: str | Path, folder: str | Path) -> Path:
     there = [path for path in (goal, *(target / file.name for file in files)) if path.exists()]
     there = [path for path in there if path.name != schema_file.name]
     if there:
-        raise InputError("the file already exists", where=str(there[0]), remedy="Choose another folder")
+        raise InputError(
+            "a file with this name already exists in the output folder",
+            where=str(there[0]),
+            remedy="Choose another folder",
+        )
     target.mkdir(parents=True, exist_ok=True)
     for file in files:
         shutil.copyfile(file, target / file.name)
@@ -419,7 +423,7 @@ def load(
         text = whole_text(path, where)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"the system file cannot be read ({error})", where=where, remedy="Save it as UTF-8 text"
+            f"the system file cannot be read ({error})", where=where, remedy="Save the file as UTF-8 text"
         ) from error
     data = toml.parse(text, where)
     values = read_overrides(overrides)
@@ -445,14 +449,14 @@ def _is_ball(data: Mapping[str, Any], where: str) -> bool:
             raise InputError(
                 "key 'world' missing in the system file",
                 where=where,
-                remedy='Add `world = "ball"` at the top',
+                remedy='Add `world = "ball"` at the top of the file',
             )
         return False
     if data["world"] != "ball":
         raise InputError(
             f'world = {data["world"]!r}; expected "ball"',
             where=where,
-            remedy="Omit the key for molecular dynamics",
+            remedy="Omit the key world for a molecular-dynamics system",
         )
     return True
 

@@ -237,8 +237,8 @@ def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation
         here, new = value(simulation, name), np.asarray(given)
         if new.shape != here.shape or np.iscomplexobj(new) or not np.isfinite(new).all():
             raise InputError(
-                f"{name}: shape {new.shape}, {new.dtype}, finite: {bool(np.isfinite(new).all())}; expected "
-                f"finite real numbers of shape {here.shape}"
+                f"{name}: the new value is an array of shape {new.shape} and type {new.dtype}, finite: "
+                f"{bool(np.isfinite(new).all())}; expected finite real numbers of shape {here.shape}"
             )
         place = entry(simulation, name)
         whole = value(simulation, place.whole)
@@ -269,7 +269,7 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
         for term in model.terms.values():
             radius, onset = np.asarray(term.r_cut), np.asarray(term.r_onset)
             if term.cutoff.switches and np.any(onset >= radius):
-                seen = f"an onset of {float(np.max(onset))!r} is not below"
+                seen = f"the switching onset {float(np.max(onset))!r} is not below"
                 raise InputError(f"{seen} the cutoff radius {float(np.min(radius))!r}", where=name)
         return simulation.with_model(model)
     if table == "dynamics":
@@ -299,7 +299,7 @@ def _heated(simulation: Simulation, new: float) -> Simulation:
         return _drawn(heated)
     if not (new > 0 and old.temperature > 0):
         seen = f"a change of temperature from {old.temperature:g} to {new:g}"
-        raise InputError(f"{seen}; expected both temperatures above 0", where="dynamics")
+        raise InputError(f"{seen}; expected an old and a new temperature above 0", where="dynamics")
     return replace(heated, velocities=simulation.velocities * np.sqrt(new / old.temperature))
 
 
@@ -371,7 +371,7 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
             return ends[0]
         if ends:
             several = f"{word!r} is ambiguous: it could be any of {', '.join(ends)}"
-            raise InputError(several, remedy="Give the full name of one of them")
+            raise InputError(several, remedy="Give the full name of one of these parameters")
     if entry(simulation, word).index:
         return word
     hint = meant(word, [*known, *(name.rpartition(".")[2] for name in known)]) + "Choose from "

@@ -46,7 +46,7 @@ def _check_pairs(pairs: Mapping[str, Any] | None) -> None:
             raise ValueError(f"pair {name!r} is not two species joined by a hyphen, such as 'Ni-P'")
         key = pair_key(*parts)
         if key in seen:
-            raise ValueError(f"pairs {seen[key]!r} and {name!r} are the same pair")
+            raise ValueError(f"the pair of species {name!r} is given twice, the first time as {seen[key]!r}")
         seen[key] = name
 
 
@@ -87,7 +87,7 @@ class PairPotentialTable(TomlTable):
         if not pairs:
             missing = [key for key in self.constants if getattr(self, key, None) is None]
             if missing:
-                raise ValueError(f"missing: {', '.join(missing)}, neither here nor in a pairs table")
+                raise ValueError(f"values of {', '.join(missing)} are missing here and in the table pairs")
         return self
 
     @property
@@ -277,19 +277,19 @@ class CutoffTable(TomlTable):
     def _one_radius(self) -> Any:
         _check_pairs(self.pairs)
         if self.radius is not None and self.in_sigma is not None:
-            raise ValueError("radius and in_sigma are both given; keep one")
+            raise ValueError("the cutoff radius is given twice, by radius and by in_sigma; remove one key")
         if self.base is None and not self.pairs:
-            raise ValueError("the radius is missing; give radius, in_sigma or a pairs table")
+            raise ValueError("the cutoff radius is missing; give radius or in_sigma, or a table pairs")
         if self.onset is None:
             return self
         if not self.switches:
-            raise ValueError(f"onset has no meaning for the kind {self.kind}, which has no switching range")
+            raise ValueError(f"an onset is given, but {self.kind} cutoffs have no switching range; remove it")
         if self.base is None:
             raise ValueError(
-                "onset needs radius or in_sigma as well; for pairs it scales with the radius of each pair"
+                "an onset needs radius or in_sigma too; the onset of each pair is scaled with its radius"
             )
         if self.onset >= self.base:
-            raise ValueError(f"onset {self.onset:g} is not below the radius {self.base:g}")
+            raise ValueError(f"the switching onset {self.onset:g} is not below the cutoff {self.base:g}")
         return self
 
 
@@ -473,7 +473,7 @@ class OtherDynamics(_Dynamics):
         _check_names(given, sorted(keys.keys() - type(self).model_fields))
         needed = [key for key, field in keys.items() if field.default is MISSING and key != "seed"]
         if missing := [key for key in needed if key not in given.keys() | self.model_fields_set]:
-            raise ValueError(f"missing: {', '.join(missing)}")
+            raise ValueError(f"values of {', '.join(missing)} are missing")
         return self
 
 
@@ -549,11 +549,11 @@ def check_interaction(potential: Any, cutoff: CutoffTable | None) -> None:
     kind = potential.kind
     if isinstance(potential, PairPotentialTable):
         if cutoff is None:
-            raise ValueError(f"the table [cutoff] is missing; {kind} needs one")
+            raise ValueError(f"the table [cutoff] is missing, but {kind} needs a cutoff; add the table")
         if cutoff.in_sigma is not None and "sigma" not in potential.constants:
-            raise ValueError(f"cutoff.in_sigma needs a potential with a sigma; {kind} has none")
+            raise ValueError(f"cutoff.in_sigma is given, but {kind} has no sigma; give cutoff.radius")
     elif cutoff is not None:
-        raise ValueError(f"[cutoff] is given, but {kind} includes its own cutoff; remove the table")
+        raise ValueError(f"the table [cutoff] is given, but {kind} includes its own cutoff; remove it")
 
 
 class TermTable(TomlTable):
@@ -569,7 +569,7 @@ class TermTable(TomlTable):
     def _cutoff_fits_potential(self) -> TermTable:
         if not isinstance(self.potential, PairPotentialTable):
             raise ValueError(
-                f"{self.potential.kind} is not a pair potential; only pair potentials can be added"
+                f"the term {self.potential.kind} is not a pair potential; only pair potentials can be added"
             )
         check_interaction(self.potential, self.cutoff)
         return self
@@ -610,12 +610,12 @@ class SystemSpec(TomlTable):
     def _cutoff_fits_potential(self) -> SystemSpec:
         if (self.potential is None) != bool(self.terms) or (self.terms and self.cutoff):
             raise ValueError(
-                "give either [potential] (with [cutoff] for pairs) or [terms.NAME.potential], not both"
+                "expected either [potential] (with [cutoff] for pairs) or [terms.NAME.potential]"
             )
         if self.potential is not None:
             check_interaction(self.potential, self.cutoff)
         if len({one.cutoff.compare for one in self.interactions.values() if one.cutoff}) > 1:
-            raise ValueError("all terms need the same cutoff.compare")
+            raise ValueError("the terms have different cutoff.compare; expected the same in all")
         return self
 
     @property

@@ -109,7 +109,7 @@ class Simulation:
         short = self.policy.state == FIXED_POINT or self.policy.force not in WIDE
         if not self.pairwise and short:
             message = "many-body potentials are evaluated in float64 and float32 only"
-            raise InputError(message, where="precision", remedy="Omit state and force, or give these values")
+            raise InputError(message, where="precision", remedy="Set state and force to float64 or float32")
         if short and self.pairwise and "" not in self.model.terms:
             seen = f"not with {self.policy.state} state and {self.policy.force} forces"
             remedy = "Leave out state and force, or write the sum as one potential"

@@ -122,7 +122,7 @@ def _read(path: Path, index: int) -> Atoms:
         found = next(ase_images(path.resolve(), index), None)
     if not isinstance(found, Atoms) or len(found) == 0:
         raise InputError(
-            "the structure holds no atoms",
+            "the structure contains no atoms",
             where=str(path),
             remedy="Correct the key structure.file or structure.index",
         )
@@ -145,9 +145,9 @@ def _build(structure: schema.BuilderStructure) -> Atoms:
     cells = math.prod(structure.repeat)
     if cells > _MOST_ATOMS // ATOMS_IN_CELL[structure.builder]:
         raise InputError(
-            f"structure.repeat = {list(structure.repeat)} makes "
+            f"structure.repeat = {list(structure.repeat)} gives "
             f"{cells * ATOMS_IN_CELL[structure.builder]:.3g} atoms; expected at most {_MOST_ATOMS:,}",
-            remedy="Repeat the cell less often",
+            remedy="Reduce the numbers in structure.repeat",
         )
     atoms = bulk(structure.symbol, structure.builder, a=structure.lattice_constant, cubic=True)
     atoms = atoms.repeat(structure.repeat)
@@ -170,8 +170,9 @@ def _set_masses(
     unknown = [name for name in given if name not in present]
     if unknown:
         raise InputError(
-            f"structure.masses names {', '.join(unknown)}, but the structure holds {', '.join(present)}",
-            remedy="Correct the species in [structure.masses]",
+            f"the table [structure.masses] lists a mass for {', '.join(unknown)}, but the species in the "
+            f"structure are {', '.join(present)}",
+            remedy="Correct the names of species in [structure.masses]",
         )
     if source.has("masses"):
         masses = np.asarray(source.get_masses(), dtype=np.float64)
@@ -186,8 +187,8 @@ def _set_masses(
     if not (np.isfinite(masses).all() and (masses > 0).all()):
         bad = int(np.argmin(np.where(np.isfinite(masses), masses, -1.0)))
         raise InputError(
-            f"atom {bad} ({atoms.symbols[bad]}) has mass {masses[bad]:g}",
-            remedy="Correct the structure's masses column or give [structure.masses]",
+            f"atom {bad} ({atoms.symbols[bad]}) has the mass {masses[bad]:g}; expected a mass above 0",
+            remedy="Correct the structure's column masses, or give the table [structure.masses]",
         )
     atoms.set_array("masses", masses, float, ())
 
@@ -227,7 +228,7 @@ def _check_finite(atoms: Atoms) -> None:
             raise InputError(
                 f"atom {first} ({atoms.symbols[first]}) has {name} ({values})"
                 + (f", and the same is true of {count - 1} other atoms" if count > 1 else ""),
-                remedy="Every coordinate must be a finite number; rewrite the structure file",
+                remedy="Write the structure file again with a finite number for every coordinate",
             )
 
 
@@ -238,18 +239,18 @@ def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
     if (places > farthest).any():
         worst = int(np.argmax(places))
         raise InputError(
-            f"atom {worst} ({atoms.symbols[worst]}) has a coordinate of {places[worst]:g} {length}, where "
-            f"adjacent numbers differ by {np.spacing(places[worst]):.2g} {length}; expected at most "
-            f"{farthest:.3g} {length}, {_FARTHEST:g} cutoffs",
-            remedy="Correct the structure: its numbers, its unit, or its rattle",
+            f"atom {worst} ({atoms.symbols[worst]}) has a coordinate of {places[worst]:g} {length}, at "
+            f"which rounding is {np.spacing(places[worst]):.2g} {length}; expected at most {farthest:.3g} "
+            f"{length}, {_FARTHEST:g} times the cutoff radius",
+            remedy="Correct the coordinates or the length unit of the structure, or the key structure.rattle",
         )
     sides = np.abs(np.asarray(atoms.cell)).max(axis=1)
     if np.isfinite(sides).all() and (sides > farthest).any():
         axis = int(np.argmax(sides))
         raise InputError(
-            f"cell vector {'abc'[axis]} is {sides[axis]:g} {length} long; expected at most {farthest:.3g} "
-            f"{length}, {_FARTHEST:g} cutoffs",
-            remedy="Correct the structure's cell, or set structure.pbc to false along it",
+            f"the cell vector {'abc'[axis]} is {sides[axis]:g} {length} long; expected at most "
+            f"{farthest:.3g} {length}, {_FARTHEST:g} times the cutoff radius",
+            remedy="Correct the cell of the structure, or set structure.pbc to false along this vector",
         )
 
 
@@ -263,9 +264,9 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
     )
     raise InputError(
         f"r_cut + skin = {r_cut:g} + {skin:g} = {r_cut + skin:.6g} {length}, but half the smallest "
-        f"perpendicular width of the box (along {axis}) is {half:.6g} {length}; beyond it a pair has "
-        "two images in range",
-        remedy=f"This box allows {allowed}; or repeat the structure {repeats(cell, r_cut + skin)}",
+        f"perpendicular width of the box (along {axis}) is {half:.6g} {length}; beyond this distance, an "
+        "atom interacts with two images of the same neighbor",
+        remedy=f"Choose {allowed}, or repeat the structure {repeats(cell, r_cut + skin)}",
     )
 
 
@@ -301,8 +302,8 @@ def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> No
     more = f" ({pairs} such pairs)" if pairs > 1 else ""
     raise InputError(
         f"atoms {a} ({atoms.symbols[a]}) and {b} ({atoms.symbols[b]}) are {distance[worst]:.4g} {length} "
-        f"apart, closer than {smallest:.4g} {length}{more}",
-        remedy="The atoms overlap: correct the positions, the cell or the units of the structure",
+        f"apart; expected at least {smallest:.4g} {length}{more}",
+        remedy="Correct the positions, the cell or the length unit: the atoms overlap",
     )
 
 

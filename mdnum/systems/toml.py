@@ -51,7 +51,7 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
         raise InputError(
             f"tables or arrays are nested more than {_DEEPEST} deep",
             where=str(where),
-            remedy="Tables of a system file are nested at most three deep",
+            remedy="Write a system file, in which tables are nested at most three levels deep",
         ) from None
     except ValueError as error:
         seen = str(error)
@@ -105,7 +105,7 @@ def dotted(text: str) -> Key:
     if not parts or end != len(text):
         raise InputError(
             f"{text!r} is not a key",
-            remedy="Write table.key=value, such as cutoff.radius=8.5",
+            remedy="Write the setting as table.key=value, such as cutoff.radius=8.5",
             where="--set",
         )
     return parts
@@ -254,12 +254,12 @@ class TomlTable(BaseModel):
                 if not isinstance(number, int | float) or isinstance(number, bool):
                     continue
                 if isinstance(number, int) and abs(number) > _LARGEST_INT:
-                    raise ValueError(f"{name} = {number}; expected an integer of at most 2^62")
+                    raise ValueError(f"{name} = {number}; expected an integer of magnitude at most 2^62")
                 # a tolerance is compared and not squared, and what tolerances can be is checked with them
                 if number and name != "tol" and not _SMALLEST <= abs(number) <= 1 / _SMALLEST:
                     raise ValueError(
-                        f"{name} = {number:g}; expected 0 or a size from {_SMALLEST:g} to {1 / _SMALLEST:g}, "
-                        "so that the number can be squared"
+                        f"{name} = {number:g}; expected 0 or a magnitude from {_SMALLEST:g} to "
+                        f"{1 / _SMALLEST:g}, so that the square can be represented"
                     )
         return self
 
@@ -515,7 +515,7 @@ def apply_overrides(data: dict[str, Any], values: Mapping[Key, Any], root: type[
             table = table.setdefault(part, {})
             if not isinstance(table, dict):
                 raise InputError(
-                    f"{'.'.join(key[:depth])} is a value, not a table",
+                    f"{'.'.join(key[:depth])} is a single value, not a table with keys",
                     where=f"--set {'.'.join(key)}",
                     remedy=f"Set the value of {'.'.join(key[:depth])}",
                 )

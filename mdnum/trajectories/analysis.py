@@ -217,8 +217,8 @@ class NeighborFlips(AnalysisBase):
                 if not getattr(one, "parallelizable", False):
                     name = getattr(one, "__name__", type(one).__name__)
                     raise InputError(
-                        f"the transformation {name!r} of the trajectory cannot be sent to workers "
-                        f"with {backend=}",
+                        f"the transformation {name!r} of the trajectory cannot be sent to other processes, "
+                        f"as {backend=} requires",
                         remedy="Use backend='serial', or make it an "
                         "MDAnalysis.transformations.TransformationBase with parallelizable=True",
                     )
@@ -236,7 +236,7 @@ class NeighborFlips(AnalysisBase):
         if back.size:
             after, before = self._numbers[back[0] + 1], self._numbers[back[0]]
             message = f"the times of the frames do not increase: frame {after} after frame {before}"
-            raise InputError(message, remedy="Give the frames in ascending order of time")
+            raise InputError(message, remedy="Give the frames of the trajectory in ascending order of time")
         sample, raw, changed = [], [], 0.0
         for number in self._numbers[:SAMPLE]:
             try:
@@ -258,7 +258,7 @@ class NeighborFlips(AnalysisBase):
                 raise InputError(
                     f"the transformations of the trajectory hide the resolution of its coordinates: {why}",
                     remedy=(
-                        "Give bound=LENGTH, the largest error of a distance (0 for none), or "
+                        "Give the largest error of a distance with bound=LENGTH (0 for no error), or "
                         "remove the transformations"
                     ),
                 )
@@ -400,7 +400,7 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):
             message = f"two processes found different pairs at the same frame (number {done - 1} of all)"
-            raise InputError(message, remedy="The file was changed while it was read; run again")
+            raise InputError(message, remedy="Run again; the file was changed while it was read")
         for table in part.flips:
             # a part after the first has counted the frame before its own too
             table.frame[:] += done - (done > 0)
@@ -420,13 +420,13 @@ def _group_of(atoms: Any, name: str) -> AtomGroup:
     """Return the atom group; reject other objects, empty groups, and groups that change between frames."""
     if isinstance(atoms, UpdatingAtomGroup):
         raise InputError(
-            f"the group {name} changes from frame to frame; a pair that leaves the group would be "
-            "counted as a flip",
-            remedy="Give atoms.select_atoms(...) without updating=True",
+            f"the group {name} changes from frame to frame, so pairs that leave the group would be counted "
+            "as flips",
+            remedy="Select the group with atoms.select_atoms(...) without updating=True",
         )
     if not isinstance(atoms, AtomGroup):
         raise InputError(
-            f"expected a Universe or an AtomGroup; got {type(atoms).__name__}",
+            f"the object is of type {type(atoms).__name__}; expected a Universe or an AtomGroup",
             remedy="Give a group of atoms, such as universe.select_atoms(...)",
         )
     if len(atoms) == 0:
@@ -444,13 +444,13 @@ def _rules_of(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
         rules.extend(rule if isinstance(rule, Sequence) else [rule])
     if not rules:
         raise InputError(
-            "no cutoff was given",
+            "no cutoff or other rule for neighbors was given",
             remedy="Give r_cut=8.5 (in Å), a list of radii, or a rule of mdnum.trajectories.rules",
         )
     for one in rules:
         if not isinstance(one, Rule):
             raise InputError(
-                f"{one!r} is not a membership rule",
+                f"{one!r} is not a rule that decides which pairs are neighbors",
                 remedy="Give CutoffRule, SpeciesCutoffs, Nearest or Capped of mdnum.trajectories.rules",
             )
     return rules

@@ -97,8 +97,8 @@ class ArrayFrames(Trajectory):
         v = None if v is None else np.array(host(v, "velocities"), float)
         if v is not None and v.shape != x.shape:
             raise InputError(
-                f"velocities have shape {v.shape}, but positions {x.shape}",
-                remedy="Give velocities of all atoms",
+                f"the velocities have shape {v.shape}, but the positions have shape {x.shape}",
+                remedy="Give one velocity vector for each atom",
             )
         x = x @ here.matrix if self._fractional else x
         return Frame(int(step), int(step) * self._timestep, x, here, v)
@@ -165,7 +165,7 @@ class ArrayFrames(Trajectory):
             found.put(found.read(k, getattr(x, "positions", x), **here))
         if not found._first:
             raise InputError(
-                "the array contains no frame",
+                "the array of positions contains no frame",
                 remedy="Give an array of shape (frames, atoms, 3)",
                 where="positions",
             )

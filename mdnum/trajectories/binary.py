@@ -108,7 +108,7 @@ class XdrFile:
     def _read(self, count: int) -> bytes:
         data = self._file.read(min(count, self._size + 1))
         if len(data) < count:
-            raise ValueError("the file ends within this frame")
+            raise ValueError("the file ends within a frame")
         return data
 
 
@@ -157,7 +157,7 @@ class XtcFile(XdrFile):
         self._file.seek(self.start(number))
         head = _HEAD.unpack(self._read(_HEAD.size))
         if head[0] not in _MAGIC or head[1] != head[-1] or head[1] < 0:
-            raise ValueError("damaged: the header of a frame is missing")
+            raise ValueError("the file is damaged: the header of a frame is missing")
         return head
 
     def _stream(self, number: int, look: bool = False) -> None:
@@ -169,20 +169,20 @@ class XtcFile(XdrFile):
         precision, *limits, small = _PACKED.unpack(self._read(_PACKED.size))
         size = int.from_bytes(self._read(_MAGIC[head[0]]), "big", signed=True)
         if size < 0:
-            raise ValueError("damaged: a negative length")
+            raise ValueError("the file is damaged: a stated length is negative")
         if not look:
             self._file.seek((size + 3) // 4 * 4, 1)
             return
         sizes = [high - low + 1 for low, high in zip(limits[:3], limits[3:], strict=True)]
         if not _FIRST <= small <= _LAST or min(sizes) <= 0 or not precision > 0:
-            raise ValueError("damaged: the header of the compressed coordinates is invalid")
+            raise ValueError("the file is damaged: the header of the compressed coordinates is not valid")
         product = sizes[0] * sizes[1] * sizes[2]
         wide = max(sizes) > _WIDE
         bits = sum(one.bit_length() for one in sizes) if wide else product.bit_length()
         stream = np.frombuffer(self._read(size), np.uint8)
         self._read(-size % 4)
         if (_walk(stream, atoms, bits, small) + 7) // 8 != size:
-            raise ValueError("damaged: the compressed coordinates do not have the given length")
+            raise ValueError("the file is damaged: compressed coordinates do not have the given length")
 
 
 @njit

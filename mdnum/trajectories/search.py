@@ -158,10 +158,10 @@ def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float)
     pairs = 0.5 * centers * others * images
     if images > _MOST_IMAGES_EACH and pairs > _MOST_REPEATED:
         raise InputError(
-            f"about {pairs:,.0f} pairs lie within {radius:.6g}: each pair of atoms has about "
-            f"{images:,.0f} images there "
-            f"in a box of widths {np.round(lattice.widths, 3).tolist()}",
-            remedy="Check the unit of the cutoff and the box, or select fewer atoms",
+            f"about {pairs:,.0f} pairs lie within {radius:.6g}: in a box of widths "
+            f"{np.round(lattice.widths, 3).tolist()}, each atom has about {images:,.0f} periodic images "
+            "within this distance of another atom",
+            remedy="Check the length unit of the cutoff and of the box, or select fewer atoms",
             where="cutoff",
         )
     _check_count(pairs, radius)
@@ -174,8 +174,7 @@ def _check_count(pairs: float, radius: float) -> None:
     if pairs > min(MOST_PAIRS, memory / _BYTES):
         raise InputError(
             f"about {pairs:,.0f} pairs lie within {radius:.6g}, which would need "
-            f"{pairs * _BYTES / 1e9:,.0f} GB "
-            f"of memory; this machine has {memory / 1e9:,.0f}",
+            f"{pairs * _BYTES / 1e9:,.0f} GB of memory; the computer has {memory / 1e9:,.0f} GB",
             remedy="Check the unit of the cutoff and the box, or select fewer atoms",
             where="cutoff",
         )

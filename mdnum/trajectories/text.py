@@ -161,9 +161,8 @@ def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
         others = [word for word in words[:-1] if "." in word]
     if _is_cut(words[-1], others):
         raise ValueError(
-            f"the file ends in the middle of a number, {words[-1]!r}: it has fewer digits than the "
-            "numbers before it, "
-            "and its line has no newline; if the number is complete, add a newline"
+            f"the file ends in the middle of a number, {words[-1]!r}, which has fewer digits than the "
+            "numbers before it and is not followed by a newline; if the number is complete, add a newline"
         )
 
 
@@ -234,7 +233,7 @@ def _whole_number(line: str, what: str) -> int:
 def _rows(lines: Any, head: int, atoms: int, cut: bool = True) -> list[str]:
     """Read `head` lines, followed by one line for each atom."""
     if atoms < 0:
-        raise ValueError(f"expected the number of atoms; found {atoms}")
+        raise ValueError(f"the number of atoms of a frame is {atoms}; expected 0 or more")
     rows = list(islice(lines, head + atoms))
     if len(rows) < head + atoms:
         raise ValueError(f"the file ends after {max(len(rows) - head, 0):,} of {atoms:,} atoms")
@@ -252,7 +251,7 @@ class ExtxyzTrajectory(AseFrames, TextTrajectory):
         head = lines.readline()
         if not head.strip():
             if any(line.strip() for line in lines):
-                raise ValueError("expected the number of atoms; found a blank line")
+                raise ValueError("found a blank line where the number of atoms of a frame was expected")
             return None
         return [head, *_rows(lines, 1, _whole_number(head, "the number of atoms"))]
 
@@ -361,7 +360,7 @@ class LammpsDump(TextTrajectory):
                 atoms = _whole_number(block[-1], "the number of atoms")
             elif line.startswith("ITEM: ATOMS"):
                 if atoms is None:
-                    raise ValueError("the atoms are listed before the number of atoms")
+                    raise ValueError("the section with the atoms of a frame comes before the number of atoms")
                 return block + _rows(lines, 0, atoms)
         if block:
             raise ValueError("the file ends in the header of a frame")
@@ -398,7 +397,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
     words = np.array("".join(rows).split(), dtype=object)
     if len(words) != len(rows) * len(columns):
         odd = next(row for row in rows if len(row.split()) != len(columns))
-        raise ValueError(f"expected {len(columns)} columns; found {odd.strip()[:40]!r}")
+        raise ValueError(f"found {odd.strip()[:40]!r}; expected {len(columns)} columns for each atom")
     return columns, words.reshape(len(rows), len(columns))
 
 
@@ -448,7 +447,7 @@ class GroTrajectory(TextTrajectory):
             raise ValueError("the frame has no atoms")
         points = [k for k, letter in enumerate(rows[0]) if letter == "." and k >= _HEAD]
         if len(points) < 3:
-            raise ValueError(f"expected three numbers; found {rows[0]!r}")
+            raise ValueError(f"found the line {rows[0]!r}; expected three coordinates with a decimal point")
         width = points[1] - points[0]
         # one decimal more in the same width and one column more
         moving = all(len(row.rstrip()) >= _HEAD + 6 * width for row in rows)
@@ -471,7 +470,7 @@ class GroTrajectory(TextTrajectory):
         rows = _rows(lines, 0, _whole_number(count, "the number of atoms"), cut=False)
         box = lines.readline()
         if not box.strip():
-            raise ValueError("the file ends before the box")
+            raise ValueError("the file ends before the box of a frame")
         words = _box_words(box)
         if not box.endswith("\n"):
             refuse_cut_line([box], words[:-1])
@@ -493,7 +492,7 @@ def _gro_box(line: str) -> Box:
     """Return the box from three diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; no box if zero."""
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
-        raise ValueError(f"the box line has {len(values)} numbers; expected 3 or 9")
+        raise ValueError(f"the line with the box of a frame has {len(values)} numbers; expected 3 or 9")
     if not any(values):
         return Box()
     xx, yy, zz, xy, xz, yx, yz, zx, zy = values if len(values) == 9 else [*values, *[0.0] * 6]

@@ -193,7 +193,7 @@ class Tracker:
             message = (
                 f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot resolve them"
             )
-            raise InputError(message, remedy="Check the unit, and check the file's coordinates")
+            raise InputError(message, remedy="Check the unit of the cutoff, and the file's coordinates")
         none = np.zeros(0)
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
@@ -308,7 +308,7 @@ def _participants(
             raise InputError(message, remedy="Select only atoms that exist in the trajectory", where=name)
     if species is not None and len(species) != atoms:
         message = f"{len(species)} species were given for frames of {atoms} atoms"
-        raise InputError(message, remedy="Use the topology that belongs to the trajectory", where="species")
+        raise InputError(message, remedy="Give the topology that belongs to the trajectory", where="species")
     centers, others = np.zeros(atoms, bool), np.zeros(atoms, bool)
     centers[first], others[second] = True, True
     labels = np.flatnonzero(centers | others)

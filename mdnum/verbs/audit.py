@@ -106,7 +106,7 @@ def audit(
                  "steps": steps, "out": out}  # fmt: skip
         if names := [name for name, value in given.items() if value is not None]:
             raise InputError(
-                f"an audit is resumed with its own options, but {names[0]} is given",
+                f"the option {names[0]} was given, but a resumed audit uses its stored options",
                 remedy=f"Omit {', '.join(names)}, or start a new audit",
             )
         with closing(take(resume, frame.layout("audit"))) as folder:
@@ -278,9 +278,9 @@ def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
         return load_calculator(calculator)
     if not callable(calculator):
         raise InputError(
-            f"the calculator is a {type(calculator).__name__}; expected its name, or a function that "
-            "returns a new calculator",
-            remedy="Give for example `lambda: LennardJones()`",
+            f"the calculator was given as an object of type {type(calculator).__name__}; expected a name, "
+            "or a function that returns a new calculator",
+            remedy="Give a function, for example `lambda: LennardJones()`",
         )
     name = getattr(calculator, "__name__", type(calculator).__name__)
     name = "calculator" if name == "<lambda>" else name
@@ -291,8 +291,8 @@ def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: P
     """Return the calculator of an audit that is resumed; raise an error if a different one was given."""
     if calculator is None and not state.named:
         raise InputError(
-            "the calculator of this audit was an object without a name",
-            remedy="Give the calculator again",
+            "the calculator of the stored audit was a Python object, which is not stored in the folder",
+            remedy="Give the same calculator again",
             where=str(path),
         )
     if isinstance(calculator, str) and state.named and calculator != state.name:

@@ -127,7 +127,7 @@ def flips(
 
     expect_at_least(1, window=window)
     if by not in ("atom", "residue"):
-        raise InputError(f"by = {by!r}; expected atom or residue")
+        raise InputError(f"by = {by!r}; expected either atom or residue")
     if by == "atom":
         refuse({"hydrogens": hydrogens}, "of contacts between residues", "Add --by residue, or leave it out")
     files = {"other": other is not None, "topology": topology is not None, "format": format is not None}
@@ -367,8 +367,8 @@ def rules(
 
     if most is not None and not cutoffs:
         raise InputError(
-            "--most keeps the nearest neighbors inside a cutoff, but no cutoff is given",
-            remedy="Add --cutoff R; for the K nearest neighbors without a cutoff write --nearest K",
+            "the option --most, for the nearest neighbors inside a cutoff, was given without a cutoff",
+            remedy="Add --cutoff R, or write --nearest K for the K nearest neighbors without a cutoff",
         )
     radii, species, counts = map(_listed, (cutoffs, pairs, nearest))
     if wrong := [one for one in (*radii, *counts) if not isinstance(one, Real)]:
@@ -403,7 +403,7 @@ def _species_cutoffs(words: _Pairs) -> Mapping[Any, float]:
             length = math.nan
         if not (equals and dash and first and second) or "-" in second or not length > 0:
             raise InputError(
-                f"--pairs {words!r}: {part.strip()!r} is not of the form A-B=LENGTH", remedy=_PAIRS
+                f"the part {part.strip()!r} of --pairs {words!r} is not of the form A-B=LENGTH", remedy=_PAIRS
             )
         if {(first, second), (second, first)} & set(found):
             raise InputError(f"--pairs {words!r} gives {first}-{second} twice", remedy="Keep one of them")
@@ -439,8 +439,8 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
             if kinds[0] not in _STRUCTURES and len(open_trajectory(names[0]).sample()) > 1:
                 return
         raise InputError(
-            f"two paths are compared as trajectories, but {Path(names[0]).name} looks like the "
-            f"topology of {Path(names[1]).name}",
+            f"two trajectories were expected, but {Path(names[0]).name} looks like the topology of "
+            f"{Path(names[1]).name}",
             remedy=f"Write mdnum flips {second} -s {first}",
         )
 

@@ -45,7 +45,7 @@ def compare(
     """
     if a.atoms != b.atoms:
         message = f"{a.path.name} has {a.atoms:,} atoms and {b.path.name} {b.atoms:,}"
-        raise InputError(message, remedy="Compare trajectories of the same atoms")
+        raise InputError(message, remedy="Compare two trajectories of the same atoms in the same order")
     groups = selected(a, between)
     samples = [one.sample() for one in (a, b)]
     resolutions = [infer(some, one.bits, one.format) for some, one in zip(samples, (a, b), strict=True)]

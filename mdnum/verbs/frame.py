@@ -244,8 +244,8 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
         text = json.dumps([__version__, verb, held], sort_keys=True)
     except TypeError as error:
         raise InputError(
-            f"the folder cannot be named after a digest of its input: {error}",
-            remedy="Give the folder a name with --out",
+            f"the result folder cannot be named after a checksum of the input: {error}",
+            remedy="Give a name for the folder with --out",
         ) from error
     return digest_of(text.encode())[:16]
 
@@ -285,7 +285,7 @@ def answering(
         InputError: overrides were given without a system. FolderError: the folder cannot be used.
     """
     if overrides and system is None:
-        raise InputError("overrides apply to a system file, but none was given", remedy="Omit the overrides")
+        raise InputError("overrides were given without a system file", remedy="Omit the overrides")
     began = perf_counter()
     with new_folder(kind, name, out, system=system) as folder:
         answer = Answer(folder, logged(folder, progress, STEPWISE))

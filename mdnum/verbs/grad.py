@@ -132,7 +132,7 @@ def _problem(
 
     if of is None:
         remedy = f"Add --of LOSS. Choose from {', '.join(LOSSES)}"
-        raise InputError("no loss to differentiate was given", where=simulation.name, remedy=remedy)
+        raise InputError("no loss function to differentiate was given", where=simulation.name, remedy=remedy)
     last = last_step(simulation, steps, FEW_STEPS)
     loss = parse(of, simulation, last)
     if not names:
@@ -205,9 +205,9 @@ def _diagnosed(
     if not chosen:
         reasons = "; ".join(f"{one['what']}: {one['why']}" for one in left)
         raise InputError(
-            f"no gradient method is applicable: {reasons}",
+            f"none of the gradient methods is applicable: {reasons}",
             where=where,
-            remedy="Choose a method with --methods",
+            remedy="Choose another method with --methods",
         )
     scalars = [name for name in names if not np.ndim(parameters.value(problem.simulation, name))]
 

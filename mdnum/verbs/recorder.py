@@ -90,7 +90,7 @@ class Recorder:
             if len(self._rules) > 1 or (radius := getattr(rule, "radius", None)) is None or rule.directed:
                 names = ", ".join(one.name for one in self._rules)
                 raise InputError(
-                    f"pair_energy cannot be combined with {names}",
+                    f"the argument pair_energy cannot be combined with the rule {names}",
                     remedy="Give pair_energy with a single r_cut only",
                 )
             self._jump = float(pair_energy(radius))
@@ -123,12 +123,12 @@ class Recorder:
         """
         began = perf_counter()
         if self._outcome is not None or self._failed is not None:
-            raise self._failed or InputError("the recorder is closed", remedy="Make another one")
+            raise self._failed or InputError("the recorder is closed", remedy="Create a new recorder")
         frame = self._source.read(step, positions, cell, box, pbc, velocities)
         if len(frame.positions) != self._source.atoms:
             message = f"step {step} has {len(frame.positions)} atoms; earlier steps had {self._source.atoms}"
             raise InputError(
-                message, remedy="Record each set of atoms with its own recorder", where="positions"
+                message, remedy="Record each set of atoms with a recorder of its own", where="positions"
             )
         if neighbors is not None:
             self._list = self._check.given(neighbors, self._source.species)

@@ -226,7 +226,7 @@ def _compute(
                 continue
             for each in told:
                 if each["status"] == "full":
-                    raise InputError(each["why"], remedy="Free disk space, then repeat the command")
+                    raise InputError(each["why"], remedy="Free some disk space, then repeat the command")
                 counts["computed"] += each["status"] == "computed"
                 done += each["status"] != "busy"
                 busy += [each["address"]] * (each["status"] == "busy")

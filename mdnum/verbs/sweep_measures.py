@@ -38,7 +38,7 @@ def _date(run: Sample, argument: str, name: str) -> Value:
     found = _pair(run, argument)
     step = getattr(found.dates, name)
     if step is None:
-        raise InputError(f"the runs do not {name} within {found.steps} steps", remedy="Use more steps")
+        raise InputError(f"the two runs do not {name} within {found.steps} steps", remedy="Use more steps")
     return Value(float(step * found.twin.a.timestep))
 
 
@@ -107,7 +107,7 @@ def horizon(run: Sample, argument: str) -> Value:
     if found.trust.verdict == "trusted":
         raise InputError("the gradient is trusted to the end of the run", remedy="Use more steps")
     if found.trust.verdict != "limited":
-        raise InputError(f"the horizon is undecided; not tested: {', '.join(found.trust.unknown)}")
+        raise InputError(f"the trust horizon is undecided; not tested: {', '.join(found.trust.unknown)}")
     return Value(float(found.trust.horizon * run.simulation.integrator.timestep))
 
 

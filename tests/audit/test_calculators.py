@@ -79,7 +79,7 @@ def test_a_system_brings_its_structure_and_temperature():
         ("ase.calculators.emt:EMT(", "the name of a function"),
         ("ase.calculators.lj:LennardJones(3)", "could not be constructed: TypeError"),
         ("ase.calculators.tersoff:Tersoff", "Class(argument=value)"),
-        ("ase.build:molecule('H2O')", "not an ASE calculator"),
+        ("ase.build:molecule('H2O')", "expected an ASE calculator"),
         ("argon/crystl-108", "Did you mean argon/crystal-108"),
         ("none.py", "no such file"),
         ("{folder}/fails.py", "ZeroDivisionError"),

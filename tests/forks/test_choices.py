@@ -432,7 +432,7 @@ def test_a_screen_ranks_by_fork_and_then_by_seed_with_what_does_not_apply_last(c
     assert first.fork is not None and 1 <= first.fork < 100
     assert (start.first_bit, lattice.first_bit) == (0, None)
     assert noise.reason_unavailable is not None and noise.held is None and noise.steps == 0
-    with pytest.raises(InputError, match="no choice to screen"):
+    with pytest.raises(InputError, match="no numerical choice"):
         screen(crystal, 10, [])
 
 

@@ -72,7 +72,7 @@ def test_hysteresis_can_be_traced_with_thresholds_that_are_arrays():
 
 
 def test_thresholds_that_make_no_gap_are_refused():
-    with pytest.raises(InputError, match="is below the one"):
+    with pytest.raises(InputError, match="below the threshold"):
         Hysteresis(Threshold(0.0), Threshold(-1.0))
     with pytest.raises(InputError, match="different quantities"):
         Hysteresis(Threshold(0.0, "<", "r"), Threshold(1.0, "<", "r2"))

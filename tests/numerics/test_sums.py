@@ -364,7 +364,7 @@ def test_a_fixed_point_sum_is_a_sum_of_rounded_integers():
     # out of range is said, never wrapped
     assert np.isnan(float(FixedPoint(40)(jnp.asarray([2.0**21, 1.0]) * 2)))
     assert float(FixedPoint(40)(jnp.asarray([2.0**21, 1.0]))) == 2.0**21 + 1
-    with pytest.raises(InputError, match="2000 binary places"):
+    with pytest.raises(InputError, match="bits = 2000"):
         FixedPoint(2000)
 
 

@@ -167,7 +167,7 @@ def test_a_finished_run_may_be_continued(path, whole, tmp_path, where):
 
 
 def test_what_cannot_be_continued_is_refused(path, whole, tmp_path):
-    with pytest.raises(FolderError, match="past step 20"):
+    with pytest.raises(FolderError, match="requested step 20"):
         run(None, resume=whole[1].path, steps=20)
     with pytest.raises(FolderError, match="already holds a run"):
         run(load(path), out=whole[1].path, steps=5)

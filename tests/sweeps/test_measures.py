@@ -62,5 +62,5 @@ def test_a_function_of_a_file_is_told_by_its_digest(tmp_path):
         (tmp_path / "helper.py").write_text("")
         for text in ("import helper", "from helper import x", "from . import x", "import helper.y"):
             file.write_text(f"def last(outcome):\n    {text}\n")
-            with pytest.raises(InputError, match="digest"):
+            with pytest.raises(InputError, match="not be noticed"):
                 chosen([f"{file}:last"], "md")

@@ -132,7 +132,7 @@ DRAWN = np.random.default_rng(0).uniform(0, 15.9, (400, 3))
         (np.zeros((2000, 3)), cube(2.0), 100.0, "pairs lie within"),
         (np.full((2, 3), 1e14), Box(), 1.0, "float64 cannot resolve"),
         # of 4/3 π r³ / V images and half as many pairs as atoms squared
-        (DRAWN[:108], cube(15.9), 500.0, r"759,\d{3},\d{3} pairs .* 500: .* about 130,\d{3} images"),
+        (DRAWN[:108], cube(15.9), 500.0, r"759,\d{3},\d{3} pairs .* 500: .* about 130,\d{3} periodic images"),
     ],
 )
 def test_what_cannot_be_searched_is_refused(x, box, radius, message):

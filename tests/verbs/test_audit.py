@@ -414,7 +414,7 @@ def test_a_deadline_ends_an_audit_and_the_rest_is_resumed(tmp_path, monkeypatch)
     Spent.looks = 3
     less = ask(planted.Good, time=1.0, resume=tmp_path / "cut", report=False)
     assert less.summary["headline"] == cut.summary["headline"]
-    with pytest.raises(InputError, match="without a name"):
+    with pytest.raises(InputError, match="a Python object"):
         ask(resume=tmp_path / "cut")
     done = ask(planted.Good, resume=tmp_path / "cut", report=False)
     assert without_times(done.summary) == without_times(whole.summary)

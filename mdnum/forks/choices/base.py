@@ -79,7 +79,7 @@ class Choice:
         """
         own = cls._fields()
         if argument and not own:
-            raise InputError(f"{cls.family} takes no argument", where=f"{cls.family}={argument}")
+            raise InputError(f"the choice {cls.family} takes no argument", where=f"{cls.family}={argument}")
         values: dict[str, Any] = {"both": both} if both else {}
         for one, part in zip(own, argument.split(":", len(own) - 1) if argument else (), strict=False):
             kind = {"int": int, "float": float}.get(str(one.type).partition(" ")[0])
@@ -144,7 +144,7 @@ def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> 
             raise
         message = f"{type(choice).__module__} reads the tables of a system file, but was given a Simulation"
         raise InputError(
-            message, where=choice.name, remedy="See `mdnum.choices` in docs/extending.md"
+            message, where=choice.name, remedy="Read about `mdnum.choices` in docs/extending.md"
         ) from error
     except InputError as error:
         # the choice is named where this is printed
@@ -160,9 +160,9 @@ def twin_of(choice: Choice, system: Simulation | System | BallSystem) -> Twin:
     made = twin_or_reason(choice, system)
     if isinstance(made, str):
         raise InputError(
-            f"the choice does not apply to {system.name}: {made}",
+            f"the numerical choice does not apply to the system {system.name}: {made}",
             where=choice.name,
-            remedy="Use another choice; `mdnum fork choices` lists all",
+            remedy="Use another choice; `mdnum fork choices` lists all choices",
         )
     return made
 
@@ -189,8 +189,8 @@ def parse(text: str, world: str | None = None) -> Choice:
     head, _, role = family.partition(".")
     if family in _PROGRAMS:
         raise InputError(
-            f"{text} cannot be varied between two runs, because its variants need separate processes",
-            remedy="Run `mdnum fork processes SYSTEM`",
+            f"the choice {text} needs separate processes, so it cannot be varied between two runs",
+            remedy="Run `mdnum fork processes SYSTEM`, which compares such variants",
         )
     if head in CHOICES and (argument or not equals) and (both or not at):
         kind: type[Choice] = CHOICES[head]
@@ -202,7 +202,7 @@ def parse(text: str, world: str | None = None) -> Choice:
     near = meant(text, [*families, *(name for one in worlds for name in shipped(one))])
     raise InputError(
         f"unknown choice {text!r}",
-        remedy=f"{near}Known choices are {', '.join(families)}; `mdnum fork choices` lists all",
+        remedy=f"{near}Known kinds are {', '.join(families)}; `mdnum fork choices` lists all choices",
     )
 
 

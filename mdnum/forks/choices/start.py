@@ -391,7 +391,7 @@ class EnergyShift(Choice):
 
     def make(self, system: Simulation) -> Twin:
         if not system.pairwise:
-            raise InputError("this potential has its own cutoff, which cannot be replaced")
+            raise InputError("the potential of the system includes its own cutoff, which cannot be replaced")
         kind = system.cutoff.name
         applies(kind in ("hard", "shifted"), f"a {kind} cutoff changes the force too")
         other = "shifted" if kind == "hard" else "hard"

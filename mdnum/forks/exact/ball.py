@@ -91,8 +91,8 @@ class _ExactBall:
         )
         if not served or getattr(contact, "smooth", False):
             raise InputError(
-                f"{type(contact).__name__} with {type(scheme).__name__} needs operations other than "
-                "sums and products",
+                f"the contact {type(contact).__name__} with the integrator {type(scheme).__name__} cannot "
+                "be computed exactly from sums and products",
                 remedy="Use explicit Euler, semi-implicit Euler or velocity Verlet, and a contact that is "
                 "not smooth",
             )
@@ -213,7 +213,7 @@ class _ExactRule:
             self.enter, rule = _held(world, rule.enter), rule.rule
         if type(rule) not in (GlobalSum, PerInstance, Maximum, Relative, FixedCount):
             raise InputError(
-                f"exact arithmetic of the ball does not support the stopping rule {type(rule).__name__}"
+                f"exact arithmetic for balls does not support the stopping rule {type(rule).__name__}"
             )
         self.rule, self.max_iter = rule, rule.max_iter
         self.tol = None if isinstance(rule, FixedCount) else _held(world, rule.tol)

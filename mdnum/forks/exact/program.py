@@ -193,8 +193,8 @@ def _without_balls(simulation: Simulation) -> InputError | None:
             pull(arb(float(r_cut)) ** 2)
     except TypeError as error:
         return InputError(
-            f"exact arithmetic cannot evaluate {simulation.potential.name!r}: {error}",
-            remedy="Use supported operations (docs/compiled-loop.md)",
+            f"the potential {simulation.potential.name!r} cannot be evaluated in exact arithmetic: {error}",
+            remedy="Use a potential made of the operations that docs/compiled-loop.md lists",
             where="potential.kind",
         )
     return None
@@ -271,9 +271,9 @@ class ExactProgram:
                 failed = run.step
             bits = max(more, bits + bits // 2)
         raise InputError(
-            f"a pair at step {failed} is too close to its cutoff to be decided with {bits} bits; its "
-            "distance may be exactly the cutoff",
-            remedy="Change the start by one ulp",
+            f"with {bits} bits it cannot be decided whether a pair at step {failed} is inside the cutoff; "
+            "its distance may equal the cutoff exactly",
+            remedy="Change a starting position by one unit in the last place",
         )
 
 

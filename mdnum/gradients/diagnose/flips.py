@@ -88,8 +88,8 @@ def flips(
     kept = [name for name in full if name not in skipped]
     if not kept:
         raise InputError(
-            f"the contributions of flips to the derivative with respect to {', '.join(full)} need a tangent "
-            f"for each of {sizes[full[0]]} entries, which are too many",
+            f"the parameter {', '.join(full)} has {sizes[full[0]]} entries, too many to compute the "
+            "contributions of flips to each derivative",
             remedy="Give a scalar parameter",
         )
     if made is None:
@@ -189,13 +189,13 @@ def edges(
     here = parameters.value(problem.simulation, full)
     if here.shape:
         raise InputError(
-            f"{full} has {here.size} entries; boundaries are located along a scalar parameter",
+            f"the parameter {full} has {here.size} entries; expected one, along which to find boundaries",
             remedy="Give a scalar parameter",
         )
     value = float(here)
     if value == 0 or not 0 < reach < 1:
         raise InputError(
-            f"{full} = {value:g} and reach = {reach:g}; expected a nonzero value and a "
+            f"the parameter {full} is {value:g} and reach is {reach:g}; expected a nonzero parameter and a "
             "relative reach between 0 and 1"
         )
     program = MdProgram(problem.simulation)

@@ -296,7 +296,7 @@ class Jacobian:
         check_kick(tape.simulation.integrator)
         if not isinstance(tape.simulation.force, PairForce):
             raise InputError(
-                "the Jacobian of a step is available for pair potentials only", where=tape.simulation.name
+                "the Jacobian of a step is available only for pair potentials", where=tape.simulation.name
             )
         self.tape, self.clock = tape, clock
         self.force: PairForce = tape.simulation.force
@@ -436,7 +436,7 @@ def spectrum(
         residual = _residual(jacobian, there.basis @ left, start @ right, log_s)
     except FloatingPointError as error:
         raise NumericalError(
-            f"no singular values: {error}", remedy="Examine the growth of the gradient with diagnose()"
+            f"singular values of the Jacobian cannot be computed: {error}", remedy="Use diagnose() instead"
         ) from error
     exponents = log_s[:values] / tape.steps
     steps, curve = np.arange(tape.steps + 1), there.stretches[:, :values]

@@ -29,13 +29,13 @@ def _rows(value: Any) -> ndarray:
 
 def _finite(value: Any) -> ndarray:
     if not np.isfinite(rows := _rows(value)).all():
-        raise ValueError("the coordinates are not finite")
+        raise ValueError("a coordinate of an atom is not a finite number")
     return rows
 
 
 def _vectors(value: Any) -> ndarray:
     if (rows := _finite(value)).shape != (3, 3):
-        raise ValueError("expected three lattice vectors")
+        raise ValueError("the box is not a 3 x 3 array; expected three lattice vectors")
     return rows
 
 

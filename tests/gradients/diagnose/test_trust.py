@@ -143,7 +143,7 @@ def test_a_shell_at_the_cutoff_is_an_ambiguous_decision(problem):
 
 
 def test_bad_input_is_refused(problem):
-    with pytest.raises(InputError, match="too many tangents"):
+    with pytest.raises(InputError, match="too many entries"):
         trust(problem, ("v0",))
     with pytest.raises(InputError, match="tolerance"):
         trust(problem, ("sigma",), tolerance=2.0)
