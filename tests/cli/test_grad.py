@@ -394,7 +394,7 @@ def open_trust(*unseen: str, unknown: tuple[str, ...] = ()) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("trust", "tone", "words"),
     [
-        (TRUST, "warning", "not trusted … 300 (limit: near miss)"),
+        (TRUST, "warning", "not trusted … 300 … near miss"),
         (open_trust("time step", unknown=("other starts",)), "warning", "undecided … other starting"),
         ({**TRUST, "verdict": "trusted", "limited_by": ""}, "good", "is trusted."),
         (None, "info", "= 2.000 σ²/σ and"),

@@ -201,7 +201,7 @@ def test_times_that_go_back_without_being_there_before_are_named_and_constant_on
     for drop in (True, False):
         found = flips(path, tmp_path / f"a{drop}", drop_repeats=drop)
         said = next(one for one in found["findings"] if one["code"] == "TIME_GOES_BACK")
-        assert "frame 4, the time changes from 30 to 15 ps" in said["text"] and found["frames"] == 8
+        assert "frame 4" in said["text"] and "30 to 15 ps" in said["text"] and found["frames"] == 8
     path = written(tmp_path / "b.xtc", run, [0.0] * 8)
     assert flips(path, tmp_path / "b", drop_repeats=True)["frames"] == 8
 
