@@ -259,7 +259,8 @@ def boundaries(
             note(k, len(places), {"phase": "running a grid", "unit": "runs"})
             line.known[place] = next(runs)
         cells = [ends for ends in pairwise(places) if len({line.digest(place) for place in ends}) > 1]
-        edges, count = list[Boundary](), 0
+        edges: list[Boundary] = []
+        count = 0
         # a cell is searched here only after those below it, and then not for more boundaries than are left
         tasks = ((own, {end: line.known[end] for end in ends}, most - count) for ends in cells)
         searched = engines.in_order(_searched, tasks, engine)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import ml_dtypes
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import DTypeLike
+from numpy.typing import ArrayLike, DTypeLike
 
 
 def unit_roundoff(dtype: DTypeLike) -> float:
@@ -25,7 +25,7 @@ def _signed(dtype: np.dtype) -> np.dtype:
     return np.dtype(f"int{8 * dtype.itemsize}")
 
 
-def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
+def ordinal(x: ArrayLike) -> Int[np.ndarray, "..."]:
     """Return the index of x among all floats of the same dtype, as a signed integer; ±0 has index 0.
 
     Adjacent finite floats have adjacent indices: differences count ulps. The index of NaN has no meaning.

@@ -25,6 +25,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import Any, cast
 
 from ase.calculators.calculator import Calculator
 from ase.calculators.tersoff import Tersoff, TersoffParameters
@@ -76,7 +77,7 @@ def reference(subject: Simulation | System) -> Reference:
         subject: a `Simulation`, or a `System`, whose box may be too small for its skin.
     """
     simulation = _objects(subject)
-    species, model = simulation.symbols, simulation.model
+    species, model = simulation.symbols, cast(Any, simulation.model)
     if isinstance(model, EmbeddedAtom):
         return Reference("ASE EAM", True, "none", lambda: short_listed_eam(Path(model.file)))
     if isinstance(model, tetrahedral.Tersoff):
@@ -104,7 +105,7 @@ def reference(subject: Simulation | System) -> Reference:
 def independent(subject: Simulation | System) -> Reference:
     """Return a plain-numpy reference for any potential except eam, even if ASE has a class for it."""
     simulation = _objects(subject)
-    model, compare = simulation.model, simulation.decider.compare
+    model, compare = cast(Any, simulation.model), simulation.decider.compare
     if isinstance(model, EnergyFunction):
         conversion = "none: the function, compiled for itself alone"
         return Reference(ENERGY, False, conversion, lambda: EnergyOnNeighborList(model))

@@ -131,7 +131,6 @@ def test_what_the_page_writes_agrees(
     for finding in found.verdict.findings:
         if finding.code == "UNDECIDABLE":
             assert finding.values["invented"] <= finding.values["share"]
-            assert "cannot be decided" not in finding.text
 
 
 def test_rounding_on_the_page_keeps_a_mean_in_its_range() -> None:
