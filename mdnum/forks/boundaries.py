@@ -258,16 +258,16 @@ def boundaries(
         for k, place in enumerate(places):
             note(k, len(places), {"phase": "running a grid", "unit": "runs"})
             line.known[place] = next(runs)
-        cells = [ends for ends in pairwise(places) if len({line.digest(place) for place in ends}) > 1]
+        unequal = [ends for ends in pairwise(places) if len({line.digest(place) for place in ends}) > 1]
         edges: list[Boundary] = []
         count = 0
         # a cell is searched here only after those below it, and then not for more boundaries than are left
-        tasks = ((own, {end: line.known[end] for end in ends}, most - count) for ends in cells)
+        tasks = ((own, {end: line.known[end] for end in ends}, most - count) for ends in unequal)
         searched = engines.in_order(_searched, tasks, engine)
-        for k in range(len(cells)):
+        for k in range(len(unequal)):
             if count == most:
                 break
-            note(count, min(most, count + len(cells) - k), {"phase": "bisecting", "unit": "boundaries"})
+            note(count, min(most, count + len(unequal) - k), {"phase": "bisecting", "unit": "boundaries"})
             for edge, runs_made in next(searched)[: most - count]:
                 line.known |= runs_made
                 edges += [] if edge is None else [edge]

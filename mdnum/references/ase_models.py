@@ -25,7 +25,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import Any, cast
 
 from ase.calculators.calculator import Calculator
 from ase.calculators.tersoff import Tersoff, TersoffParameters
@@ -77,7 +76,7 @@ def reference(subject: Simulation | System) -> Reference:
         subject: a `Simulation`, or a `System`, whose box may be too small for its skin.
     """
     simulation = _objects(subject)
-    species, model = simulation.symbols, cast(Any, simulation.model)
+    species, model = simulation.symbols, simulation.model
     if isinstance(model, EmbeddedAtom):
         return Reference("ASE EAM", True, "none", lambda: short_listed_eam(Path(model.file)))
     if isinstance(model, tetrahedral.Tersoff):
@@ -105,11 +104,11 @@ def reference(subject: Simulation | System) -> Reference:
 def independent(subject: Simulation | System) -> Reference:
     """Return a plain-numpy reference for any potential except eam, even if ASE has a class for it."""
     simulation = _objects(subject)
-    model, compare = cast(Any, simulation.model), simulation.decider.compare
+    model, compare = simulation.model, simulation.decider.compare
     if isinstance(model, EnergyFunction):
         conversion = "none: the function, compiled for itself alone"
         return Reference(ENERGY, False, conversion, lambda: EnergyOnNeighborList(model))
-    again = TersoffModel if isinstance(model, tetrahedral.Tersoff) else StillingerWeberModel
+    again = TersoffModel if type(model) is tetrahedral.Tersoff else StillingerWeberModel
     own = simulation.pairwise and all(isinstance(one.potential, PairFunction) for one in model.terms.values())
     return Reference(
         ITSELF if own else "plain numpy on ASE's neighbor list",
