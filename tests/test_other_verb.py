@@ -298,7 +298,7 @@ def test_a_folder_of_before_is_one_clear_line_and_its_tables_can_be_read(site, c
 def test_a_kind_that_nobody_declares_is_refused_before_a_folder_is_made(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with (
-        pytest.raises(InputError, match=r"installed verb .* kind 'nothing'"),
+        pytest.raises(InputError, match=r"installed package .* kind 'nothing'"),
         frame.answering("nothing", "x"),
     ):
         pass

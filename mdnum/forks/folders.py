@@ -109,7 +109,7 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
         folder.check_start()
         if folder.kind not in _ELSEWHERE:
             raise InputError(
-                "this folder holds a result of `mdnum fork`, not a run",
+                "the folder holds a result of `mdnum fork`, not a run",
                 where=str(folder.path),
                 remedy="Give two folders of `mdnum run`, `mdnum ball` or `mdnum flips`; show a result "
                 "of `mdnum fork` with `mdnum report DIR`",

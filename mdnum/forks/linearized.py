@@ -456,7 +456,7 @@ def forecast(
         dx = direction(simulation, seed)
     change = [np.zeros(shape) if part is None else np.asarray(part, np.float64) for part in (dx, dv)]
     if any(part.shape != shape for part in change):
-        raise InputError(f"the direction must have the shape of the positions, {shape}")
+        raise InputError(f"the perturbation must have the shape of the positions, {shape}")
     dx, dv = change
     parts = list(tangents(simulation, last, dx, dv))
     tables = [part.segment.table for part in parts]

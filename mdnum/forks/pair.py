@@ -205,7 +205,7 @@ def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such ru
         )
     if repeats and not counterfactual:
         raise InputError(
-            f"repeats = {repeats}, but B is not run with A's decisions, so there is no run to repeat: {why}",
+            f"repeats = {repeats}, but run B is not repeated with A's decisions: {why}",
             remedy="Set repeats = 0, or omit the option",
         )
     return repeats

@@ -273,7 +273,7 @@ def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Con
     names = [one.name.lower() for one in placed]
     if placed and (names[0] in _GRAPHS or "Graph" in str(placed[0].annotation)):
         raise InputError(
-            f"the energy function {name} takes a graph instead of a neighbor list",
+            f"the energy function {name} takes a graph; expected a function of a neighbor list",
             remedy="Call it from a function energy(parameters, R, neighbor, cell) that makes the graph "
             "from neighbor.idx and mdnum.md.jaxmd.displacement(cell)",
         )

@@ -120,7 +120,7 @@ class FixedPointUnits:
         matrix = np.round(np.asarray(cell.matrix, np.float64) / self.spacing)
         if np.max(np.abs(matrix)) >= 2**50:
             raise InputError(
-                "the box is too large for fixed-point positions of this resolution", where="precision.state"
+                "the box is too large for the resolution of fixed-point positions", where="precision.state"
             )
         made = Cell.create(matrix * self.spacing, cell.pbc)
         # an atom at the far face is at the near one: L times its inverse must not round below 1

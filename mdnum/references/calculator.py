@@ -139,7 +139,7 @@ class MdnumCalculator(ClassicalCalculator):
             TypeError: a parameter was given.
         """
         if changes:
-            raise TypeError(f"MdnumCalculator cannot change {', '.join(changes)}; create a new calculator")
+            raise TypeError(f"{', '.join(changes)} cannot be changed; create a new MdnumCalculator")
         return {}
 
     def evaluated(self, atoms, changes):

@@ -167,7 +167,7 @@ class FrameFile:
         if self.mark()[2] < size:
             raise FolderError(
                 f"the trajectory is shorter than its checkpoint says ({frames} frames)",
-                remedy="Run again in a new folder: the old one was changed after the checkpoint",
+                remedy="Run again in a new folder: the old folder was changed after the checkpoint",
                 where=str(self.path),
             )
         with disk_errors(self.path), opened(self.path, "r+b") as file:

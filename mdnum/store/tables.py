@@ -127,7 +127,7 @@ class TableStream:
         missing = [name for name in schema.names if name not in columns and name not in self._usual]
         unknown = [name for name in columns if name not in schema.names]
         if missing or unknown:
-            raise ValueError(f"table {self.name!r} has missing columns {missing}, unexpected {unknown}")
+            raise ValueError(f"table {self.name!r} has missing columns {missing} and extra columns {unknown}")
         lengths = {name: len(one) for name, one in columns.items() if not isinstance(one, str)}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"the columns of the table {self.name!r} have different lengths: {lengths}")
@@ -189,7 +189,7 @@ class TableStream:
         if have < rows:
             raise FolderError(
                 f"the table {self.name!r} has {have} rows, fewer than the {rows} rows at the last checkpoint",
-                remedy="Run again in a new folder: the old one was changed after the checkpoint",
+                remedy="Run again in a new folder: the old folder was changed after the checkpoint",
                 where=str(self.merged_path.parent),
             )
         # parts of a merge that was killed before it removed them: their rows are in the merged file

@@ -140,7 +140,7 @@ class Workspace:
         except (OSError, ValueError) as error:
             message = f"the file is not the result of a point: {error}"
             raise FolderError(
-                message, where=str(file), remedy="Delete this point's folder; the point is computed again"
+                message, where=str(file), remedy="Delete this point's folder to compute the point again"
             ) from None
 
     def nearest(self, point: Mapping[str, Any]) -> list[str] | None:

@@ -440,7 +440,7 @@ def load(
 def _check_world(name: str | Path, is_ball: bool, world: str | None) -> None:
     if world is not None and is_ball != (world == "ball"):
         verb, what = ("ball", "a ball") if is_ball else ("run", "molecular dynamics")
-        raise InputError(f"this system is {what}", where=str(name), remedy=f"Use `mdnum {verb} {name}`")
+        raise InputError(f"the system is {what}", where=str(name), remedy=f"Use `mdnum {verb} {name}`")
 
 
 def _is_ball(data: Mapping[str, Any], where: str) -> bool:

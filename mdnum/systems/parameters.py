@@ -237,8 +237,8 @@ def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation
         here, new = value(simulation, name), np.asarray(given)
         if new.shape != here.shape or np.iscomplexobj(new) or not np.isfinite(new).all():
             raise InputError(
-                f"{name}: the new value is an array of shape {new.shape} and type {new.dtype}, finite: "
-                f"{bool(np.isfinite(new).all())}; expected finite real numbers of shape {here.shape}"
+                f"{name}: the new value has shape {new.shape} and type {new.dtype} (all finite: "
+                f"{bool(np.isfinite(new).all())}); expected finite real numbers of shape {here.shape}"
             )
         place = entry(simulation, name)
         whole = value(simulation, place.whole)

@@ -87,7 +87,7 @@ class PairPotentialTable(TomlTable):
         if not pairs:
             missing = [key for key in self.constants if getattr(self, key, None) is None]
             if missing:
-                raise ValueError(f"values of {', '.join(missing)} are missing here and in the table pairs")
+                raise ValueError(f"values of {', '.join(missing)} are missing, also in the table pairs")
         return self
 
     @property
@@ -610,12 +610,12 @@ class SystemSpec(TomlTable):
     def _cutoff_fits_potential(self) -> SystemSpec:
         if (self.potential is None) != bool(self.terms) or (self.terms and self.cutoff):
             raise ValueError(
-                "expected either [potential] (with [cutoff] for pairs) or [terms.NAME.potential]"
+                "give either the table [potential] (with [cutoff] for pairs) or [terms.NAME.potential]"
             )
         if self.potential is not None:
             check_interaction(self.potential, self.cutoff)
         if len({one.cutoff.compare for one in self.interactions.values() if one.cutoff}) > 1:
-            raise ValueError("the terms have different cutoff.compare; expected the same in all")
+            raise ValueError("the potential terms differ in cutoff.compare; expected the same in all")
         return self
 
     @property

@@ -51,7 +51,7 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
         raise InputError(
             f"tables or arrays are nested more than {_DEEPEST} deep",
             where=str(where),
-            remedy="Write a system file, in which tables are nested at most three levels deep",
+            remedy="Nest tables at most three levels deep",
         ) from None
     except ValueError as error:
         seen = str(error)

@@ -93,7 +93,7 @@ class XdrFile:
             self._stream(at)
             end = self._file.tell()
             if end > self._size:
-                raise ValueError("the file ends within this frame")
+                raise ValueError("the file ends within a frame")
             self._starts.append(end)
         return self._starts[number]
 
@@ -246,7 +246,7 @@ class TrrFile(XdrFile):
         width = box // 9 if box else max(vectors, default=0) // max(3 * atoms, 1)
         fits = all(size == 3 * width * atoms for size in vectors) and box in (0, 9 * width)
         if (magic, word) != _TRR_BEGIN or width not in (4, 8) or not fits or min(sizes) < 0:
-            raise ValueError("damaged: the header of a frame is missing")
+            raise ValueError("the file is damaged: the header of a frame is missing")
         return atoms, width, sizes
 
     def has_box(self, number: int) -> bool:

@@ -236,7 +236,7 @@ def _rows(lines: Any, head: int, atoms: int, cut: bool = True) -> list[str]:
         raise ValueError(f"the number of atoms of a frame is {atoms}; expected 0 or more")
     rows = list(islice(lines, head + atoms))
     if len(rows) < head + atoms:
-        raise ValueError(f"the file ends after {max(len(rows) - head, 0):,} of {atoms:,} atoms")
+        raise ValueError(f"the file ends after {max(len(rows) - head, 0):,} of {atoms:,} atoms of a frame")
     if cut:
         refuse_cut_line(rows[head:])
     return rows

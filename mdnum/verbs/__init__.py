@@ -102,7 +102,7 @@ def home(kind: str) -> str:
             if heading.search(Path(_file(name)).with_suffix(".toml").read_text(encoding="utf-8")):
                 return name
     raise InputError(
-        f"no installed verb writes folders of kind {kind!r}",
+        f"no installed package writes folders of kind {kind!r}",
         remedy="Install the package that wrote the folder",
     )
 

@@ -86,7 +86,7 @@ def of_md(
 
     loaded = opened(system, overrides)
     if isinstance(loaded, BallSystem):
-        raise InputError("this system is a ball", where=loaded.name, remedy=TEXTS(f"ball_{question}"))
+        raise InputError("the system is a ball", where=loaded.name, remedy=TEXTS(f"ball_{question}"))
     if pairwise and not loaded.pairwise:
         remedy = "Use a system with a pair potential"
         raise InputError(TEXTS(f"many_body_{question}"), where=loaded.name, remedy=remedy)

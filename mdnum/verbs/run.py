@@ -98,7 +98,7 @@ def run(
     from mdnum.systems import BallSystem
 
     if isinstance(system, BallSystem):
-        raise InputError("this system is a ball", where=system.name, remedy="Use mdnum.bounce")
+        raise InputError("the system is a ball", where=system.name, remedy="Use mdnum.bounce")
     if resume is not None and Path(resume).is_dir() and (folder := RunFolder.open(resume)).kind != "md":
         remedy = f"`mdnum report {resume}` shows it" if folder.summary else folder.again
         seen = f"this is a folder of `mdnum {folder.layout.command}`, not of a run"

@@ -57,7 +57,7 @@ def separation(run: Sample, argument: str) -> Value:
     found = _pair(run, argument)
     grown = found.growth["B"]
     if not grown.plain:
-        raise InputError("the separation does not grow exponentially", remedy="Use more steps")
+        raise InputError("the separation of the runs does not grow exponentially", remedy="Use more steps")
     return Value(float(grown.rate / found.twin.a.timestep))
 
 
@@ -72,7 +72,7 @@ def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
         raise InputError(f"{argument!r} is not of the form {_LOSS}", remedy=remedy)
     name, *others = parameters.resolve(simulation, [parameter])
     if others or np.ndim(parameters.value(simulation, name)):
-        raise InputError(f"{parameter} has several values", remedy="Give the name of one value")
+        raise InputError(f"{parameter} is not a single number", remedy="Name a single number")
     return parse(word, simulation, steps), name
 
 

@@ -210,7 +210,7 @@ def test_systems_that_cannot_be_bounced_or_run(tmp_path: Path):
     asked: list[tuple[Any, Any, dict[str, Any], str]] = [
         (bounce, drop, {"overrides": {"contact.k": 1.0}}, "overrides have no effect on a loaded system"),
         (bounce, drop, {"against": ["contact.k"]}, "not of the form key=value"),
-        *((run, system, {}, "this system is a ball") for system in ("ball/drop", drop)),
+        *((run, system, {}, "the system is a ball") for system in ("ball/drop", drop)),
         *((bounce, system, {}, "molecular dynamics") for system in ("argon/crystal-108", crystal)),
     ]
     for verb, system, options, message in asked:

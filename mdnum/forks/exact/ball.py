@@ -212,9 +212,7 @@ class _ExactRule:
         if isinstance(rule, HysteresisStop):
             self.enter, rule = _held(world, rule.enter), rule.rule
         if type(rule) not in (GlobalSum, PerInstance, Maximum, Relative, FixedCount):
-            raise InputError(
-                f"exact arithmetic for balls does not support the stopping rule {type(rule).__name__}"
-            )
+            raise InputError(f"the stopping rule {type(rule).__name__} is not supported in exact arithmetic")
         self.rule, self.max_iter = rule, rule.max_iter
         self.tol = None if isinstance(rule, FixedCount) else _held(world, rule.tol)
 
