@@ -145,7 +145,7 @@ def test_a_checkpoint_names_tables_and_no_files(tmp_path, killed, name):
     state, store = checkpoint.read(killed / "checkpoint.npz")
     # a checkpoint is listed as it is written
     checkpoint.write(killed / "checkpoint.npz", state, {**store, "rows": {**store["rows"], name: 0}}, {})
-    with pytest.raises(FolderError, match=r"checkpoint\.npz: .*counts rows"):
+    with pytest.raises(FolderError, match=r"checkpoint\.npz: .*refers to a table"):
         RunFolder.open(killed).resume()
     assert (tmp_path / "precious.parquet").read_bytes() == PRECIOUS
 

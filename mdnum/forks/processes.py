@@ -152,7 +152,7 @@ def variants(
     if not system.pairwise:
         raise InputError("variants of a many-body potential cannot be compared", where=system.name)
     if steps < 1 or not which:
-        raise InputError("expected at least one step and one variant", where=f"steps = {steps}")
+        raise InputError("a comparison needs at least one step and one variant", where=f"steps = {steps}")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         question = _question(system, steps, folder)

@@ -114,7 +114,7 @@ class Implicit(BallMethod):
         condition = max(1.0, gain + self.regularization) / min(1.0, gain + self.regularization)
         if condition > LIMIT:
             raise InputError(
-                f"the matrix 1 - dG/dy has condition number {condition:.3g}; expected at most {LIMIT:g}",
+                f"the implicit equation has condition number {condition:.3g}; expected at most {LIMIT:g}",
                 remedy="Set a regularization; the derivative is then that of the regularized problem.",
             )
         rule = FixedPointRule(self.regularization, self.at_iterate)

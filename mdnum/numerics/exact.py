@@ -151,7 +151,7 @@ def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
         TypeError: the equation contains another jaxpr, such as the body of a loop.
     """
     if any(isinstance(param, Jaxpr | ClosedJaxpr) for param in equation.params.values()):
-        raise TypeError(f"{equation.primitive.name} cannot be evaluated operation by operation")
+        raise TypeError(f"{equation.primitive.name} is not an elementary operation")
     outputs = equation.primitive.bind(*inputs, **equation.params)
     return list(outputs) if equation.primitive.multiple_results else [outputs]
 

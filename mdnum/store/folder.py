@@ -691,7 +691,7 @@ class RunFolder:
             or not all(isinstance(count, int) and count >= 0 for count in (*rows.values(), *mark, log))
         ):
             raise FolderError(
-                "the checkpoint counts rows of a table that mdnum does not write",
+                "the checkpoint refers to a table that mdnum does not write",
                 remedy="Run again in a new folder",
                 where=str(path),
             )

@@ -74,7 +74,7 @@ def find(name: str | Path) -> tuple[str, Path]:
         return path.resolve().name, path / SYSTEM_FILE
     if path.is_dir() and (path / SIMULATION_FILE).is_file():
         raise InputError(
-            "this run was made from Python objects, which no file can recreate",
+            "the run was made from Python objects, which no file can recreate",
             where=text,
             remedy=GIVE_OBJECTS,
         )

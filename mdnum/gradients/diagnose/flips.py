@@ -189,7 +189,7 @@ def edges(
     here = parameters.value(problem.simulation, full)
     if here.shape:
         raise InputError(
-            f"the parameter {full} has {here.size} entries; expected one, along which to find boundaries",
+            f"decision boundaries are located along one number, but {full} has {here.size} entries",
             remedy="Give a scalar parameter",
         )
     value = float(here)
