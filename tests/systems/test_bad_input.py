@@ -133,7 +133,7 @@ def test_a_mistake_in_the_file(folder: Path, old: str, new: str, line: int | Non
         ("cutof.radius", "8", "--set cutof.radius:  … Did you mean cutoff?"),
         ("cutoff.kind", "swiched", "--set cutoff.kind … Did you mean switched?"),
         ("neighbors.skin", "wide", '--set neighbors.skin … "wide" … expected a number'),
-        ("about.me", "x", "--set about.me … about is a value"),
+        ("about.me", "x", "--set about.me … about is a single"),
         ("cutoff..radius", "8", "--set … is not a key"),
         ("dynamics.kind", "langevin", "key 'temperature' missing"),
         ("potential.kind", "morse", "depth … missing"),
