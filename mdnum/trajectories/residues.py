@@ -53,7 +53,7 @@ class ByResidue:
         """
         if len(table) and not any(table.residue_names):
             remedy = "Give a topology that has residues with -s TOPOLOGY"
-            raise InputError("the file has no residues, so no contacts between residues", remedy=remedy)
+            raise InputError("the file has no residues between which contacts can be found", remedy=remedy)
         if directed := [one.name for one in rules if one.directed]:
             remedy = "Use --cutoff, or --pairs for cutoffs by species"
             raise InputError(f"the rule {directed[0]} applies to atoms, not to residues", remedy=remedy)
