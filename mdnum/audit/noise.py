@@ -131,7 +131,7 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     """Detect discrete steps in energies and forces: values that stay constant to the last bit, then change.
 
     In single or double precision, every smooth energy or force changes within a move of 1e-4 Å. Points at
-    which the energy and all forces are unchanged are ignored, since cached results look the same.
+    which energy and forces are identical to those of the previous point are ignored: they may be cached.
     """
     key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
     if key in subject.known:

@@ -138,7 +138,7 @@ class NumberLine:
         self.known: dict[int, DecisionHistory] = {}
 
     def value(self, place: int) -> float:
-        """Return the float with the given ordinal."""
+        """Return the float with a given position (ordinal) in the ordered sequence of floats."""
         return float(neighbor(np.zeros((), self.number.dtype), place, self.number.dtype))
 
     def places(self, values: Any) -> list[int]:
@@ -146,17 +146,17 @@ class NumberLine:
         return sorted({int(place) for place in ordinal(np.asarray(values, self.number.dtype))})
 
     def at(self, place: int) -> Any:
-        """Return the program for the parameter value with the given ordinal."""
+        """Return the program for the parameter value with a given position in the sequence of floats."""
         return self.number.at(self.value(place))
 
     def run(self, place: int) -> DecisionHistory:
-        """Compute the history (all decisions) for the parameter value with the given ordinal."""
+        """Compute all decisions for the parameter value with a given position in the sequence of floats."""
         history = self.at(place).history(self.steps, self.loss)
         self.known[place] = replace(history, marks=history.marks[:0], x=history.x[:0])
         return history
 
     def digest(self, place: int) -> str:
-        """Return the digest of all decisions for the parameter value with the given ordinal."""
+        """Return the digest of all decisions for the float with a given position in the sequence."""
         if place not in self.known:
             self.run(place)
         return self.known[place].digest

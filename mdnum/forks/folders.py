@@ -117,7 +117,7 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
     where = f"{first.path} and {second.path}"
     if first.kind != second.kind:
         kinds = f"the folders hold runs of different kinds, {first.kind} and {second.kind}"
-        raise InputError(kinds, where=where, remedy="Compare two molecular-dynamics runs, or two ball runs")
+        raise InputError(kinds, where=where, remedy="Compare two runs of atoms, or two runs of balls")
     with first.explained(), second.explained():
         return _compared(first, second, where)
 
@@ -158,7 +158,7 @@ def twin_of(found: FolderFork, objects: Sequence[Simulation] = ()) -> Twin:
 
 
 def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
-    world, remedy = first.kind, "Compare runs of one system"
+    world, remedy = first.kind, "Compare two runs of the same system"
     elsewhere = _ELSEWHERE[world]
     keys = _different(flat(first.system), flat(second.system))
     programs = [row for row in keys if row[0] not in elsewhere and row[0].split(".")[0] not in elsewhere]
@@ -172,7 +172,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
             raise InputError(
                 f"the runs are of different systems: {key} is {one} in the first and {other} in the second",
                 where=where,
-                remedy="Give two runs of the same system; only numbers and numerical settings may differ",
+                remedy="Give two runs of the same system; parameter values and numerical settings may differ",
             )
     if world == "flips":
         return _of_frames(first, second, where)

@@ -368,7 +368,7 @@ def screen(
     """
     choices = list(shipped(world_of(system)).values()) if choices is None else choices
     if not choices:
-        raise InputError("no numerical choice was given", remedy="Give at least one choice")
+        raise InputError("no numerical choice was given", remedy="Give at least one, such as precision")
     rows: list[Screened] = []
     with engines.requested(on, workers) as engine:
         sent = system if engine is None else packed(system)

@@ -126,7 +126,7 @@ def pinned(
     last_step = fork.steps if steps is None else steps
     if pairs is None:
         if fork.decision is None:
-            raise InputError("the runs do not fork", remedy="Give the pairs whose decisions to override")
+            raise InputError("the runs do not fork", remedy="Give the pairs whose decisions to impose")
         i, j = fork.decision.subject
         pairs = [(i, j)]
         spell = disagreements(fork, i, j)[0]

@@ -157,7 +157,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
         ends = [_ends(made, power) for power in (1, 3)]
     if made.smoothness < _ORDERS and not any(ends):
         after = _DERIVATIVES[max(made.smoothness + 1, 0)]
-        raise ValueError(f"the cutoff declares smoothness {made.smoothness}, but the {after} does not jump")
+        raise ValueError(f"cutoff smoothness = {made.smoothness} is too low: the {after} is continuous")
 
 
 def _ends(made: Cutoff, power: int) -> bool:

@@ -69,7 +69,7 @@ def displacement(
     ) -> Array:
         if Ra.shape != (3,) or Rb.shape != (3,):
             # jax-md probes with one and two dimensions and moves on at a ValueError
-            raise ValueError(f"the points have shapes {Ra.shape} and {Rb.shape}; expected (3,) for each")
+            raise ValueError(f"points of shapes {Ra.shape} and {Rb.shape}; expected shape (3,) for both")
         vector = Ra - Rb
         if periodic:
             lattice = jnp.asarray(base if cell is None else cell, vector.dtype)

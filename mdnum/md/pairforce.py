@@ -182,7 +182,7 @@ class PairForce(eqx.Module):
         return wide and few and self.reduction == Sequential() and foreign.known()
 
     def _terms(self, tensor: bool) -> Callable[..., tuple[Float[Array, "..."], ...]]:
-        """Return a function for force, energy and virial of a pair, given its displacement and decision.
+        """Return a function that computes force, energy and virial from displacement and decision of a pair.
 
         Args:
             tensor: True for a virial with six components, in Voigt order.

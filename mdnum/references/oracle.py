@@ -137,7 +137,7 @@ def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
         if not lengths[axis] > 0.0:
             raise InputError(
                 f"direction {axis} of the structure is periodic, but has no cell vector",
-                remedy="Give this direction a cell vector, or set pbc to false along it",
+                remedy="Give a cell vector for this direction, or set pbc to false for it",
                 where="pair oracle",
             )
     return completed(cell, pbc)

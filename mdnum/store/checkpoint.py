@@ -55,7 +55,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             arrays = _arrays(file)
         meta, store = (json.loads(str(arrays.pop(name))) for name in (_META, _STORE))
         if not isinstance(meta, dict) or not isinstance(store, dict):
-            raise ValueError("the checkpoint does not contain a number of rows for each table")
+            raise ValueError("the checkpoint does not contain the number of rows of each table")
         return arrays | meta, store
     except FolderError:
         raise

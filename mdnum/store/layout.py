@@ -59,7 +59,7 @@ class Layout:
                 f"invalid kind {self.kind!r}, command {self.command!r} or resumes_from {self.resumes_from!r}"
             )
         if len(self.further) > _MOST_COLUMNS:
-            raise ValueError(f"the text with the names of further files is too long: {self.further[:100]!r}")
+            raise ValueError(f"the list of further files has too many characters: {self.further[:100]!r}")
         if len(self.tables) > _MOST_TABLES or not all(map(_TABLE.fullmatch, self.tables)):
             raise ValueError(f"too many tables, or invalid names of tables: {list(self.tables)[:3]}")
         _ = self._columns

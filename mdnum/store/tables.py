@@ -347,7 +347,7 @@ class _Writing:
         while (table := self._tables.get()) is not None:
             yield table
         if not self._whole:
-            raise RuntimeError("some rows of the table are missing")
+            raise RuntimeError("some rows of the table were not written")
 
     def put(self, table: pa.Table | None) -> None:
         """Add a table to the queue when there is space; raise the error of the writing thread, if any."""

@@ -527,7 +527,7 @@ def in_fixed_point(simulation: Simulation) -> Simulation:
             'with state = "lattice", forces are computed in float64, and decisions and sums in fixed '
             "point; other precisions are not supported",
             where="precision",
-            remedy="Omit the keys force, decision and accumulate of the table [precision]",
+            remedy="Omit the keys `force`, `decision` and `accumulate` of the table [precision]",
         )
     kT = units.k_B * simulation.draw.temperature
     own = masses * np.linalg.norm(simulation.velocities, axis=1)

@@ -74,7 +74,7 @@ def find(name: str | Path) -> tuple[str, Path]:
         return path.resolve().name, path / SYSTEM_FILE
     if path.is_dir() and (path / SIMULATION_FILE).is_file():
         raise InputError(
-            "the run was made from Python objects, which no file can recreate",
+            "the run was built from Python objects, which cannot be loaded from its folder",
             where=text,
             remedy=GIVE_OBJECTS,
         )
@@ -347,7 +347,7 @@ def copy(name: str | Path, folder: str | Path) -> Path:
     """
     system: System | BallSystem = load(name)
     if system.path is None:
-        raise TypeError("a loaded system must have a path")
+        raise TypeError("the system was not loaded from a file, so there is no file to copy")
     target = Path(folder)
     is_ball = isinstance(system, BallSystem)
     files = [] if is_ball else sorted(system.tables)
@@ -456,7 +456,7 @@ def _is_ball(data: Mapping[str, Any], where: str) -> bool:
         raise InputError(
             f'world = {data["world"]!r}; expected "ball"',
             where=where,
-            remedy="Omit the key world for a molecular-dynamics system",
+            remedy="For a molecular-dynamics system, omit the key `world`",
         )
     return True
 

@@ -299,7 +299,7 @@ def _heated(simulation: Simulation, new: float) -> Simulation:
         return _drawn(heated)
     if not (new > 0 and old.temperature > 0):
         seen = f"a change of temperature from {old.temperature:g} to {new:g}"
-        raise InputError(f"{seen}; expected an old and a new temperature above 0", where="dynamics")
+        raise InputError(f"{seen}; expected two temperatures above 0", where="dynamics")
     return replace(heated, velocities=simulation.velocities * np.sqrt(new / old.temperature))
 
 

@@ -87,7 +87,7 @@ class PairPotentialTable(TomlTable):
         if not pairs:
             missing = [key for key in self.constants if getattr(self, key, None) is None]
             if missing:
-                raise ValueError(f"values of {', '.join(missing)} are missing, also in the table pairs")
+                raise ValueError(f"{', '.join(missing)} missing; give values here or in the table `pairs`")
         return self
 
     @property
@@ -286,7 +286,7 @@ class CutoffTable(TomlTable):
             raise ValueError(f"an onset is given, but {self.kind} cutoffs have no switching range; remove it")
         if self.base is None:
             raise ValueError(
-                "an onset needs radius or in_sigma too; the onset of each pair is scaled with its radius"
+                "onset is given without radius or in_sigma, relative to which onsets of pairs are scaled"
             )
         if self.onset >= self.base:
             raise ValueError(f"the switching onset {self.onset:g} is not below the cutoff {self.base:g}")

@@ -92,7 +92,7 @@ def spreads(x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "3"]:
 def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> str | None:
     """Describe the plane, line or point into which all atoms have collapsed; None without a collapse.
 
-    Rippled sheets may become flat, and bent chains may become straight, without an error. A collapse is
+    Rippled sheets may become flat, and bent chains may become straight, in a correct file. A collapse is
     therefore reported only if the earlier spread across the sheet or chain was large: above the distance
     between neighbors or, if a coordinate is constant, above a fifth of the largest spread.
     """

@@ -90,7 +90,7 @@ def _reduced(rows: bytes, periodic: bytes) -> ReducedLattice:
         scaled = matrix[pbc] / np.linalg.norm(matrix[pbc], axis=1)[:, None]
         if not np.sqrt(max(np.linalg.det(scaled @ scaled.T), 0.0)) > _FLAT:
             message = f"the vectors of the box lie in one plane: {matrix[pbc].tolist()}"
-            raise InputError(message, remedy="Give the frame the box of its simulation", where="box")
+            raise InputError(message, remedy="Use the box of the simulation", where="box")
         if np.count_nonzero(matrix) > pbc.sum():
             # a box with right angles is reduced, and stays in its order
             # in the layout of the one above: of another, numba would compile every search a second time

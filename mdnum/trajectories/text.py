@@ -4,9 +4,9 @@ This module reads three text formats itself, because other libraries lose inform
 tests/trajectories/test_source.py):
 
 - LAMMPS's `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org/dump.html,
-  Howto_triclinic); MDAnalysis reduces coordinates to float32 and ignores the tilt of a box.
+  Howto_triclinic). MDAnalysis would reduce their coordinates to float32 and ignore the tilt of the box.
 - GROMACS's gro files with any number of frames, whose column width is the distance of two decimal points
-  (manual.gromacs.org, reference manual, file formats); MDAnalysis and ASE read only the first frame.
+  (manual.gromacs.org, reference manual, file formats). MDAnalysis and ASE read only the first frame.
 - Extended XYZ, with ASE called for each frame: otherwise, ASE scans the whole file before the first frame.
 """
 
@@ -397,7 +397,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
     words = np.array("".join(rows).split(), dtype=object)
     if len(words) != len(rows) * len(columns):
         odd = next(row for row in rows if len(row.split()) != len(columns))
-        raise ValueError(f"found {odd.strip()[:40]!r}; expected {len(columns)} columns for each atom")
+        raise ValueError(f"found line {odd.strip()[:40]!r}; expected {len(columns)} columns per atom")
     return columns, words.reshape(len(rows), len(columns))
 
 

@@ -193,7 +193,7 @@ def flips_each(
     from mdnum.sweeps import engines
 
     if isinstance(trajectories, str | Path):
-        raise InputError("expected several files", where=str(trajectories), remedy="Give a list of files")
+        raise InputError("found one path", where=str(trajectories), remedy="Give a list of paths")
     if options.get("topology") is not None:
         options["topology"] = Path(options["topology"]).absolute()
     tasks = [(Path(one).absolute(), Path(out).absolute(), options) for one in trajectories]

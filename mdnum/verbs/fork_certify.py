@@ -135,7 +135,7 @@ def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
 
 
 def judge_certify(view: View) -> Verdict:
-    """Return the verdict: which precisions reproduce all decisions of exact arithmetic, and for how long?"""
+    """Return the verdict: at which precisions do all decisions agree with exact arithmetic, and how long?"""
     s = view.summary
     rows = [row for row in s["policies"] if row["reason_unavailable"] is None]
     left = [row for row in rows if row["horizon"] is not None]

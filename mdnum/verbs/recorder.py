@@ -174,7 +174,7 @@ class Recorder:
             self.see_atoms(*(args or (self._atoms,)))
         else:
             raise InputError(
-                "the recorder was called without a frame", remedy="Use Recorder(atoms=...), or call `see`"
+                "the recorder was called without a frame", remedy="Give a frame, or use Recorder(atoms=...)"
             )
 
     def hook(self, step: Any, positions: Any, **given: Any) -> None:

@@ -5,11 +5,11 @@ case ends in another way (docs/hostile-input.md). It takes minutes.
 
     python scripts/campaigns/malformed_input.py [--cases 300] [--seed 1]
 
-Each case damages a system or its structure (bits, numbers, nesting, control characters, long lines, wrong
-types, odd boxes and coordinates) and goes through `mdnum systems check`; what that accepts is shown and run
-for two steps. Fine is: refused in one printable line with exit code 2, or accepted and run to exit code 0 or
-1, or stopped with such a line. Everything else is counted by name and must be 0. The cases run in a process
-of their own, so that a crash is counted too.
+Each case is a system file or structure file with flipped bits, invalid numbers, deep nesting, control
+characters, long lines, wrong types, or impossible boxes and coordinates. `mdnum systems check` reads each
+case; if it accepts the case, the system is shown and run for two steps. A case passes if it is rejected in
+one printable line with exit code 2, or if the run ends with exit code 0 or 1, or with such a line. All other
+outcomes are counted by name and must not occur. Cases run in separate processes, so that a crash is counted.
 """
 
 from __future__ import annotations

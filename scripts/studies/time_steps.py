@@ -1,6 +1,6 @@
 """Which time step is too long, and does mdnum warn about it?
 
-Answer. Among 55 cases there are one missed and one false warning (docs/time-steps.md). It takes minutes.
+Answer. Among 55 cases, one warning is missed and one is false (docs/time-steps.md). It takes minutes.
 
 Every shipped system of atoms runs for the same time at its own time step and at 1/2 to 16 times that. A
 step is too long where halving it changes what an experiment would see: the mean potential energy or the

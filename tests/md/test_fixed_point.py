@@ -161,7 +161,7 @@ def test_an_atom_at_the_far_face_is_at_the_near_one(liquid):
 def test_what_a_fixed_point_state_cannot_be_is_refused():
     with pytest.raises(InputError, match="orthorhombic"):
         build("argon/tilted-500", {"precision.state": "lattice"})
-    with pytest.raises(InputError, match="Omit the keys force"):
+    with pytest.raises(InputError, match="Omit the keys `force"):
         build("argon/crystal-108", {"precision.state": "lattice", "precision.force": "float32"})
     table = {"kind": "langevin", "timestep": 0.004, "temperature": 1.0, "friction": 1e-6}
     with pytest.raises(InputError, match="friction"):

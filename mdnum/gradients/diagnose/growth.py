@@ -417,7 +417,7 @@ def spectrum(
     timestep = float(simulation.integrator.timestep)
     jacobian = Jacobian(tape, CLOCK_STEPS * timestep)
     if not 1 <= values <= jacobian.coordinates or rounds < 1:
-        raise InputError(f"{values = }, {rounds = }; expected 1 to {jacobian.coordinates}, and 1 or more")
+        raise InputError(f"{values = }, {rounds = }; expected values up to {jacobian.coordinates}, both ≥ 1")
     vectors = min(values + extra, jacobian.coordinates)
     rng = np.random.default_rng(seed)
     start, _ = np.linalg.qr(rng.standard_normal((jacobian.coordinates, vectors)))
