@@ -97,7 +97,9 @@ def documents() -> Iterator[tuple[str, str]]:
         # code, formulas, marks that are not shown, and the lines of a notebook before its title
         hidden = r"^(```|~~~|\$\$).*?^(```|~~~|\$\$)|<!--.*?-->|\A---\n.*?^---$"
         text = re.sub(hidden, "", file.read_text(), flags=re.S | re.M)
-        for part in re.split(r"\n\s*\n", re.sub(r"^(\||#|---|\s*:::).*$", "", text, flags=re.M)):
+        text = re.sub(r"^(\||#|---|\s*:::).*$", "", text, flags=re.M)
+        # paragraphs, and items of lists
+        for part in re.split(r"\n\s*\n|\n\s*(?=(?:\d+\.|[-*]) )", text):
             yield from _split(file, part.lstrip("-*>0123456789. "))
 
 
