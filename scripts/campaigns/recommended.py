@@ -6,7 +6,7 @@ contact. Copper: at the recommended 8 fs in float32 the temperature differs by -
 temperature differs by -47.6 K with an error of 0.9. Liquids, dense, near-critical and hot: at the
 recommended cutoffs of 2.8, 2.5 and 2.8 and a time step of 0.016, energies differ by 0.095, 0.146 and 0.083
 (tolerances 0.15, 0.18 and 0.13), pressures by less than 0.09 (0.2 or 0.3) and temperatures by less than half
-of their tolerances, all with errors below 0.02; at the next smaller cutoffs the energies differ by 0.218, 0.307
+of their tolerances, all with errors below 0.02; at the next smaller cutoffs energies differ by 0.218, 0.307
 and 0.204, and at the next time step, 0.032, every run fails. Ball: at the recommended 1.6 ms in float32,
 heights of four balls after ten times the steps differ by up to 0.008 m (tolerance 0.01), and energies of
 three by less than 0.005 (tolerance 0.01). The fourth run ends during a contact, where the energy of
