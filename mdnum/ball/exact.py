@@ -237,7 +237,7 @@ class ExactPenalty(_Motion):
         _positive("damping", self.damping, zero=True)
         if self.damping**2 == 4 * self.k:
             raise InputError(
-                "the closed form does not hold at critical damping", remedy="Change the damping slightly"
+                "no formula is available at critical damping", remedy="Change the damping slightly"
             )
 
     def state(self, t: Times) -> tuple[Known, Known]:

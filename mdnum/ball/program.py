@@ -328,7 +328,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
             ends[name] = int(broken.argmax()) - 1
     last = min([a.steps, *ends.values()])
     if last < 0:
-        raise InputError("an initial height or velocity exceeds the dtype", remedy="Use a wider dtype")
+        raise InputError("initial heights or velocities exceed the dtype's range", remedy="Use a wider dtype")
     return last, {name: "blow-up" if ends.get(name) == last else "" for name in "AB"}
 
 

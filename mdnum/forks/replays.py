@@ -162,7 +162,7 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
     named = re.fullmatch(r"(\d+)\s*[-–]\s*(\d+)(?::(\d+)\.\.(\d+))?", text.strip())
     if named is None:
         raise InputError(
-            f"{text!r} does not name a decision", where="pin", remedy="Write fork, 3-75 or 3-75:600..700"
+            f"{text!r} does not name a decision", where="pin", remedy="Give fork, 3-75 or 3-75:600..700"
         )
     pair = int(named[1]), int(named[2])
     _check_pair(pair, atoms)

@@ -194,7 +194,7 @@ class SoftFloor(BallMethod):
         """
         eps = _suitable(problem) if self.eps is None else self.eps
         if not eps > 0:
-            raise InputError(f"the width eps is {eps}", remedy="Choose an eps above 0.", where="eps")
+            raise InputError(f"the contact width eps is {eps}", remedy="Choose an eps above 0.", where="eps")
         soft = softened(problem, eps)
         # the soft floor's own stiffness and width are not what these names mean in the given program
         own = () if isinstance(problem.world.contact, Penalty) else (*_SOLVER, "eps", "rest_speed")

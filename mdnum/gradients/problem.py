@@ -71,7 +71,7 @@ class Problem:
         )
         if jax.tree.structure(made) != jax.tree.structure(0.0) or made.shape != ():
             seen = getattr(made, "shape", None) or jax.tree.structure(made)
-            raise InputError(f"the loss has shape {seen}; expected a scalar", remedy="Reduce it to a number")
+            raise InputError(f"the loss has shape {seen}; expected a scalar", remedy="Return one number")
         if not np.issubdtype(made.dtype, np.inexact):
             remedy = "A count has no gradient: replace it by a float that varies smoothly"
             raise InputError(

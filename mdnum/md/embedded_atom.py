@@ -82,7 +82,7 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
     words = " ".join(lines[6:]).split()
     expected = n_rho + 2 * n_r
     if len(words) != expected:
-        raise InputError(f"the table has {len(words)} numbers after line 6; expected {expected}", where=where)
+        raise InputError(f"found {len(words)} numbers after line 6; expected {expected}", where=where)
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError as error:

@@ -709,7 +709,7 @@ class RunFolder:
         except BlockingIOError:
             lock.close()
             raise FolderError(
-                "another process is writing this run", remedy="Wait for it to end", where=str(self.path)
+                "another process is writing to this folder", remedy="Wait for it to end", where=str(self.path)
             ) from None
         except OSError:
             # a file system without locks (some network mounts): go on without

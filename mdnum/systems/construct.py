@@ -180,7 +180,7 @@ def simulation(
     if isinstance(integrator, Integrator):
         if also := [*given, *(["timestep"] if timestep is not None else [])]:
             message = f"the integrator is an object, but {', '.join(also)} was given as well"
-            raise InputError(message, where=name, remedy="Omit the extra setting, or name the integrator")
+            raise InputError(message, where=name, remedy="Omit these, or give the integrator's name")
         _check_instance(integrator, system, name)
     else:
         if timestep is None:

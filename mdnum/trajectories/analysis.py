@@ -468,4 +468,4 @@ def _cutoff(value: Any) -> Rule:
         return CutoffRule(length(value))
     except (TypeError, ValueError):
         message = f"r_cut = {value!r}; expected a length in Å, or lengths by pair of species"
-        raise InputError(message, remedy='Give 8.5, {("O", "H"): 2.5}, or a list of these') from None
+        raise InputError(message, remedy='Give a cutoff (8.5), {("O", "H"): 2.5}, or a list') from None

@@ -34,7 +34,7 @@ def _radius(value: float, where: str) -> None:
 def _count(value: int, where: str) -> None:
     if isinstance(value, bool) or int(value) != value or value < 1:
         message = f"{value!r} neighbors; expected an integer of at least 1"
-        raise InputError(message, remedy="Give a whole number of nearest neighbors", where=where)
+        raise InputError(message, remedy="Give the number of nearest neighbors to count", where=where)
 
 
 class _Membership:

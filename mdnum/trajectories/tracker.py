@@ -193,7 +193,7 @@ class Tracker:
             message = (
                 f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot resolve them"
             )
-            raise InputError(message, remedy="Check the unit of the cutoff, and the file's coordinates")
+            raise InputError(message, remedy="Check the units of the cutoff and of the coordinates")
         none = np.zeros(0)
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 

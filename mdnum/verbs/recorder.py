@@ -128,7 +128,7 @@ class Recorder:
         if len(frame.positions) != self._source.atoms:
             message = f"step {step} has {len(frame.positions)} atoms; earlier steps had {self._source.atoms}"
             raise InputError(
-                message, remedy="Record each set of atoms with a recorder of its own", where="positions"
+                message, remedy="Use a separate recorder for each set of atoms", where="positions"
             )
         if neighbors is not None:
             self._list = self._check.given(neighbors, self._source.species)

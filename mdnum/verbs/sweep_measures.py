@@ -72,7 +72,7 @@ def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
         raise InputError(f"{argument!r} is not of the form {_LOSS}", remedy=remedy)
     name, *others = parameters.resolve(simulation, [parameter])
     if others or np.ndim(parameters.value(simulation, name)):
-        raise InputError(f"{parameter} is not a single number", remedy="Name a single number")
+        raise InputError(f"{parameter} is not a single number", remedy="Name a scalar parameter")
     return parse(word, simulation, steps), name
 
 
