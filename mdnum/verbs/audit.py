@@ -520,7 +520,7 @@ def _page(view: AuditView, verdict: Verdict) -> Page:
     sections = [Section("What each check found", found, terminal=True)]
     left = [(heading(one["what"]), one["why"]) for one in summary["left_out"] if one["why"]]
     if left:
-        sections.append(Section("Not asked", [replace(pairs(left), shown=6)], terminal=True))
+        sections.append(Section("Tests left out", [replace(pairs(left), shown=6)], terminal=True))
     if state.during is not None:
         sections[-1] = replace(
             sections[-1], parts=[*sections[-1].parts, TEXTS("how_to_go_on", folder=str(view.folder.path))]
