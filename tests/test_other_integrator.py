@@ -145,8 +145,8 @@ def test_from_a_file_it_is_that_from_objects(site):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"dynamics.relaxation": None}, "missing: relaxation"),
-        ({"dynamics.temperature": None}, "missing: temperature"),
+        ({"dynamics.relaxation": None}, "relaxation are missing"),
+        ({"dynamics.temperature": None}, "temperature are missing"),
         ({"dynamics.friction": 1.0}, "unknown key friction"),
         ({"dynamics.kind": "nose-hover"}, "unknown dynamics kind 'nose-hover'"),
         ({"dynamics.kind": "broken"}, "package strange-steps"),

@@ -116,12 +116,12 @@ def test_a_package_cannot_take_a_name_that_is_there(rules, installed):
     installed("first-rules", {}, {GROUP: {"plain": "anything:Rule"}})
     assert rules["plain"] is Rule
     for looked_up in (lambda: list(rules), lambda: rules["unknown"]):
-        with pytest.raises(InputError, match=r"first-rules adds .*'plain', .*mdnum already"):
+        with pytest.raises(InputError, match=r"'plain' of .* first-rules .* by mdnum"):
             looked_up()
 
 
 def test_two_packages_cannot_add_the_same_name(rules, installed):
     installed("first-rules", {}, {GROUP: {"wide": "first:Rule"}})
     installed("second-rules", {}, {GROUP: {"wide": "second:Rule"}})
-    with pytest.raises(InputError, match=r"-rules adds .*'wide', .*-rules already"):
+    with pytest.raises(InputError, match=r"'wide' of .*-rules .* by .*-rules"):
         rules.parse("wide")

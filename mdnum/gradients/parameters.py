@@ -27,7 +27,7 @@ __all__ = ["by", "is_weight", "unit", "value", "with_values"]
 
 #: Numbers of a system file without a derivative, and the reason.
 _INTEGERS = {
-    "dynamics.seed": "it is the number of a noise, not a quantity",
+    "dynamics.seed": "it selects random numbers and is not a quantity",
     "dynamics.steps": "it is a whole number",
     "neighbors.skin": "it changes which list is used, and no force",
     "dynamics.temperature": "nothing has it; velocity.scale scales velocities that are given",

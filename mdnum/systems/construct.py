@@ -319,8 +319,8 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
         k, kind = np.unravel_index(np.argmax(differs), u.shape)
         first, second = pairs_of[kind].split("-")
         raise InputError(
-            f"the pair energy at distance {r[k, kind]:.6g} is {u[k, kind]:.6g} for the species {first}, "
-            f"{second}, but {swapped[k, kind]:.6g} for {second}, {first}; expected equal energies",
+            f"the pair energy at distance {r[k, kind]:.6g} is {u[k, kind]:.12g} for the species {first}, "
+            f"{second}, but {swapped[k, kind]:.12g} for {second}, {first}; expected equal energies",
             where=potential.name,
             remedy="Combine the parameters of the two species symmetrically, for example as (a + b) / 2",
         )

@@ -35,7 +35,7 @@ grad: Any = importlib.import_module("mdnum.verbs.grad")
         ((WELL, "--of", "msd", "--wrt", "sgima"), "Did you mean sigma?"),
         (
             (WELL, "--of", "msd", "--wrt", "sigma,seed"),
-            "with respect to dynamics.seed",
+            "dynamics.seed has no derivative",
         ),
         ((WELL, "--of", "msd", "--wrt", "sigma", "--methods", "symetric"), "Did you mean symmetric?"),
         ((WELL, "--of", "pressure", "--wrt", "sigma"), "not defined for"),

@@ -164,8 +164,8 @@ def test_a_free_axis_needs_no_lattice_vector():
 @pytest.mark.parametrize(
     "matrix, pbc, words",
     [
-        (np.zeros((3, 3)), True, "axis a is periodic"),
-        (np.diag([5.0, 0.0, 5.0]), True, "axis b is periodic"),
+        (np.zeros((3, 3)), True, "axis a of .* periodic"),
+        (np.diag([5.0, 0.0, 5.0]), True, "axis b of .* periodic"),
         ([[1, 0, 0], [2, 0, 0], [0, 0, 1]], True, "span no volume"),
         (np.diag([5.0, np.nan, 5.0]), True, "not finite"),
     ],

@@ -164,7 +164,7 @@ def test_netcdf_without_units_or_of_another_kind_is_one_line(tmp_path, rng):
     ("name", "text", "said"),
     [
         ("a.extxyz", "1\nProperties=species:S:1:pos:R:3\nUue 0 0 0\n", "Uue is the symbol"),
-        ("a.extxyz", "-5\nProperties=species:S:1:pos:R:3\nAr 0 0 0\n", "found -5"),
+        ("a.extxyz", "-5\nProperties=species:S:1:pos:R:3\nAr 0 0 0\n", "is -5"),
         ("a.xyz", "-5\nwords\nAr 0 0 0\n", "announces -5 atoms"),
         ("a.gro", "words\n-5\n\n", "-5 "),
         ("a.mdcrd", "words\n  1.0  2.0  3.0\n", "-s TOPOLOGY"),

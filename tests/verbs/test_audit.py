@@ -196,7 +196,7 @@ def test_a_calculator_that_fails_is_a_finding_with_its_structure(make, why, tmp_
     [
         ({"checks": ","}, "no check was given"),
         ({"structure": Atoms()}, "has no atoms"),
-        ({"calculator": 7}, "is a int"),
+        ({"calculator": 7}, "type int"),
         ({"time": 0.0}, "--time"),
     ],
 )
