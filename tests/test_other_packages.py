@@ -132,7 +132,7 @@ def test_a_potential_of_two_constants(site, tmp_path):
     simulation = mdnum.build("pair/at-cutoff", overrides)
     assert simulation.potential.evaluate(np.float64(4.0))[0] == pytest.approx(0.5 / 2**8)
     assert check_energy(simulation).ok
-    with pytest.raises(InputError, match="strength are missing"):
+    with pytest.raises(InputError, match="strength missing"):
         mdnum.load("pair/at-cutoff", {"potential.kind": "power", "potential.length": 1.0})
     with pytest.raises(InputError, match=r"key sigma; .*length, strength"):
         mdnum.load("pair/at-cutoff", {**overrides, "potential.sigma": 1.0})
@@ -178,7 +178,7 @@ def test_a_gradient_method(site):
             ("w - share", "w + share", "slope … derivative … energy … r = 1, r_cut = 2"),
             ("u - share * r2", "u - share * r2 + 1", "energy jumps … -1 … r_cut … smoothness … 0"),
             ("smoothness = 0", "smoothness = 1", "slope jumps … 0.125 … r_cut … smoothness … 1"),
-            ("smoothness = 0", "smoothness = -1", "smoothness … -1, … energy … not jump"),
+            ("smoothness = 0", "smoothness = -1", "smoothness = -1 … energy is continuous"),
             ("name = ", "nam = ", "has no name"),
         )
     ],
