@@ -136,7 +136,7 @@ def test_a_potential_of_two_constants(site, tmp_path):
         mdnum.load("pair/at-cutoff", {"potential.kind": "power", "potential.length": 1.0})
     with pytest.raises(InputError, match=r"key sigma; .*length, strength"):
         mdnum.load("pair/at-cutoff", {**overrides, "potential.sigma": 1.0})
-    with pytest.raises(InputError, match="with a sigma; power has"):
+    with pytest.raises(InputError, match="power has no sigma"):
         mdnum.load("pair/at-cutoff", {**overrides, "cutoff.in_sigma": 2.5})
 
 
