@@ -1,12 +1,12 @@
 """Constant pressure and temperature: the Martyna-Tobias-Klein barostat and stochastic cell rescaling.
 
-Both barostats change only the volume of the box (`box = "isotropic"`), or all six parameters of its shape
-without a rotation ("full"). Rates and strains are multiples of the unit matrix, stored as numbers, or
-symmetric matrices. The pressure is (2 K + virial) / 3 V with the instantaneous kinetic energy K; the pressure
-tensor is Π / V with Π = Σ m v ⊗ v + Σ r ⊗ F. Volumes are sampled with the weight exp(-(U + p V) / k_B T) dV,
-and matrices h of full boxes with the measure dh / det(h)², det(h) = V. If the total momentum is zero, the
-center of mass does not contribute to the pressure, and the mean volume of an ideal gas is N k_B T / p;
-otherwise it is (N + 1) k_B T / p.
+Each barostat changes either only the volume of the box (`box = "isotropic"`), or all six parameters of the
+box without rotating the box ("full"). A strain or strain rate is stored as a number (a multiple of the unit
+matrix) or as a symmetric matrix. The pressure is (2 K + virial) / 3 V with the instantaneous kinetic energy
+K; the pressure tensor is Π / V with Π = Σ m v ⊗ v + Σ r ⊗ F. Volumes are sampled with the weight exp(-(U + p
+V) / k_B T) dV, and matrices h of full boxes with the measure dh / det(h)², det(h) = V. If the total momentum
+is zero, the center of mass does not contribute to the pressure, and the mean volume of an ideal gas is N k_B
+T / p; otherwise it is (N + 1) k_B T / p.
 """
 
 from __future__ import annotations
@@ -50,39 +50,39 @@ def growth(a: Rate) -> Rate:
 
 
 def invariants(a: Float[Array, "3 3"], square: Float[Array, "3 3"]) -> tuple[Number, Number, Number]:
-    """Return the three coefficients of a³ = first a² - second a + third, from a (3, 3) matrix a and a²."""
+    """Return the coefficients of a³ = first a² - second a + third for a (3, 3) matrix a, given a and a²."""
     first = jnp.trace(a)
     second = 0.5 * (first**2 - jnp.trace(square))
     return first, second, a[0] @ jnp.cross(a[1], a[2])
 
 
 def times(a: Rate, b: Rate) -> Rate:
-    """Return the product of two rates, which are both numbers or both matrices."""
+    """Return the product of two strain rates, given as two numbers or as two matrices."""
     return a @ b if a.ndim else a * b
 
 
 def exponential(a: Rate) -> Rate:
-    """Return exp(a) for a rate a with norm up to 0.5; the result is exactly one if a is zero."""
+    """Return exp(a) for a number or matrix a with norm up to 0.5; the result is exactly one if a is zero."""
     return unit(a) + times(a, growth(a))
 
 
 def unit(a: Rate) -> Rate:
-    """Return one for a rate that is a number, or the unit matrix for a rate that is a matrix."""
+    """Return 1 if a strain rate is a number, or the unit matrix if the strain rate is a matrix."""
     return jnp.eye(3) if a.ndim else jnp.ones(())
 
 
 def trace(a: Rate) -> Number:
-    """Return the trace of a rate; a number stands for a multiple of the (3, 3) unit matrix."""
+    """Return the trace of a strain rate; a number stands for a multiple of the (3, 3) unit matrix."""
     return jnp.trace(a) if a.ndim else 3 * a
 
 
 def matrix(a: Rate) -> Float[Array, "3 3"]:
-    """Return the rate as a matrix of shape (3, 3)."""
+    """Return a strain rate as a matrix of shape (3, 3)."""
     return a if a.ndim else a * jnp.eye(3)
 
 
 def acted(x: Vector, a: Rate, *, fused: bool = False) -> Vector:
-    """Return the product of vectors (as rows) and a rate (number or matrix), in float64.
+    """Return the product of vectors (as rows) and a strain rate (number or matrix), in float64.
 
     Args:
         fused: True to write the product as sums, which XLA fuses with other operations. Fusion is faster
@@ -130,14 +130,14 @@ class Barostat(Integrator):
             raise InputError(message, where="dynamics.kind", remedy="Use nose-hoover, csvr or langevin")
 
     def motion(self, v: Vector, masses: Masses) -> Rate:
-        """Return the kinetic tensor Σ m v ⊗ v, an energy, or a third of its trace for an isotropic box."""
+        """Return the kinetic tensor Σ m v ⊗ v (energy); for an isotropic box, a third of the trace."""
         if not self.anisotropic:
             return 2 * super().kinetic(v, masses) / 3
         v = v.astype(jnp.float64)
         return symmetric(products(v, masses * v))
 
     def excess(self, motion: Rate, at: AtStep) -> Rate:
-        """Return the tensor Π - p V at the set pressure p, or its mean diagonal for an isotropic box."""
+        """Return the tensor Π - p V at the target pressure p; for an isotropic box, the diagonal's mean."""
         virial = at.tensor if self.anisotropic else at.virial / 3
         assert virial is not None
         return motion + 0.5 * (virial + virial.T) - self.pressure * volume(at.cell) * unit(motion)
@@ -152,7 +152,7 @@ def volume(cell: Cell) -> Number:
 
 
 class BoxState(NamedTuple):
-    """Extra state of the integrator `MTK`: rate of the box, thermostat chains and initial volume."""
+    """Extra state of the integrator `MTK`: strain rate of the box, thermostat chains and initial volume."""
 
     rate: Rate  # of the box, one over time
     atoms: Chain  # thermostats of the atoms
@@ -211,7 +211,7 @@ class MTK(Barostat):
         return 0.5 * self.inertia(masses) * jnp.sum(jnp.square(extra.rate)), 6 if self.anisotropic else 1
 
     def _pushed(self, motion, extra, at, time):
-        """Return the state after excess pressure and kinetic energy have acted on the box for a time."""
+        """Return the state after excess pressure and kinetic energy acted on the box for a given time."""
         heat = trace(motion) / self.freedom(at.masses)
         push = self.excess(motion, at) + heat * unit(extra.rate)
         # of an isotropic box the three directions together
@@ -219,7 +219,7 @@ class MTK(Barostat):
         return extra._replace(rate=extra.rate + time * share * push / self.inertia(at.masses))
 
     def _kicked(self, v, extra, at, time):
-        """Return velocities after forces and the friction due to the box rate have acted for a time."""
+        """Return velocities after forces and strain-rate friction have acted for a given time."""
         rate = extra.rate
         slow = -time * (rate + trace(rate) / self.freedom(at.masses) * unit(rate))
         kick = acted(at.acceleration, time * growth(slow), fused=True)
@@ -271,12 +271,12 @@ class CellRescaling(Barostat):
     """Integrator for the isothermal-isobaric ensemble: first-order stochastic cell rescaling with CSVR.
 
     In the middle of the drift, the square root of the volume is propagated by an Euler step with the present
-    forces. The noise of the square root does not depend on the volume. Velocities are scaled inversely to the
-    box (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section II C). In a full box, the traceless strain
-    is also propagated by an Euler step, with noise computed from the geometric mean of the volumes before and
-    after the step (del Tatto, Raiteri, Bernetti, Bussi, Appl. Sci. 12, 1139, 2022). From the probabilities of
-    each step and its reverse, an effective energy (total energy minus heat and work) is computed, which is
-    conserved within the time-step error.
+    forces. The noise added to the square root of the volume does not depend on the volume. Velocities are
+    scaled inversely to the box (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section II C). In a full
+    box, the traceless strain is also propagated by an Euler step, with noise computed from the geometric mean
+    of the volumes before and after the step (del Tatto, Raiteri, Bernetti, Bussi, Appl. Sci. 12, 1139, 2022).
+    From the probabilities of each step and its reverse, an effective energy (total energy minus heat and
+    work) is computed, which is conserved within the time-step error.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,

@@ -96,7 +96,7 @@ class Cell(eqx.Module):
         return volume if volume > 0 else float("nan")
 
     def reach(self, positions: Float[np.ndarray, "atoms 3"]) -> Reach:
-        """Return the magnitudes of coordinates and lattice vectors in displacements, for rounding bounds.
+        """Return the largest coordinates and lattice vectors, from which rounding bounds are computed.
 
         The magnitudes of coordinates along periodic axes follow from the box. Along nonperiodic axes, the
         magnitudes allow for motion of the atoms to twice their present distances.
@@ -176,12 +176,12 @@ class Cell(eqx.Module):
         return self.astype(x.dtype).farthest(moved) + 0.5 * strain_loss(reference, self, r_list)
 
     def farthest(self, moved):
-        """Return the largest length of the minimum images of displacements, float64 (inside jit)."""
+        """Return the length, in float64, of the longest minimum-image displacement (for use inside jit)."""
         d = self.minimum_image(*moved)
         return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
 
     def wrap(self, x, y, z):
-        """Return the components wrapped into the box, and the numbers of lattice vectors subtracted."""
+        """Return the components of wrapped positions, and the numbers of lattice vectors subtracted."""
         if not any(self.pbc):
             zero = np.zeros_like(x) if isinstance(x, np.ndarray) else jnp.zeros_like(x)
             return (x, y, z), (zero, zero, zero)
@@ -211,7 +211,7 @@ def _subtract(lattice, x, y, z, n):
 
 @njit(inline="always")
 def nearest_image(lattice, x, y, z):
-    """Return the minimum image of a displacement in a compiled loop, with the bits of `Cell.minimum_image`.
+    """Return, in compiled code, the minimum image of a displacement, with the bits of `Cell.minimum_image`.
 
     Args:
         lattice: the box as returned by `box_of`, in the dtype of the displacement.
@@ -264,7 +264,7 @@ class HostCell:
     def displacement(
         self, start: Float[np.ndarray, "... 3"], end: Float[np.ndarray, "... 3"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the components of the minimum image of end - start, with the same bits as the force loop."""
+        """Return the components of the minimum image of end - start, bit for bit as in the force loop."""
         start, end = np.asarray(start, self.dtype), np.asarray(end, self.dtype)
         x, y, z = (end[..., k] - start[..., k] for k in range(3))
         if not any(self._lattice[2]):
@@ -275,7 +275,7 @@ class HostCell:
 def wrap_positions(
     cell: Cell, positions: Float[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
-    """Wrap positions, which may be far outside the box; return positions and the images that contained them.
+    """Wrap positions, even from far outside the box; return wrapped positions and lattice shifts.
 
     Error: the first pass subtracts n lattice vectors at once and rounds n*L; a second pass wraps positions
     that are still outside due to this rounding. A wrapped coordinate may equal the edge length L after L is
@@ -296,18 +296,18 @@ def displacement(
     end: Float[np.ndarray, "... 3"],
     dtype: DTypeLike = np.float64,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the components of the minimum image of end - start, with the bits of the force loop."""
+    """Return the components of the minimum image of end - start, bit for bit as in the force loop."""
     return HostCell(cell, dtype).displacement(start, end)
 
 
 def transformed(x, by):
-    """Return the components of positions multiplied, as rows, by a deformation (inside jit)."""
+    """Return the components of positions, as rows, times a deformation matrix (for use inside jit)."""
     # one product: XLA fuses sums that are written out with what makes their operands, again for each row
     return jnp.matmul(by.astype(x.dtype).T, x, precision="highest")
 
 
 def strain_loss(reference: Cell, now: Cell, r_list):
-    """Return a bound on the decrease of a distance of length r_list due to the deformation of the box.
+    """Return an upper bound on the decrease of a distance r_list that a deformation of the box can cause.
 
     The deformation F maps a vector of length r_list to a vector of at least length sigma_min(F) * r_list. A
     neighbor list is complete as long as the bound plus twice the largest displacement relative to the box is

@@ -1,7 +1,7 @@
 """Cutoffs: formulas that truncate, shift or switch a pair potential u(r) at the cutoff radius r_cut.
 
 Every cutoff maps the value u and slope w = du/d(r²) of the bare potential to the value and slope of the cut
-potential, for pairs inside the cutoff. The module `decide` determines which pairs are inside.
+potential, for pairs inside the cutoff. The module `decide` determines which pairs are inside the cutoff.
 
 A cutoff is a class with a formula `cut`, a name and a smoothness. All other parts of the package find the
 class by its name in `CUTOFFS`. A class may also define the independent implementation `reference` and the
@@ -59,11 +59,11 @@ class Cutoff(ABC):
         """
 
     def energy_jump(self, at: AtCutoff):
-        """Return the energy jump as a pair enters: the limit of the cut energy at r_cut from inside."""
+        """Return the energy jump when a pair enters: the limit of the pair energy as r approaches r_cut."""
         return self._limits(at)[0] if self.smoothness < 0 else 0 * at.energy
 
     def force_jump(self, at: AtCutoff):
-        """Return the jump of the radial force (positive: repulsive) as a pair enters, energy per length."""
+        """Return the jump of the radial force when a pair enters, in energy/length; positive if repulsive."""
         return -2 * at.r_cut * self._limits(at)[1] if self.smoothness < 1 else 0 * at.slope
 
     def jumps(self, at: AtCutoff):
@@ -104,7 +104,7 @@ class Cutoff(ABC):
     def enclose(
         self, pull: Callable[[Any], Any], energy: Callable[[Any], Any], at: AtCutoff
     ) -> Callable[[Any], Any]:
-        """Return 2 denergy/d(r²) of the cut potential in ball arithmetic, as a function of the interval r².
+        """Return twice the derivative of the cut potential by r², in ball arithmetic, for an interval of r².
 
         The default method executes the operations of `cut` one by one in ball arithmetic.
 
@@ -136,7 +136,7 @@ _ORDERS = len(_DERIVATIVES) - 1
 
 
 def check(cutoff: type[Cutoff] | Cutoff) -> None:
-    """Check that a cutoff's slope is the derivative of its energy, and its smoothness is as declared.
+    """Check that a cutoff's slope is the derivative of its energy, and that its smoothness is as declared.
 
     The test potentials are u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. Derivatives of the energy with
     respect to r² (nested jvp) are computed at a distance of 2⁻⁴⁶ from r_cut and on both sides of the onset,

@@ -44,7 +44,7 @@ CONVENTIONS = ("r2 <", "r2 <=", "r <", "r <=")
 
 @dataclass(frozen=True)
 class PairDecider:
-    """Decision rule for pairs inside, one of `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` and `r <= r_cut`."""
+    """Decision rule for pairs inside, one of `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
 
     r_cut: tuple[float, ...]  # cutoff of each pair type, length
     compare: str = "r2 <"  # quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <="
@@ -97,7 +97,7 @@ class PairDecider:
         return narrows and len(self.reach.lattice) < 3
 
     def bounds_at(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows types"]:
-        """Return bounds for several states, larger if atoms are beyond `reach` along a nonperiodic axis.
+        """Return margin bounds of several states, larger if atoms are beyond `reach` on a nonperiodic axis.
 
         The rounding error of a position increases with its magnitude; positions are not wrapped along
         nonperiodic axes.
@@ -133,12 +133,12 @@ class PairDecider:
         return root(r2) if self.space == "r" else r2
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
-        """Return r or r², as compared in decisions, on the host; displacements have the decision's dtype."""
+        """Return, on the host, the compared quantity (r or r²) of displacements in the decision's dtype."""
         r2 = dx * dx + dy * dy + dz * dz
         return np.sqrt(r2) if self.space == "r" else r2
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
-        """Return margins (threshold minus r or r²) on the host, positive inside, bitwise as in the decision.
+        """Return margins (threshold minus r or r²; positive inside) on the host, with the decision's bits.
 
         Args:
             displacement: three components, in the dtype of the decision. kind: pair type of each pair.
@@ -147,7 +147,7 @@ class PairDecider:
         return thresholds[kind] - self.host_quantity(*displacement).astype(np.float64)
 
     def inside(self, quantity, value):
-        """Compare quantities with thresholds by the convention; True for pairs inside (jax or numpy)."""
+        """Compare r or r² with thresholds; return True for pairs inside (jax or numpy arrays)."""
         return quantity <= value if self.compare.endswith("<=") else quantity < value
 
 
@@ -199,7 +199,7 @@ def unpacked(half: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
 
 
 class SlotJudge:
-    """Decisions for groups of slots of all atoms, inside jit, with the smallest |margin| of each atom.
+    """Decisions on groups of neighbor slots, made inside jit, with the smallest |margin| of each atom.
 
     Args:
         decider: the comparison that defines a decision.
@@ -241,7 +241,7 @@ class SlotJudge:
         return d, quantity, self.decider.inside(quantity, threshold), threshold
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return decisions for a group of slots as low bits of a byte per atom, and the smallest |margin|."""
+        """Return decisions on a group of slots, as low bits of a byte per atom, and the least |margin|."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         margin = jnp.abs(threshold - quantity)
         for k in range(GROUP):
@@ -250,7 +250,7 @@ class SlotJudge:
         return bits, nearest
 
     def decide(self, tables: Tables) -> Decisions:
-        """Return the decisions for a whole neighbor list, without computing forces."""
+        """Return the decisions on all pairs of a neighbor list, without computing forces."""
 
         def block(nearest, listed):
             _, quantity, inside, threshold = self.group(*listed)

@@ -1,9 +1,9 @@
-"""Neighbor search in XLA on the device, where neighbor lists are built and stored next to the positions.
+"""Neighbor search in XLA; neighbor lists are built and stored on the device that holds the positions.
 
-An atom is compared with the atoms in neighboring bins, in the same order as in `md.host_search`, so that both
-searches build the same table from the same bins. A search copies two numbers to the host: the largest number
-of atoms in a bin, and the largest number of neighbors. Extents of the atoms along nonperiodic axes are also
-copied to the host.
+An atom is compared with the atoms in neighboring bins, in the same order as in `md.host_search`, so that the
+search on the device and the search on the host build the same table from the same bins. A search copies two
+numbers to the host: the largest number of atoms in a bin, and the largest number of neighbors. Extents of the
+atoms along nonperiodic axes are also copied to the host.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class DeviceBuilder:
     def build(
         self, positions: Float[Array | np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[Array, "slots atoms"], Int[Array, "atoms"], int]:
-        """Build a list like `neighbors.ListBuilder.build`; the table and atom order stay on the device."""
+        """Build a neighbor list as `neighbors.ListBuilder.build` does, but keep its arrays on the device."""
         x = jnp.asarray(positions, np.float64).T
         extent, low, high = cell.widths.copy(), np.zeros(3), np.ones(3)
         if not all(cell.pbc):
@@ -90,7 +90,7 @@ def _binned(x, cell: Cell, low, span, bins: _Whole):
 def _searched(
     x, places, cell: Cell, start, r2_list, bins: _Whole, reach: _Whole, room: int, slots: int, blocks: int
 ):
-    """Return the neighbors of every sorted atom, and the largest neighbor count (incomplete if > slots)."""
+    """Return the neighbors of sorted atoms, and the largest neighbor count; if > slots, some are missing."""
     atoms = x.shape[1]
     matrix = cell.matrix
     # layer after layer along the third axis, as the host goes

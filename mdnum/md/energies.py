@@ -130,7 +130,7 @@ class Call:
 
 @jax.custom_jvp
 def _real_slope(x: Array, inverse: Array) -> Array:
-    """Return fractional coordinates with the derivatives of real coordinates, as defined in jax-md."""
+    """Return fractional coordinates with the derivatives of real coordinates, as jax-md does."""
     return x @ inverse
 
 

@@ -81,8 +81,8 @@ class FixedPointUnits:
         """Choose the fixed-point units for a box, a neighbor list radius and a potential.
 
         The position spacing is the smallest power of two for which squared distances of listed pairs are
-        exact. The unit of force is the smallest for which momenta and forces stay in the range of exact sums
-        in every valid run. The unit of momentum is the unit of force times half a time step.
+        exact. The unit of force is the smallest unit for which momenta and forces stay in the range of exact
+        sums in every valid run. The unit of momentum is the unit of force times half a time step.
 
         Args:
             r_list: radius of the neighbor lists, length.
@@ -150,7 +150,7 @@ class FixedPointUnits:
 
 
 def _depth(model: CutPotential) -> float:
-    """Return an energy scale of a pair potential: its depth or, if repulsive, its value near 0.6 r_cut."""
+    """Return an energy scale of a pair potential: its depth, or the energy near 0.6 r_cut if repulsive."""
     r_cut = np.asarray(model.r_cut, np.float64)
     r = r_cut * np.linspace(0.2, 1.0, 400)[:, None]
     energy = np.asarray(model.potential.evaluate(jnp.asarray(r * r))[0])
@@ -166,8 +166,8 @@ class FixedPointDecider(PairDecider):
     """Decision whether a pair is inside the cutoff, by comparison of two integers.
 
     The squared distance is an integer in units of the squared spacing. Every comparison is converted to the
-    form `r2 < limit` with an integer limit. A margin is the difference to a threshold half a unit below the
-    limit, so that margins are never zero and have no rounding error.
+    form `r2 < limit` with an integer limit. The threshold of a margin is half a unit below the limit, so that
+    margins are never zero and have no rounding error.
     """
 
     spacing: float = 1.0  # of positions, length
@@ -179,7 +179,7 @@ class FixedPointDecider(PairDecider):
 
     @property
     def limits(self) -> tuple[int, ...]:
-        """Smallest squared distance of a pair outside the cutoff, in squared spacings, by pair type."""
+        """Smallest squared distance outside the cutoff, in units of the squared spacing, by pair type."""
         unit = Fraction(self.spacing) ** 2
         square = self.compare.startswith("r2")
         exact = [(Fraction(r * r) if square else Fraction(r) ** 2) / unit for r in self.r_cut]
@@ -187,7 +187,7 @@ class FixedPointDecider(PairDecider):
 
     @property
     def thresholds(self) -> tuple[Threshold, ...]:
-        """Thresholds of squared distances by pair type, half a squared spacing below `limits`, as doubles."""
+        """Thresholds of squared distances by pair type, as doubles: half a squared spacing below `limits`."""
         unit = self.spacing * self.spacing
         return tuple(Threshold((limit - 0.5) * unit, "<", "r2") for limit in self.limits)
 
@@ -244,7 +244,7 @@ class FixedPointStep(Integrator):
         return jnp.where(jnp.abs(p) < _LARGEST, p * (self.impulse / masses), jnp.nan)
 
     def kick(self, v, time, acceleration, masses):
-        """Return velocities after an acceleration has acted for a time, with momenta rounded to integers."""
+        """Return velocities after an acceleration for a given time, with momenta rounded to integers."""
         push = jnp.round(time * acceleration * (masses / self.impulse))
         return self.velocity(self.momentum(v, masses) + push, masses)
 
@@ -257,7 +257,7 @@ class FixedPointStep(Integrator):
 
     @abstractmethod
     def drift(self, x, v, extra, masses, step, order):
-        """Advance positions, velocities and extra state as in `begin`, after the kick."""
+        """Make the part of `begin` after the kick: advance positions, velocities and extra state."""
 
     @abstractmethod
     def undrift(self, x, v, extra, masses, step, order):
@@ -402,7 +402,7 @@ _ROUND_BITS = int(np.float64(_ROUND).view(np.int64))
 
 @jax.custom_jvp
 def counted(x: Float[Array, "*shape"], zero: jax.Array) -> jax.Array:
-    """Return the integers nearest to numbers below 2^51, plus `_ROUND_BITS`, by a single addition."""
+    """Round numbers below 2^51 to integers by a single addition; return the integers plus `_ROUND_BITS`."""
     return lax.bitcast_convert_type(fence(x, zero) + _ROUND, jnp.int64)
 
 
@@ -450,7 +450,7 @@ class FixedPointJudge(SlotJudge):
         return d, r2, r2 < limit, limit
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return decisions for a group of slots as low bits of a byte per atom, and the smallest |margin|."""
+        """Return decisions on a group of slots, as low bits of a byte per atom, and the least |margin|."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         left = threshold - quantity
         away = jnp.maximum(left, 1 - left)
@@ -468,7 +468,7 @@ class FixedPointJudge(SlotJudge):
 
 
 class FixedPointForce(PairForce):
-    """Forces and decisions of a cut pair potential in fixed-point numbers."""
+    """Forces and decisions of a pair potential with a cutoff, in fixed-point numbers."""
 
     units: FixedPointUnits = eqx.field(static=True, kw_only=True)  # the units
     # squared distance below which a pair leaves the range of exact sums
@@ -478,7 +478,7 @@ class FixedPointForce(PairForce):
     def on(
         cls, units: FixedPointUnits, model: CutPotential, cell: Cell, decider, policy, reduction
     ) -> FixedPointForce:
-        """Make the force with parameters in float64; `reduction` has no effect, since sums are exact."""
+        """Make the force object in float64; `reduction` has no effect, since sums are exact."""
         return cls(
             model.astype(np.float64),
             cell.astype(np.float64),
@@ -502,7 +502,7 @@ class FixedPointForce(PairForce):
         return FixedPointJudge(self.decider, self.thresholds, self.cell, self.zero, positions, self.units)
 
     def decide(self, positions, tables):
-        """Return the decisions of a neighbor list from integer distances."""
+        """Return the decisions on all pairs of a neighbor list, made from integer distances."""
         return self.judge(positions).decide(tables)
 
     def __call__(self, positions, tables, *, decisions, tensor=False, given=None, where=None):

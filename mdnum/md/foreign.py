@@ -128,7 +128,7 @@ def buffer(typingctx: Any, buffers: Any, k: Any) -> Any:
 
 @njit
 def asked_to_run(frame):
-    """Return True for a request of execution; answer a request for the version, ignore other requests."""
+    """Return True if XLA requests execution; answer a request for the version, and ignore all others."""
     asked = peek(frame, 1)
     if asked != 0 and peek(asked, 1) & 0xFFFFFFFF == 1:
         # for which version of the interface was this written?

@@ -160,7 +160,7 @@ def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
 
 @njit
 def _within(x, y, z, xi, yi, zi, r2_list, mask):
-    """Set the mask of the candidate atoms within the list radius of an atom."""
+    """Set the mask that marks candidate atoms within the list radius of an atom."""
     for k in range(len(x)):
         dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         mask[k] = dx * dx + dy * dy + dz * dz <= r2_list
@@ -168,7 +168,7 @@ def _within(x, y, z, xi, yi, zi, r2_list, mask):
 
 @njit
 def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
-    """Set the mask of candidates within the list radius, for a box with a single bin along an axis."""
+    """Set the mask that marks candidates within the list radius, in a box with a single bin along an axis."""
     for k in range(len(x)):
         dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         f = np.rint(dx * inverse[0, 0] + dy * inverse[1, 0] + dz * inverse[2, 0])
@@ -258,7 +258,7 @@ def _fill(x, layered, box, inverse, start, r2_list, table, columns):
 
 
 def grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
-    """Return the number of bins along each axis, and the range of the search in bins."""
+    """Return the number of bins along each axis, and the search range as a number of bins."""
     bins = np.ones(3, np.int64)
     reach = np.zeros(3, np.int64)
     for k in range(3):
@@ -348,7 +348,7 @@ _using = threading.Lock()
 
 
 def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
-    """Return aligned memory for a neighbor table, reusing memory if possible; on a CPU, XLA need not copy it.
+    """Return aligned memory for a table of neighbors, which XLA on a CPU can use without making a copy.
 
     For a million atoms, the table needs half a gigabyte, whose allocation takes longer than a search.
     """

@@ -1,4 +1,4 @@
-"""Integrators, which update the state between two force evaluations, and the time step that uses them.
+"""Integrators, which update the state between two force evaluations, and the function for a time step.
 
 A step evaluates the forces at x_s and completes the previous step (`finish`), which gives full-step
 velocities v_s. The first half of the next step (`begin`) gives the positions x_{s+1}. The state between steps
@@ -144,7 +144,7 @@ class Integrator(eqx.Module):
 
     @property
     def random(self) -> Any:
-        """Random key as an array; None for an integrator without noise; any object inside eqx.tree_at."""
+        """Random key, as an array; None without noise; inside eqx.tree_at, the key may be any object."""
         field = self.keys().get("seed")
         return None if field is None else getattr(self, field.name)
 
@@ -186,7 +186,7 @@ class Integrator(eqx.Module):
 
     @abstractmethod
     def begin(self, x: Vector, v: Vector, extra: Any, at: AtStep) -> tuple[Vector, Vector, Any, Number]:
-        """Begin a step; return positions, velocities and extra state for the next forces, and absorbed heat.
+        """Begin a step; return the positions, velocities and extra state of the next step, and heat absorbed.
 
         Args:
             x, v: sorted positions and full-step velocities.
@@ -196,7 +196,7 @@ class Integrator(eqx.Module):
         """Return the deformation of the box before the next force evaluation; the default is no deformation.
 
         The method `deform` is called after `begin`. Lattice vectors and positions, as rows, are multiplied by
-        the deformation; `begin` must make only the motion relative to the box.
+        the deformation; `begin` must move the atoms only relative to the box.
 
         Args:
             v, extra: sorted velocities and extra state, as returned by `begin`.
@@ -234,7 +234,7 @@ class Integrator(eqx.Module):
         return False
 
     def exchanged(self, extra: Any, at: AtStep) -> tuple[Number | float, Number | float]:
-        """Return the energies transferred to the atoms so far: heat from the thermostat, and work of the box.
+        """Return the energies transferred to the atoms so far: thermostat heat, and work done by the box.
 
         The total energy minus heat and work, and minus the heat returned by `begin`, is conserved.
         """
@@ -318,7 +318,7 @@ class KickDrift(Integrator):
             )
 
     def kick(self, v: Vector, time: Number, acceleration: Vector) -> Vector:
-        """Return velocities after an acceleration has acted for a time."""
+        """Return velocities after an acceleration has acted for a given time."""
         return v + time * acceleration
 
     def finish(self, v, extra, at, time):
@@ -333,11 +333,11 @@ class KickDrift(Integrator):
     def drift(
         self, x: Vector, v: Vector, masses: Masses, step: Step, order: Order
     ) -> tuple[Vector, Vector, Number]:
-        """Advance positions and velocities as in `begin`, after the kick, by a function linear in x and v."""
+        """Make the part of `begin` after the kick, which must be linear in positions and velocities."""
 
 
 def without_kick(integrator: Integrator) -> str | None:
-    """Return the reason why derivatives of kick and drift are invalid for an integrator; None if valid."""
+    """Return why derivatives of an integrator's kick and drift are invalid; None if they are valid."""
     if type(integrator) in (VelocityVerlet, Langevin):
         return None
     if isinstance(integrator, KickDrift) and _is_linear(integrator):
@@ -363,7 +363,7 @@ def check_one_box(integrator: Integrator, what: str) -> None:
 
 
 def _is_linear(integrator: KickDrift) -> bool:
-    """Return True if the derivative of the drift, by positions and velocities, is equal at two states."""
+    """Return True if the drift has the same derivatives by positions and velocities at two states."""
     x, v, dx, dv = jax.random.normal(jax.random.key(0), (4, 3, 4), jnp.float64)
     zero, order = jnp.zeros((), jnp.int64), jnp.arange(4)
 

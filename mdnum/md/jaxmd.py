@@ -133,7 +133,7 @@ def scalar(value: float | np.ndarray) -> Float[Array, ""]:
     """Convert a number to a float64 jax array, the only type that jax-md does not round to float32.
 
     Even with x64 enabled, jax_md.util.maybe_downcast converts Python floats, numpy floats and numpy arrays to
-    float32, but no float64 jax arrays. Apply `scalar` to every sigma, epsilon, r_onset and r_cutoff.
+    float32, but not float64 jax arrays. Apply `scalar` to every sigma, epsilon, r_onset and r_cutoff.
     """
     return jnp.asarray(value, jnp.float64)
 

@@ -151,7 +151,7 @@ def over_pairs(
 
 
 def left_out(potential: Any) -> str | None:
-    """Return jax's name of the operation that excludes a potential from the loop; None if there is none."""
+    """Return jax's name of an operation that the loop does not support; None if all are supported."""
     return _LEFT_OUT.get(jax.tree.structure(potential))
 
 
@@ -682,7 +682,7 @@ def _filled(out_at, n, value):
 
 @njit
 def _interleaved(columns_at, columns, atoms, table_at, apart):
-    """Write the data of one atom after the other to a table, and NaN for the index of padding."""
+    """Write the data of all atoms to a table, atom by atom, and a row of NaN for padding entries."""
     of = carray(pointer(columns_at), (columns * atoms,), np.float64)
     table = carray(pointer(table_at), ((atoms + 1) * apart,), np.float64)
     for k in range(atoms):
@@ -709,7 +709,7 @@ _USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _WORD, _TABLE, _THREADS, _ASKED, _NEAREST
 
 @njit
 def _work(job):
-    """Process blocks of atoms of a job, one after the other, until none is left."""
+    """Process blocks of atoms of a job, one after the other, until no block is left."""
     block, blocks = added(job + 8 * _NEXT, 1), peek(job, _BLOCKS)
     if block >= blocks:
         return

@@ -73,7 +73,7 @@ class PairForce(eqx.Module):
 
     @classmethod
     def create(cls, model: Any, cell: Cell, decider: PairDecider, policy, reduction) -> PairForce:
-        """Make the force, with parameters and box in the dtypes of the precision policy."""
+        """Make the force object, with parameters and box in the dtypes of the precision policy."""
         return cls(
             model.astype(policy.dtype("force")),
             cell.astype(np.float64),
@@ -216,7 +216,7 @@ class PairForce(eqx.Module):
         decisions: bool,
         tensor: bool = False,
     ) -> Forces:
-        """Return the forces as `__call__` does, for any precision, order of summation and device."""
+        """Return the same forces as `__call__`, for any precision, order of summation and device."""
         judge, terms_of = self.judge(positions), self._terms(tensor)
         geometry, accumulate = self.policy.geometry, self.policy.dtype("accumulate")
         same = self.policy.dtype("decision") == geometry
@@ -411,8 +411,8 @@ VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 def products(a: Float[Array, "_ atoms"], b: Float[Array, "_ atoms"]) -> Float[Array, "6"]:
     """Return the sums over atoms of a_i b_j in Voigt order, of the first three rows of a and b.
 
-    Eight partial sums are added at a time, which XLA computes in vectors: at 4,000 atoms in a third of the
-    time of sequential sums.
+    Eight partial sums are added at a time, which XLA does in vectors; for 4,000 atoms, this takes a third of
+    the time of sequential sums.
     """
     pieces = [jnp.pad(one[:3], ((0, 0), (0, -one.shape[1] % 8))).reshape(3, 8, -1) for one in (a, b)]
     sums = [reduce(add, (pieces[0][i, k] * pieces[1][j, k] for k in range(8))) for i, j in VOIGT]
@@ -442,7 +442,7 @@ class ManyBodyForce(eqx.Module):
 
     @classmethod
     def create(cls, potential, cell: Cell, decider: PairDecider, policy: PrecisionPolicy) -> ManyBodyForce:
-        """Make the force, with the box as jax arrays and parameters in the force dtype."""
+        """Make the force object, with the box as jax arrays and parameters in the force dtype."""
         zero, dtype = zero_bits(policy.dtype("decision")), policy.dtype("force")
         if dtype != np.float64:
             potential = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, potential)

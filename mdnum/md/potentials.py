@@ -273,14 +273,14 @@ class PairFunction(PairPotential):
 
 
 def _is_by_type(value: Any) -> bool:
-    """Return True for a parameter per pair type: a number, or a number for each pair of species."""
+    """Return True for a parameter that is one number, or has a number for each pair of species."""
     if isinstance(value, Mapping):
         return bool(value) and all(isinstance(key, str) and "-" in key for key in value)
     return isinstance(value, int | float | np.generic) or (eqx.is_array_like(value) and np.ndim(value) == 0)
 
 
 def _is_by_species(value: Any) -> bool:
-    """Return True for a parameter per species: numbers by chemical symbol."""
+    """Return True for a parameter that has a number for each chemical symbol."""
     return (
         isinstance(value, Mapping)
         and bool(value)
@@ -336,7 +336,7 @@ class Together(Cutoff):
         return zip(self.ends, (AtCutoff(at.r_cut, *own) for own in rest), strict=True)
 
     def cut(self, r2, u, w, at, weights=None):
-        """Return the sum of `Cutoff.cut` over terms; weights: one factor for each term, None for 1."""
+        """Return the sum of `Cutoff.cut` over all terms, each times its weight (1 if `weights` is None)."""
         rows = zip(self._each(at), u, w, strict=True)
         made: list[Any] = [end.cut(r2, energy, slope, own) for (end, own), energy, slope in rows]
         for k, weight in enumerate(weights or ()):
@@ -348,7 +348,7 @@ class Together(Cutoff):
 
 
 class CutPotential(eqx.Module):
-    """Pair potential with its cutoff, or a sum of such terms with a common pair decision."""
+    """Pair potential with its cutoff, or a sum of pair potentials with a common pair decision."""
 
     potential: PairPotential  # bare potential, parameters per pair type
     cutoff: Cutoff = eqx.field(static=True)  # how it ends
@@ -375,7 +375,7 @@ class CutPotential(eqx.Module):
 
     @property
     def rows(self) -> list[tuple[str, PairPotential, Cutoff, Any, Any]]:
-        """For each term: name ("" if single), bare potential, cutoff, onset, and weights or None."""
+        """All terms: name ("" for a single term), bare potential, cutoff, onset, and weights (or None)."""
         # eqx.tree_at looks at a tree whose empty tuples are leaves
         weights = self.weights if isinstance(self.weights, tuple) else ()
         if not isinstance(self.potential, SumPotential) or not isinstance(self.cutoff, Together):
@@ -421,7 +421,7 @@ class CutPotential(eqx.Module):
         return self.cutoff.cut(r2, u, w, here, *weights)
 
     def jumps(self) -> Float[np.ndarray, "2 terms types"]:
-        """Return energy jump and radial force jump as a pair of weight 1 enters, per term and pair type."""
+        """Return energy and radial force jumps when a pair of weight 1 enters, by term and pair type."""
         # in numpy: to jax each operation on these few numbers is a program to compile
         made = self.cutoff.jumps(jax.tree.map(np.asarray, self).at_cutoff())
         return np.array(made).swapaxes(0, 1)
@@ -482,7 +482,7 @@ class Channels(eqx.Module):
         return jnp.concatenate([part.r_cut for part in self.parts])
 
     def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
-        """Return energy jump and radial force jump as a pair enters, by term, channel and pair type."""
+        """Return energy and radial force jumps when a pair enters, by term, channel and pair type."""
         sides = zip(*(part.jumps() for part in self.parts), strict=True)
         return np.stack([np.asarray(block_diag(*one)) for one in sides])
 

@@ -1,4 +1,4 @@
-"""Thermostats that scale all velocities by one factor: Nosé-Hoover chains and stochastic rescaling.
+"""Thermostats that scale all velocities by one factor (Nosé-Hoover chains, stochastic rescaling).
 
 A total momentum of zero stays zero, which reduces the number of degrees of freedom and affects the
 temperature (`Integrator.freedom`). The extra states of thermostats are always float64. Velocities are scaled
@@ -67,7 +67,7 @@ class Chain(NamedTuple):
         return scale, Chain(jnp.stack(rate), jnp.stack(way))
 
     def energy(self, freedom: int | Number, kT: Number, relaxation: Number) -> Number:
-        """Return the energy of all links (eq. 2.8 of Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635)."""
+        """Return the energy of the chain (eq. 2.8 of Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635)."""
         shares = jnp.ones(len(self.rate)).at[0].set(freedom)
         return kT * jnp.sum(shares * (0.5 * jnp.square(relaxation * self.rate) + self.way))
 

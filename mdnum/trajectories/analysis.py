@@ -1,9 +1,9 @@
 """Analysis of flips as an MDAnalysis class, `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
 
-Frames may be distributed over processes. A flip is found by comparing two successive frames, so each process
-also reads the frame before its first frame. No flip is lost at a process boundary, and the results are
-bitwise identical to those of a single process. If two processes find different pairs at a shared frame, an
-error is raised.
+Frames may be distributed over processes. A flip is found by comparing two successive frames, so that each
+process also reads the frame before its first frame. No flip is lost at a process boundary, and the results
+are bitwise identical to those of a single process. If two processes find different pairs at a shared frame,
+an error is raised.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class RuleResult:
 
 @dataclass
 class _ProcessPart:
-    """Results of one process for one membership rule; frame 0 is the first frame that this process reads."""
+    """Results of one process for one membership rule; frame 0 is the first frame that the process reads."""
 
     flips: list[FlipTable] = field(default_factory=lambda: [FlipTable.none()])  # of frames that have any
     rows: list[tuple[int, int, float]] = field(default_factory=list)  # (pairs, near, smallest margin)
@@ -104,13 +104,13 @@ class NeighborFlips(AnalysisBase):
 
     After `run` with one rule, `results` has all attributes of `RuleResult` (`flips`, `pairs`, `near`,
     `min_margin`, `initial`, `last`, `contacts`, `occupancy`). With several rules, each element of
-    `results.rules` is a `RuleResult`. Tables have a method `to_pandas()`. With by="residue", pairs are pairs
-    of residues, i and j are rows of `results.residues`, and `results.left_out` counts the excluded atoms.
-    `results.resolution` is the resolution of positions in the file, and `results.bound` is the resulting
-    error bound of a distance, per frame. `results.repeats` lists the frames that repeat earlier frames (see
-    `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first frame and a reason
-    (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and times of the frames
-    analyzed; `FlipTable.frame` is an index into both.
+    `results.rules` is a `RuleResult`. Tables have a method `to_pandas()`. With by="residue", the pairs are
+    pairs of residues, `i` and `j` are row numbers of `results.residues`, and `results.left_out` counts the
+    excluded atoms. `results.resolution` is the resolution of positions in the file, and `results.bound` is
+    the resulting error bound of a distance, per frame. `results.repeats` lists the frames that repeat earlier
+    frames (see `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first frame
+    and a reason (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and times of the
+    frames analyzed; `FlipTable.frame` is an index into both.
 
     If a frame cannot be read or contains impossible values, an error with the frame number is raised; the
     results of all earlier frames are kept.
@@ -395,7 +395,7 @@ def _changed(before: Frame, after: Frame) -> float:
 
 
 def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
-    """Concatenate the results of all processes, renumbering frames from the first frame of the analysis."""
+    """Concatenate the results of all processes, and number frames from the first frame of the analysis."""
     tables, done, last = [FlipTable.none()], 0, None
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):

@@ -1,4 +1,4 @@
-"""Trajectories in memory: frames as arrays of numpy, jax or torch, passed one after another by a program.
+"""Trajectories in memory: a program passes frames, one after another, as numpy, jax or torch arrays.
 
 ASE, vesin and torch-sim store lattice vectors as rows of a matrix (`cell`); jax-md stores them as columns of
 an upper triangular matrix (`box`), and often stores positions as fractions of the box.
@@ -52,7 +52,7 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
 
 
 class ArrayFrames(Trajectory):
-    """Trajectory of frames passed one by one by a program; each frame is kept until the next is examined.
+    """Trajectory of frames that a program passes one by one; each is kept until the next one is examined.
 
     Args:
         name: name of the frames on a results page.
@@ -178,7 +178,7 @@ class ArrayFrames(Trajectory):
         return self._waiting[0]
 
     def sample(self) -> list[Frame]:
-        """Return the first frames, as many as are available so far."""
+        """Return the first frames of the trajectory that are available so far."""
         return list(self._first)
 
     @contextmanager

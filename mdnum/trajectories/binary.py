@@ -6,8 +6,8 @@ compressed stream contains the number of bits of each atom's coordinates, so tha
 atoms, the bit counts and the length can be verified without decoding. File damage that leaves a valid stream
 is not detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
 
-MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. These readers write the index
-through symbolic links, and trust an index file even if it belongs to another trajectory; this module uses no
+MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. MDAnalysis writes the index
+through symbolic links, and use an index file even if it belongs to another trajectory; this module uses no
 index file. Source of the trr format: GROMACS, trrio.
 """
 
@@ -83,7 +83,7 @@ class XdrFile:
         return number
 
     def ends_at(self, number: int) -> bool:
-        """Return True if the file ends directly before the frame with the given number."""
+        """Return True if the file ends exactly where the frame with the given number would begin."""
         return self.start(number) == self._size
 
     def start(self, number: int) -> int:
@@ -102,7 +102,7 @@ class XdrFile:
         self.start(number + 1)
 
     def _stream(self, number: int, look: bool = False) -> None:
-        """Move the file position to the end of a frame; if `look` is true, also verify the coordinates."""
+        """Move the file position to the end of a frame; if `look` is true, verify the coordinates first."""
         raise NotImplementedError
 
     def _read(self, count: int) -> bytes:
@@ -237,7 +237,7 @@ class TrrFile(XdrFile):
         return 8 * self.head(0)[1]
 
     def head(self, number: int) -> tuple[int, int, list[int]]:
-        """Read a frame header up to the time: (atoms, bytes per number, bytes of the ten blocks)."""
+        """Read a frame header up to the time; return (atoms, bytes per number, bytes of the ten blocks)."""
         self._file.seek(self.start(number))
         magic, _, _, word, *numbers = _TRR.unpack(self._read(_TRR.size))
         sizes, atoms, box = numbers[:10], numbers[10], numbers[_BOX]

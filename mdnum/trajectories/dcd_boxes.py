@@ -48,7 +48,7 @@ def conventions(cell: Float[np.ndarray, "6"]) -> dict[str, Float[np.ndarray, "3 
 
 
 class DcdBoxes:
-    """Lattice vectors of a DCD file, by the box convention that is consistent with the positions.
+    """Lattice vectors of a DCD file, in the box convention that is consistent with the positions.
 
     Attributes:
         convention: name of the chosen convention; None if no examined box depends on the choice.
@@ -99,7 +99,7 @@ class DcdBoxes:
         return vectors if any(np.allclose(one, ts.dimensions[:3], rtol=1e-5) for one in lengths) else None
 
     def instead(self, number: int) -> Float[np.ndarray, "3 3"] | None:
-        """Return the lattice vectors of a frame by the second fitting convention, or None."""
+        """Return the lattice vectors of a frame by the second convention that fits, or None."""
         return self._vectors(number, self.other)
 
     def _vectors(self, number: int, convention: str | None) -> Float[np.ndarray, "3 3"] | None:

@@ -71,8 +71,8 @@ def _usable(
 ) -> Iterator[tuple[list[Frame], Any]]:
     """Yield (next frame of each file, result of `step`) until a file ends or a frame is unusable.
 
-    All rules process a frame before any of its results are stored, so that a frame rejected by one rule does
-    not enter the ledger of another rule.
+    All membership rules process a frame before any results are stored, so that a frame rejected by one rule
+    does not enter the ledger of another rule.
 
     Raises:
         InputError: the first frame cannot be read or used, so there are no results to keep.
@@ -170,7 +170,7 @@ def follow(
     trajectory: Trajectory, rules: Sequence[Rule], groups: Groups, resolution: Resolution, sink: Sink,
     residues: ByResidue | None = None,
 ) -> Iterator[Pass]:  # fmt: skip
-    """Read the frames once, and send table rows to the sink: "members", "flips", "frames" and "motion".
+    """Read frames once; send rows of the tables "members", "flips", "frames" and "motion" to the sink.
 
     If `residues` is given, pairs are pairs of residues, but groups still contain atoms. The same `Pass` is
     yielded after each frame, and iteration may stop at any frame. Memory use does not grow with the number of
@@ -251,7 +251,7 @@ def _hand_on(
 
 
 def _threshold(rule: Rule, members: Members) -> tuple[float, bool]:
-    """Return (typical threshold distance of a pair, True if the order of distances defines neighbors)."""
+    """Return a pair's typical threshold distance, and True if the order of distances defines neighbors."""
     if isinstance(rule, CutoffRule | SpeciesCutoffs):
         return rule.reach, False
     if not len(members):
@@ -282,7 +282,7 @@ def _measure_flux(one: Followed, frame: Frame, groups: Groups, species: list[str
 
 @dataclass
 class SetDifference:
-    """Pairs (i, j, rank) that are neighbors in only one of two trajectories, updated with flips of both."""
+    """Pairs (i, j, rank) that are neighbors in only one of two trajectories, updated by the flips of each."""
 
     only_a: set[Pair] = field(default_factory=set)
     only_b: set[Pair] = field(default_factory=set)
@@ -328,7 +328,7 @@ def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[
 
 @dataclass
 class ComparedSide:
-    """One of two compared trajectories, with its tracker, resolution and error bounds."""
+    """One of two trajectories to compare, with its tracker, resolution and error bounds."""
 
     trajectory: Trajectory
     tracker: Tracker
@@ -486,7 +486,7 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 def _apart(
     found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
 ) -> tuple[Separation, float]:
-    """Return (separation, the separation that file resolution can explain), both without a common shift.
+    """Return the separation without a common shift, and the separation that file resolution can explain.
 
     A shift common to all atoms is removed only if it explains nearly all of the separation. A shift can
     result from different origins of two files, or from removal of center-of-mass motion in one file.

@@ -1,7 +1,7 @@
 """One frame of a trajectory in float64, and checks for values that no simulation can produce.
 
 Formats with plain floats (dcd, trr, netcdf) accept any bytes as coordinates; file damage often produces a
-huge coordinate. Unless the frame is rejected, a huge coordinate increases the rounding bound of every pair.
+huge coordinate. If the frame is not rejected, a huge coordinate increases the rounding bound of every pair.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ def far_out(
     bits: int = 64,
     before: Float[np.ndarray, "some 3"] | None = None,
 ) -> tuple[int, int, str] | None:
-    """Return the most distant atom if its distance is impossibly large; arguments as in `FrameCheck`.
+    """Return the most distant atom if its distance is impossibly large; for arguments, see `FrameCheck`.
 
     The system size is also estimated from positions one frame earlier, since a frame may be damaged.
 
@@ -237,7 +237,7 @@ def far_out(
 def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, float] | None:
     """Return the atom with the largest displacement since the previous frame, if impossibly large.
 
-    A jump by a lattice vector, when one atom or all atoms are wrapped into the box, does not count.
+    A jump by a lattice vector, as when atoms are wrapped into the box, does not count as a displacement.
 
     Returns:
         (the atom, the length of its displacement); None if no displacement is impossible.

@@ -1,4 +1,4 @@
-"""History of every pair over the frames: flips, contacts, and the flips still found at larger strides.
+"""History of every pair over the frames: flips, contacts, and flips that are found at larger strides.
 
 From the counts at several strides, the module `lost` estimates the number of flips missed between frames.
 """
@@ -95,7 +95,7 @@ class History:
 
 
 def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return (indices that sort rows stably by all columns, mask of the first sorted row of each group)."""
+    """Return indices that sort rows stably by all columns, and a mask of the first row of each group."""
     if not len(columns[0]):
         return np.zeros(0, np.int64), np.zeros(0, bool)
     sizes = [int(column.max()) + 1 for column in columns]
@@ -172,7 +172,7 @@ def mended(stays: Contacts, gap: int) -> Contacts:
 
 @dataclass(frozen=True)
 class Strides(Sums):
-    """Number of flips that are still found if only every nth frame is examined."""
+    """Number of flips that are found if only every nth frame is examined."""
 
     _common = ("stride",)
 
@@ -198,7 +198,7 @@ class Strides(Sums):
 
     @property
     def share(self) -> Float[np.ndarray, "strides"]:
-        """Fraction of the flips that are still found at each stride; nan if there are no flips."""
+        """Fraction of the flips that are found at each stride; nan if there are no flips."""
         return np.divide(self.flips, self.of, out=np.full(len(self.of), np.nan), where=self.of > 0)
 
 

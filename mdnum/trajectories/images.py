@@ -23,7 +23,7 @@ _TOGETHER, _APART = 1_000_000, 256
 
 
 def pair_keys(i: np.ndarray, j: np.ndarray, shifts: np.ndarray, atoms: int) -> Int[np.ndarray, "pairs"]:
-    """Return an integer key for each pair (i, j), or for each image (i, j, shift) if shifts have columns."""
+    """Return an integer key for each pair (i, j) or, if `shifts` has columns, each image (i, j, shift)."""
     keys = i * np.int64(atoms) + j
     for column in shifts.T:
         keys = keys * _APART + column % _APART
@@ -41,8 +41,8 @@ def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
 def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
     """Return the lattice shifts of images given by rank: the image of j is at x[j] + shift @ box.
 
-    ASE, vesin and jax-md define shifts in the same way. An atom's own images come in ± pairs; the shift whose
-    first nonzero component is positive is returned.
+    ASE, vesin and jax-md define shifts in the same way. Of the two opposite images of an atom itself, the
+    shift with a positive first nonzero component is returned.
 
     Args:
         pairs: object with arrays i, j, rank and distance, such as `Members`.

@@ -2,8 +2,8 @@
 
 Lattice vectors are reduced first, so that a search in a skewed box is as fast as in the compact box with the
 same lattice. Every decision is based on the length of (x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2, computed in
-this order from stored coordinates x, i < j, integers s and reduced vectors a. A pair decision therefore does
-not depend on the search algorithm that found the pair.
+this order from stored coordinates x, i < j, integers s and reduced vectors a. A pair decision does not depend
+on the search algorithm that found the pair.
 
 For a search, the reduced box is divided into bins. Coordinates along a nonperiodic direction are folded onto
 a limited number of bins, so that a distant atom does not enlarge the grid. For each bin, the atoms of all
@@ -35,7 +35,7 @@ INSIDE, DIRECTED = 0, 2
 
 
 class ReducedLattice(NamedTuple):
-    """Properties of a box needed by a neighbor search, as a tuple that compiled loops accept."""
+    """Properties of a box that a neighbor search needs, in a tuple that compiled loops accept."""
 
     vectors: Float[np.ndarray, "3 3"]  # reduced, as rows, length; zero along directions that do not repeat
     periodic: Bool[np.ndarray, "3"]  # which rows repeat
@@ -104,7 +104,7 @@ def _reduced(rows: bytes, periodic: bytes) -> ReducedLattice:
 def shortest(
     moved: Float[np.ndarray, "atoms 3"], box: Box
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """Return (displacements to the nearest image, numbers of lattice vectors removed).
+    """Return displacements to nearest images, and the numbers of lattice vectors subtracted.
 
     Displacements are correct for atoms that moved by less than half the width of the box. If the box is
     invalid, displacements are returned unchanged.
@@ -118,7 +118,7 @@ def shortest(
 
 
 def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
-    """Return squared lengths, ascending, of the lattice vectors up to `radius`, with one of each ± pair."""
+    """Return squared lengths, ascending, of lattice vectors up to `radius`, one of each opposite pair."""
     if not lattice.periodic.any() or radius < lattice.narrowest * (1 - 1e-9):
         return np.zeros(0)
     vectors, most = lattice.vectors, np.where(lattice.periodic, radius / lattice.widths + 1, 0).astype(int)
@@ -175,9 +175,9 @@ def near_squares(x, i, j, lattice, y, squares):
 
 @njit
 def image_square(x, i, j, rank, lattice):
-    """Return the squared distance to the image of j that has `rank` nearer images; inf if there is none.
+    """Return the squared distance to the image of j that has `rank` nearer images; inf if it is missing.
 
-    Atoms have i < j, or i == j for images of an atom itself, of which one of each ± pair is counted.
+    Indices satisfy i < j, or i == j for images of an atom itself; of two opposite images, one is counted.
     """
     vectors, periodic, widths = lattice.vectors, lattice.periodic, lattice.widths
     # the image that rounding names; nearest where that is near enough
@@ -347,7 +347,7 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
 
 
 def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[np.ndarray, "3"]):
-    """Return (numbers of bins, reach of a search in bins, width of a bin), each along the three axes.
+    """Return, for each of the three axes, the number of bins, the search range in bins, and the bin width.
 
     The number of bins is at most about twice the number of atoms. `extent` is the extent of the atoms along
     each nonperiodic axis, in length units.
@@ -379,7 +379,7 @@ def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[n
 
 @njit
 def wrap(x, lattice, bins, step):
-    """Wrap all atoms; return wrapped positions, numbers of lattice vectors removed, and bins of the atoms."""
+    """Wrap atoms; return wrapped positions, numbers of lattice vectors subtracted, and each atom's bin."""
     wrapped, home, bin_of = np.empty(x.shape), np.empty(x.shape, np.int64), np.empty(x.shape[0], np.int64)
     vectors, inverse, periodic = lattice.vectors, lattice.inverse, lattice.periodic
     for i in range(x.shape[0]):
@@ -436,7 +436,7 @@ def lattice_vector(code):
 
 @njit
 def _run(d0, d1, d2, b0, b1, b2, bins, last):
-    """Return a contiguous run of bins at offset d from a bin: lattice vector, first and last bin, next d2."""
+    """Return a run of adjacent bins at offset d from a bin: lattice vector, first and last bin, next d2."""
     n0, n1, n2 = (b0 + d0) // bins[0], (b1 + d1) // bins[1], (b2 + d2) // bins[2]
     c0, c1, low = b0 + d0 - n0 * bins[0], b1 + d1 - n1 * bins[1], b2 + d2 - n2 * bins[2]
     high = min(bins[2] - 1, low + last - d2)

@@ -1,4 +1,4 @@
-"""Pairs inside a cutoff that are missing from the neighbor list of a program, and for how long.
+"""Pairs inside a cutoff that a program's neighbor list lacks, and how long each pair is missing.
 
 A neighbor list may be incomplete because the skin was exceeded, a buffer overflowed, or images are not
 supported. A program with an incomplete list omits the interactions of the missing pairs inside the cutoff.

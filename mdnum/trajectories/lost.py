@@ -1,4 +1,4 @@
-"""Estimate of flips missed between frames, when a pair crosses its threshold and returns by the next frame.
+"""Estimate of missed flips, where a pair crosses its threshold and returns between two frames.
 
 Missed flips are defined relative to the flips found if every time step of the run is examined. The four
 estimates (thinning, persistence, velocities and flux), the test systems used to choose the constants, and the
@@ -92,7 +92,7 @@ class FrameMotion:
 
 @dataclass(frozen=True)
 class LostFlips:
-    """Estimate of the flips missed between frames, as fractions of the true number of flips."""
+    """Estimate of the flips missed between frames, as a fraction of the true number of flips."""
 
     # "none_lost" (every second frame alone would lose no flip), "estimate"; or why there is no number:
     # "rounding" (the file's digits may have made what thinning loses), "open" (too wide a range fits)

@@ -2,8 +2,8 @@
 
 MDAnalysis's readers of dcd, trr and some text formats take a truncated or damaged frame for the end of the
 file, and silently skip the remaining data. If the last number of a text file is truncated, the remaining
-digits are read as a different number. A killed run leaves an Amber NetCDF file with fewer records than stated
-in the header; MDAnalysis rejects such a file, and this module reads it (ambermd.org/netcdf/nctraj.xhtml).
+digits are read as a different number. If a run is killed, its Amber NetCDF file has fewer records than the
+header states; MDAnalysis rejects such a file, and this module reads it (ambermd.org/netcdf/nctraj.xhtml).
 """
 
 from __future__ import annotations
@@ -213,7 +213,7 @@ class MDAnalysisTrajectory(Trajectory):
 
 
 def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
-    """Return a function that reads the atom labels of any frame; MDAnalysis reads only those of the first.
+    """Return a function that reads atom labels of any frame; MDAnalysis reads only the first frame's.
 
     The function returns None unless the file is an XYZ file or a PDB file with several models.
     """

@@ -101,7 +101,7 @@ def open_trajectory(
 
 
 def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
-    """Return the function that opens a file from its path, its topology and the requested frames."""
+    """Return the function that opens a file, given its path, its topology and the requested frames."""
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
     word = (format or suffix[1:]).lower()
     if word in READERS:

@@ -2,7 +2,7 @@
 
 A run continued from a checkpoint writes some frames again, concatenated files may share frames, and a stopped
 simulation or a rejected Monte Carlo move repeats the previous frame, not always with equal times. After a
-restart with different rounding, times repeat but data differ; the first frame of each time is kept.
+restart with different rounding, times repeat but data differ; of frames with equal times, the first is kept.
 """
 
 from __future__ import annotations
@@ -113,6 +113,6 @@ class RepeatedFrames:
         return back > 0
 
     def plain(self, most: int = 100) -> dict[str, Any]:
-        """Return the record as plain Python values, with at most `most` ranges of each kind."""
+        """Return the record of repeats as plain Python values, with at most `most` ranges of each kind."""
         sizes = {"frames": self.frames, "stretches": len(self.stretches), "to_the_end": self._back > 0}
         return sizes | {"dropped": self.drop, "ranges": self.stretches[:most], "again": self.again[:most]}
