@@ -1,4 +1,4 @@
-"""Gradients of long simulations, with an estimate of the number of steps up to which each can be trusted.
+"""Gradients of long simulations, and the number of steps up to which each gradient can be trusted.
 
 A simulation is differentiated at its recorded states and decisions; changes of decisions (flips) contribute a
 separate term. Gradient methods are subclasses of `Method`, and losses are subclasses of `Loss`.

@@ -1,7 +1,7 @@
 """Reverse-mode derivatives of a simulation at its recorded states and decisions.
 
 With jax.value_and_grad, the forward pass rounds differently from an ordinary run, and after some thousand
-steps makes other decisions. In this module, an ordinary run is made and recorded first.
+steps makes other decisions. This module therefore makes and records an ordinary run first.
 
 A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
 times that vector. For a pair potential, J times a vector is a sum over neighbors, like the forces, and
@@ -132,7 +132,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
     def with_shared(r2, along, inside, types, weights):
         """Compute the slope of each slot, and cotangents of r², of slot parameters and of shared parameters.
-        A single reverse pass computes all cotangents, which is cheaper than two for a neural network.
+        A single reverse pass computes all cotangents; for a neural network, one pass is cheaper than two.
         """
         ended, slots, onto = through(r2, along, inside, types, weights)
 
@@ -220,7 +220,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
 
 def _differences(cell, own, other):
-    """Return, for a pair, differences of positions and vectors, products of weights, and the weights of j."""
+    """Return position and vector differences of pairs, products of weights, and the weights of atoms j."""
     d = [b - a for a, b in zip(own[:6], other[:6], strict=True)]
     products = (a * b for a, b in zip(own[6:], other[6:], strict=True))
     return [*cell.minimum_image(*d[:3]), *d[3:], *products, *other[6:]]
@@ -302,10 +302,10 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
 
 
 class AdjointCarry(NamedTuple):
-    """Cotangents that a reverse pass propagates from each step to the step before.
+    """Cotangents that a reverse pass propagates from each step to the preceding step.
 
-    A trace is an `AdjointCarry` with the cotangents at every step, without those of the first frame. Row k of
-    a trace belongs to the state (x, half-kicked v) at the beginning of step first + k, without the
+    A trace is an `AdjointCarry` with the cotangents at every step, but without those of the first frame. Row
+    k of a trace belongs to the state (x, half-kicked v) at the beginning of step first + k, without the
     contribution of the cutoff crossings that lead to this state. Atoms in a trace are in the order of the
     neighbor list. Unused rows at the end of a trace are undefined.
     """
@@ -420,7 +420,7 @@ class StretchReversal:
         return np.asarray(weights), trace
 
     def cotangents(self) -> Cotangents:
-        """Return the derivatives of the loss, once the reverse pass has reached the start of the run."""
+        """Return the derivatives of the loss after the reverse pass has reached the start of the run."""
         simulation, carry, start = self.tape.simulation, self.carry, self.tape.start.state
         through = carry.integrator, carry.x, carry.v
         if jax.tree.leaves(carry.extra):

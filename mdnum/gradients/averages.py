@@ -1,4 +1,4 @@
-"""Derivatives of averages over states, from the frames of one run; the dynamics are not differentiated.
+"""Compute derivatives of averages from the frames of one run, without differentiating its dynamics.
 
 The derivative of an average with respect to a parameter has up to three contributions. First, at fixed
 positions, the value of the observable in each frame changes. Second, if the observable jumps when a pair
@@ -154,7 +154,7 @@ def _look(forces: tuple[PairForce, PairForce], tables, rows, bits, seen, looking
 
 
 def standard_error(series: Float[np.ndarray, "frames"]) -> float:
-    """Return the standard error of the mean of a correlated series: the largest for 8, 16 and 32 blocks.
+    """Return the largest standard error of the mean of a correlated series, for 8, 16 and 32 blocks.
 
     Source: H. Flyvbjerg, H. G. Petersen, J. Chem. Phys. 91, 461 (1989).
     """
@@ -170,7 +170,7 @@ def standard_error(series: Float[np.ndarray, "frames"]) -> float:
 
 @dataclass(frozen=True)
 class Density:
-    """Weighted number of pairs per length at the cutoff distance, with its error."""
+    """Weighted number of pairs per unit of distance at the cutoff, and the error of this number."""
 
     # each frame's share of the estimate that was chosen, shape (frames, types)
     frames: Float[np.ndarray, "frames types"]
@@ -206,7 +206,7 @@ def density(
     reach: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> Density:
-    """Estimate the weighted sum over frames of the pair density at the cutoff, delta(r_cut - r_ij).
+    """Estimate the weighted sum of the pair density at the cutoff, delta(r_cut - r_ij), over all frames.
 
     The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
     of the width; extrapolation from three widths, each half of the previous width, removes the second and

@@ -1,4 +1,4 @@
-"""Gradient methods for a simulated bouncing ball, which differ in how they treat contact decisions.
+"""Gradient methods for a simulated bouncing ball; the methods treat contact decisions differently.
 
 The methods in this module differentiate the operations that ran (unrolled), the program with all decisions
 fixed (frozen), or the loss averaged over random parameters (randomized). Methods that replace the contact by
@@ -157,7 +157,7 @@ def _used(function: Any, values: dict[str, jax.Array], rest: tuple, names: tuple
 
 
 def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str) -> bool:
-    """Return whether any branch or loop of the program uses the parameter, even one that did not run."""
+    """Return whether any branch or loop of the program, executed or not, uses the parameter."""
 
     def slope(tangent):
         return jax.jvp(lambda q: function(values | {name: q}, *rest), (values[name],), (tangent,))[1]
@@ -294,7 +294,7 @@ class Frozen(BallMethod):
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """Compute derivatives by reverse mode, and central differences at fixed decisions as a check.
 
-        Error: rounding errors for the derivative; relative error of about u^(2/3) for finite differences.
+        Error: rounding only for the derivative; about u^(2/3) (relative) for the finite differences.
         """
         run = problem.run(keep=False)
         decisions = jax.tree.map(jnp.asarray, run.decisions())

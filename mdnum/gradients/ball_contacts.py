@@ -37,7 +37,7 @@ _NARROW = 1e-6
 
 
 def _moving(x: Any) -> Any:
-    """Return zero with the derivative of x, by subtracting from x its value as a constant."""
+    """Return zero, but with the derivative of x, by subtracting the value of x as a constant from x."""
     return x - lax.stop_gradient(x)
 
 
@@ -82,8 +82,8 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """Gradient method: derivative of the fixed point of the projection, by the implicit function theorem.
 
-    The loss is that of the iterations that ran; the derivative is that of their limit, the floor. The method
-    `unrolled` gives a nonzero derivative with respect to k, an artifact of the solver's tolerance.
+    The loss is computed from the executed iterations; the derivative is that of their limit, the floor. The
+    method `unrolled` gives a nonzero derivative with respect to k, an artifact of the solver's tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
@@ -170,7 +170,7 @@ class SoftImpact(eqx.Module):
 
 @dataclass(frozen=True)
 class SoftFloor(BallMethod):
-    """Gradient method: derivative of another program, whose floor is soft (see `softened`)."""
+    """Gradient method: derivative of a different program, in which the floor is soft (see `softened`)."""
 
     # width, m. Small: near the given program, with derivatives that peak at its contacts. Large: a tame
     # derivative, of something else. None for one that suits the problem: a tenth of the depth to which a
@@ -210,7 +210,7 @@ class SoftFloor(BallMethod):
 
 
 def softened(problem: BallProblem, eps: float) -> BallProblem:
-    """Return the problem with a soft floor: a softplus penalty, or for impacts a spring of depth about eps.
+    """Return the problem with a soft floor: a softplus penalty or, for impacts, a spring of depth about eps.
 
     Raises:
         InputError: the ball would cross the soft floor of width eps in too few steps.
@@ -310,7 +310,7 @@ class ThroughContacts(BallMethod):
 
 
 class _SaltatingReset:
-    """Contact that resets the velocity at the end of a step, with the derivative of continuous motion."""
+    """Contact that resets the velocity at the end of a step, but has the derivative of continuous motion."""
 
     def move(self, motion: Motion) -> Moved:
         """Compute one step with a contact; its derivative is that of the flight and the saltation matrix."""

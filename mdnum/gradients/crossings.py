@@ -1,4 +1,4 @@
-"""Contributions of flips to a gradient through the times at which pairs cross their cutoff (saltation).
+"""Contributions to a gradient from changes of the times at which pairs cross their cutoff (saltation).
 
 A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the momentum of the
 pair differs after the crossing. Derivatives of a program's steps lack the effect of crossing times, even for
@@ -36,7 +36,7 @@ _ROOM_BITS = 6
 
 
 class Met(NamedTuple):
-    """Cutoff crossings of one step, or of all steps in sequence, padded to a fixed size for compilation."""
+    """Cutoff crossings of one step or of a sequence of steps, padded to a fixed size for compilation."""
 
     # i, j: sorted atoms; beyond the last one where there is no crossing
     i: Int[Array, "most"]
@@ -108,7 +108,7 @@ class Crossings:
         return np.stack([starts[:-1], np.diff(starts)], axis=1)
 
     def rows(self, room: int) -> MetRows:
-        """Return the crossings of `room` steps, padded to a fixed size for compilation."""
+        """Return the cutoff crossings of `room` steps, padded to a fixed size for compilation."""
         spans = self.spans(room)
         most = _padded(int(spans[:, 1].max(initial=0)))
         # a slice of so many fits everywhere
@@ -128,7 +128,7 @@ class Crossings:
         return MetRows(Met(*map(padded, columns)), spans, np.arange(most))
 
     def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
-        """Return an array without the padding of each step, with one entry per crossing."""
+        """Return an array with one entry per crossing, after removing the padding of each step."""
         return values[np.arange(values.shape[1]) < self.spans(len(values))[:, 1:]]
 
     def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
@@ -137,7 +137,7 @@ class Crossings:
 
 
 def _padded(count: int) -> int:
-    """Round a count up to a power of four, so that programs are compiled for few array sizes."""
+    """Round a count up to a power of four, so that programs are compiled for only a few array sizes."""
     bits = max(_ROOM_BITS, count.bit_length())
     return 1 << (bits + bits % 2)
 

@@ -1,9 +1,9 @@
-"""Gradient methods that use many runs: finite differences with error estimates, and means over replicas.
+"""Gradient methods that make many runs: finite differences with error estimates, and means over replicas.
 
 A replica is the same system with different initial velocities and, with a thermostat, different noise.
 Replicas have different neighbor lists and are therefore run one after another on each device.
 
-When a parameter changes, cutoff crossings move to other steps. If the force jumps at the cutoff, the loss
+If a parameter changes, pairs cross the cutoff at other steps. If the force jumps at the cutoff, the loss
 then jumps; between jumps, its slope is the derivative of the steps. The event-aware gradient is the slope
 across many jumps; a finite difference for comparison must span many jumps.
 """
@@ -189,7 +189,7 @@ class FiniteDifferences(Method):
 
     @property
     def runs(self) -> int:
-        """Approximate number of runs for each parameter."""
+        """Approximate number of runs that the method makes for each parameter."""
         return 2 * self.levels + (0 if self.relative is not None else _CHOOSING)
 
     def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
@@ -331,7 +331,7 @@ def settled(simulation: Simulation, steps: int) -> Simulation:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean over replicas, with its standard error and the value of each replica."""
+    """Mean over replicas, with the standard error of the mean and the value of each replica."""
 
     # mean, error: the mean and its standard error, of the shape of the parameter
     mean: Float[np.ndarray, "..."]

@@ -142,7 +142,7 @@ def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) ->
 
 
 def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return values of parameters by full name, given by full or short names."""
+    """Convert full or short names of parameters to full names, and return the values by full name."""
     out = {}
     for word, value in values.items():
         (name,) = parameters.resolve(problem.simulation, [word])

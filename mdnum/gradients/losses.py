@@ -1,9 +1,9 @@
-"""Losses of a trajectory, evaluated frame by frame, so that the trajectory need not be stored.
+"""Losses of a trajectory, which are evaluated frame by frame so that the trajectory need not be stored.
 
 A loss computes observations from each frame (and the first frame), sums the observations over frames, and
 computes a number from these sums. Averages, correlations with the start and histograms are losses of this
-form. Derivatives of a loss need only one frame at a time, too. Each loss of the command line is a class in
-this module with a name, a label and a unit.
+form. The derivatives of a loss also require only one frame at a time. Each loss of the command line is a
+class in this module with a name, a label and a unit.
 """
 
 from __future__ import annotations
@@ -232,8 +232,8 @@ class MeanDensity(MeanVolume):
 class EinsteinDiffusion(Loss):
     """Diffusion constant from the slope of the mean squared displacement, length² per unit of time.
 
-    The mean squared displacement since step 0 is fitted by a straight line, and D is a sixth of its slope.
-    Motion is ballistic in the beginning: set `first` to a step after the ballistic regime.
+    A straight line is fitted to the mean squared displacement since step 0; D is a sixth of the line's slope.
+    Motion is ballistic at the beginning of a run: set `first` to a step after the ballistic regime.
 
     Source: Allen and Tildesley, Computer Simulation of Liquids (2017), section 2.7.
     """

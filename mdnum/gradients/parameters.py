@@ -1,4 +1,4 @@
-"""Parameters with respect to which a simulation can be differentiated, and the inputs they change.
+"""Parameters with respect to which a simulation can be differentiated, and the inputs that each one changes.
 
 Names, values and units of parameters are those of `mdnum.systems.parameters`.
 """

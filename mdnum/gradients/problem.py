@@ -124,7 +124,7 @@ class Gradient:
 class Method:
     """Base class of gradient methods: frozen dataclasses of options, registered in METHODS.
 
-    Gradient methods for molecular dynamics are subclasses of `Method`, for a ball of `ball.BallMethod`.
+    Gradient methods are subclasses of `Method` for molecular dynamics, and of `ball.BallMethod` for a ball.
 
     Attributes:
         name: name on the command line. description: which derivative the method computes, one sentence.
@@ -254,13 +254,13 @@ def rounded(simulation: Simulation) -> str | None:
 
 
 def scalars_only(problem: Problem, names: Sequence[str]) -> str | None:
-    """Return the reason why finite differences do not apply (a parameter with several entries), or None."""
+    """Return why finite differences do not apply (a parameter has several entries); None if they apply."""
     large = [name for name in names if np.ndim(parameters.value(problem.simulation, name))]
     return f"{', '.join(large)}: a value for each shift of each entry would be needed" if large else None
 
 
 def in_phase(progress: Progress | None, phase: str) -> Callable[[int, int], None] | None:
-    """Return a progress callback called as (step, steps), which adds the name of the phase."""
+    """Return a callback that is called as (step, steps) and reports progress under the name of the phase."""
     if progress is None:
         return None
     return lambda step, steps: progress(step, steps, phase)

@@ -75,7 +75,7 @@ def passed(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> ReversePass:
-    """Run a problem and the reverse pass; callbacks receive the cotangents of each stretch of steps.
+    """Run a problem and its reverse pass; callbacks receive the cotangents of each stretch of steps.
 
     Args:
         names: full names of the parameters. saltation: whether to include the contribution of flips.
@@ -231,7 +231,7 @@ class Forward(Method):
 
 @dataclass(frozen=True)
 class Reversible(Method):
-    """Gradient method: derivative of the steps of a fixed-point run, which is reversed instead of stored.
+    """Gradient method: derivative of the steps of a fixed-point run; the run is reversed instead of stored.
 
     The forward pass stores only the last state; rounding to integers is differentiated as the identity.
 

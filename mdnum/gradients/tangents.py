@@ -72,7 +72,7 @@ def tangents(
     states: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[StretchTangents]:
-    """Yield tangents with respect to named parameters along a recorded run, for each stretch of steps.
+    """For each stretch of steps of a recorded run, yield the tangents with respect to named parameters.
 
     If saltation is False, the contribution of flips to a derivative is the sum over crossings of weight times
     (dr_cut - dr), where an event-aware reverse pass gives the weights.
@@ -117,7 +117,7 @@ def tangents(
 
 
 def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
-    """Return the derivatives of the loss from the tangents of the loss's sums at the end."""
+    """Compute the derivatives of the loss from the tangents of the loss's sums at the end of the run."""
 
     def one(tangent):
         return jax.jvp(lambda total: tape.loss.value(total, tape.frames), (tape.total,), (tangent,))[1]
@@ -126,7 +126,7 @@ def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
 
 
 def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, told, values, matrix) -> Forces:
-    """Evaluate forces with other parameters and lattice vectors, but with the same nearest images."""
+    """Evaluate forces for other parameters and lattice vectors, but for the same nearest images."""
     other: Any = with_quantities(force, values)
     other = replace(other, cell=replace(force.cell, matrix=matrix))
     if isinstance(force, PairForce):

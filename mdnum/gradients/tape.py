@@ -1,9 +1,9 @@
-"""A recorded run for gradients: its steps, in forward or reverse order, and the sums of the loss.
+"""A run recorded for gradients: its steps, in forward or reverse order, and the sums of the loss.
 
-Recorded stretches of steps are kept as far as memory allows. Other stretches are run again from their first
-states: the same compiled program with the same state and neighbor list gives the same bits. A run with a
-fixed-point integer state need not be stored: its steps are reversed, and must return to the start bit for
-bit.
+Recorded stretches of steps are kept in memory as long as there is room. Other stretches are run again from
+their first states: the same compiled program with the same state and neighbor list gives the same bits. A run
+with a fixed-point integer state need not be stored: its steps are reversed, and must return to the start bit
+for bit.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ class TapeStretch:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the recorded stretch of steps uses, bytes."""
+        """Memory that the recorded stretch of steps uses, in bytes."""
         kept = ([getattr(self, name) for name in _COLUMNS], self.x_before, self.table.index)
         return sum(array.nbytes for array in jax.tree.leaves(kept))
 
     def cut(self, room: int | None = None) -> TapeStretch:
-        """Return a copy whose arrays have `room` rows, by default one row for each recorded step."""
+        """Return a copy with arrays of `room` rows; the default is one row for each recorded step."""
 
         def copied(rows: np.ndarray) -> np.ndarray:
             kept = np.zeros((room or self.rows, *rows.shape[1:]), rows.dtype)
@@ -303,7 +303,7 @@ class ReversibleTape(RunTape):
 
     @property
     def nbytes(self) -> int:
-        """Memory of the bits that friction discarded, which grows with the run, bytes."""
+        """Memory, in bytes, for the bits that friction discarded; it grows with the number of steps."""
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:

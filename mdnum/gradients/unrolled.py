@@ -1,4 +1,4 @@
-"""Reverse-mode differentiation by JAX through all operations of the steps, like `jax.grad` of the run.
+"""Let JAX differentiate all operations of the steps in reverse mode, like `jax.grad` of the whole run.
 
 A chunk is a scan over a fixed number of steps with one neighbor list, which limits the memory of reverse
 mode. When the list expires, the remaining steps of the chunk do nothing, and the host builds the next list at

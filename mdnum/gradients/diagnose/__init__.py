@@ -1,4 +1,4 @@
-"""Diagnosis of a simulation's gradient: how far the gradient can be trusted, and what contributes to it.
+"""Diagnose a simulation's gradient: up to which step it can be trusted, and what contributes to it.
 
 Gradient methods compute different quantities: the derivative of the steps, the derivative of the flow with
 the times of flips, the slope of the loss between shifted runs, the slope of an average, or the derivative of
@@ -66,7 +66,7 @@ class Opinion:
 
 @dataclass(frozen=True)
 class GradientDifference:
-    """Comparison of the derivatives with respect to one parameter from two methods."""
+    """Comparison of two derivatives with respect to one parameter, computed by two methods."""
 
     name: str  # full name of the parameter
     # method, reference: names of the two methods
@@ -83,7 +83,7 @@ class GradientDifference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Gradients of one run by several methods, and comparisons with a reference method."""
+    """Gradients of one run, computed by several methods and compared with a reference method."""
 
     horizon: int  # steps
     reference: str  # name of the method that the others are compared with
@@ -189,7 +189,7 @@ def _meaning(
     name: str, one: Gradient, reference: Gradient, size: float, relative: float, rounding: float,
     grown: float, jumps: bool,
 ) -> tuple[str, dict[str, float] | None]:  # fmt: skip
-    """Return the reason why two derivatives differ, and numbers that support it (None: a rounding bound)."""
+    """Return why two derivatives differ, and numbers that support this reason (None for a rounding bound)."""
     kinds = {one.kind: one, reference.kind: reference}
     if not np.isfinite(relative):
         return "unexplained", {}
@@ -223,7 +223,7 @@ def _meaning(
 
 @result
 class GradientDiagnosis:
-    """Results on whether and how far a gradient can be trusted; results that were not requested are None.
+    """Results that tell up to which step a gradient can be trusted; results that were not requested are None.
 
     Attributes:
         horizon: number of steps. names: full names of the parameters. value: value of the loss.
@@ -262,7 +262,7 @@ def diagnose(
     format: str = "float16",
     progress: Progress | None = None,
 ) -> GradientDiagnosis:
-    """Examine whether and how far a gradient can be trusted, and what contributes to the gradient.
+    """Examine up to which step a gradient can be trusted, and what contributes to the gradient.
 
     Args:
         names: parameters, full or short names. parts: which of PARTS to compute.
@@ -358,7 +358,7 @@ def diagnose(
 
 
 def _methods(asked: Sequence[str | Method] | None) -> list[Method]:
-    """Return gradient methods as objects, given as names or objects; all methods if none are given."""
+    """Return as objects the gradient methods given by name or as objects; if none are given, return all."""
     return [by_name(one) if isinstance(one, str) else one for one in (METHODS if asked is None else asked)]
 
 

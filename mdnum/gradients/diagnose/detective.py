@@ -66,7 +66,7 @@ def detective(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> NotFinite:
-    """Find the first step, operation and pair with a result that is not finite in the reverse pass.
+    """Find the first step, operation and pair for which a result of the reverse pass is not finite.
 
     Args:
         problem: the loss of a rollout of a pair potential.

@@ -1,4 +1,4 @@
-"""Contribution of each flip to a gradient, and jumps of a gradient at parameter values where flips change.
+"""Contribution of each flip to a gradient, and parameter values at which flips and the gradient change.
 
 The contribution of a crossing is a product of two factors. The first factor, from a reverse pass, is the
 derivative of the loss with respect to the cutoff of one crossing alone, including the effect of all later
@@ -285,7 +285,7 @@ def _edge(
 
 
 def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:
-    """Return the loss of a simulation, and its derivative with respect to one parameter by two methods."""
+    """Return the loss of a simulation, and its derivative with respect to one parameter, from two methods."""
     there = Problem(simulation, problem.loss, problem.steps)
     tape = tape_of(there, True)
     found = {

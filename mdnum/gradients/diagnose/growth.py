@@ -141,7 +141,7 @@ class GrowthWatch:
 
 
 def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
-    """Classify a run, by an entry of WORDS, from the growth of its gradient and outliers of the rms speed."""
+    """Choose the entry of WORDS that describes a run, from gradient growth and outliers of the rms speed."""
     usual = float(np.median(speed))
     if usual > 0 and not (np.isfinite(speed).all() and speed.max() <= _WILD * usual):
         return WORDS[2]
@@ -273,7 +273,7 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class TangentImage:
-    """Image of a block of orthonormal vectors under a Jacobian, stored as basis @ mixing * exp(log_scale)."""
+    """Product of a Jacobian and a block of orthonormal vectors, stored as basis @ mixing * exp(log_scale)."""
 
     basis: Float[np.ndarray, "coordinates vectors"]  # orthonormal, shape (coordinates, vectors)
     mixing: Float[np.ndarray, "vectors vectors"]  # upper triangular, of size one, shape (vectors, vectors)

@@ -1,4 +1,4 @@
-"""The largest number of steps (horizon) for which a gradient can be trusted, and what limits it.
+"""The largest number of steps (horizon) for which a gradient can be trusted, and what limits this number.
 
 A gradient ceases to be trusted in five cases. (1) Another precision gives a different gradient, because
 rounding errors have grown. (2) Half the time step gives a different gradient. (3) A pair turned around so
@@ -98,7 +98,7 @@ class Shorter(Loss):
 
 
 def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Problem:
-    """Return a problem that evaluates the loss at several horizons, with `per` steps for each given step.
+    """Return a problem that evaluates the loss at several horizons and makes `per` steps for each given step.
 
     Args:
         at: horizons, rising; the last horizon is the length of the run.
@@ -124,7 +124,7 @@ class Horizons:
     flips: Int[np.ndarray, "flips 4"]  # step, pair and whether it entered, of each flip of the run, in order
 
     def by_name(self) -> dict[str, Float[np.ndarray, "points entries"]]:
-        """Return the gradient at every horizon, with one array per parameter."""
+        """Return the gradient at every horizon, as one array per parameter."""
         names = [column.name for column in self.columns]
         return {
             name: self.gradient[:, [k for k, one in enumerate(names) if one == name]]
@@ -355,7 +355,7 @@ def trust(
     moved, ambiguous, chaotic = near and near.moved, ambiguity(problem), grew(growth)
 
     def judged(*chosen: str) -> Judgment:
-        """Return the judgment on the derivatives with respect to the chosen parameters."""
+        """Return the verdict on the derivatives with respect to the chosen parameters."""
         apart, halved, scattered = (
             {name: one[name] for name in chosen if name in one} for one in (differing, steps, scatter)
         )
@@ -440,7 +440,7 @@ def _missed(
     problem: Problem, own: Horizons, turns: Turns | None, unseen, made: ReversePass, moved, tolerance: float,
     saltation: bool, names: Sequence[str],
 ) -> Limit:  # fmt: skip
-    """Find the step from which excluded flips or near misses of the cutoff are relevant for derivatives."""
+    """Find the step after which excluded flips or near misses of the cutoff affect derivatives noticeably."""
     if not np.any(np.asarray(problem.simulation.jumps())):
         return Limit(NEAR, problem.steps, False, "no jump")
     if not saltation:
@@ -544,7 +544,7 @@ def last_below(
 def last_agreeing(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the longest horizon with all values below a limit, and whether a longer horizon exists.
+    """Return the longest horizon at which all values are below a limit, and whether a longer horizon exists.
 
     Disagreement at shorter horizons is ignored: the relative error due to the time step may decrease again,
     and for few flips a change of a single flip is a large part of the gradient. Agreement at one horizon with
@@ -558,7 +558,7 @@ def last_agreeing(
 
 
 def ambiguity(problem: Problem) -> Limit:
-    """Find the first decision of the run whose margin is within its rounding bound."""
+    """Find the first decision of the run with a margin that is smaller than its rounding bound."""
     recorder = PairRecorder(problem.simulation)
     for segment in Engine(problem.simulation, problem.steps).segments():
         close = recorder.doubtful(segment)
