@@ -84,7 +84,7 @@ class Meter:
 
     @contextmanager
     def apart(self, calls: int) -> Iterator[None]:
-        """Allow calculator calls beyond the limit of a check, for a result that several checks share."""
+        """Allow calculator calls beyond the limit of a check, to compute a result that several checks use."""
         most = self.most
         self.most = self.calls + calls
         try:

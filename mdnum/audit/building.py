@@ -1,4 +1,4 @@
-"""Build a structure for auditing a calculator without own structure, from elements that it supports."""
+"""Build a test structure from elements that a calculator supports, if no structure is given."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return the crystal of the first supported element; `paired` tests a pair of its atoms first."""
+        """Return the crystal of the first supported element; if `paired`, test a pair of its atoms first."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():
@@ -141,7 +141,7 @@ class _Builder:
         return None
 
     def _mixed(self, made: Atoms) -> Atoms:
-        """Return a crystal with a second element if the calculator distinguishes two, else unchanged."""
+        """Add a second element to a crystal if the calculator distinguishes two, and return the crystal."""
         from ase.data import atomic_numbers
 
         self.best, symbol = made, str(made.symbols[0])

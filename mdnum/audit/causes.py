@@ -10,7 +10,7 @@ from mdnum.plain import beside
 
 @dataclass(frozen=True)
 class Cause:
-    """Consequences of the cause behind a finding code, alternative causes, and tests to distinguish these."""
+    """Consequences of the cause of a finding, alternative causes, and tests that distinguish the causes."""
 
     brings: tuple[str, ...] = ()  # codes of findings that it explains
     rivals: tuple[str, ...] = ()  # codes of other causes that show the same
@@ -42,7 +42,7 @@ _SEVERITIES = ("info", "warning", "error")
 
 
 def cause(code: str) -> Cause:
-    """Return the row of the cause table for a finding code; empty for codes of other packages."""
+    """Return the row of the cause table for a finding code; an empty row for codes of other packages."""
     return CAUSES.get(code, Cause())
 
 

@@ -21,12 +21,12 @@ def in_order(names: Sequence[str]) -> list[str]:
 
 
 def needed_to(question: str) -> set[str]:
-    """Return the checks without which a question ("run" or "differentiate") cannot be answered."""
+    """Return the checks that are required to answer a question ("run" or "differentiate")."""
     return {name for name in CHECKS if question in CHECKS[name].needed_to}
 
 
 def answers(results: Sequence[CheckResult], wanted: Sequence[str]) -> Mapping[str, Answer]:
-    """Answer the questions "run" and "differentiate" from the results of the requested checks."""
+    """Answer, from the results of the checks, whether it is safe to run and to differentiate a calculator."""
     return {question: _answer(question, results, wanted) for question in _QUESTIONS}
 
 

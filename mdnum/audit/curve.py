@@ -40,7 +40,7 @@ SMOOTH = 3  # order of a threshold at which neither energy, force nor curvature 
 
 
 class Curve:
-    """Energy and force along one coordinate; results are stored, so each point is evaluated only once.
+    """Energy and force along one coordinate; results are stored, so that no point is evaluated twice.
 
     Args:
         at: function that returns (energy, force = -dE/dx) at a coordinate.
@@ -81,9 +81,9 @@ def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
 
 
 def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
-    """Estimate the rounding noise of energy and force (columns) just below low and just above high (rows).
+    """Estimate rounding noise of energy and force (columns), just below `low` and just above `high` (rows).
 
-    The largest estimate over several spacings is used, since float32 values are constant over small ones.
+    The largest estimate for several spacings is used, since float32 values do not change over small spacings.
     """
     sides = []
     for start, sign in ((low, -1.0), (high, 1.0)):
@@ -200,7 +200,7 @@ def find_jumps(
 
 
 def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
-    """Measure the jumps between low and high, with bounds on the jumps that a smooth curve would show.
+    """Measure the jumps between `low` and `high`, and bound the jumps that a smooth curve would show.
 
     Energy and force on either side are medians of values at the four nearest coordinates, which excludes
     single rounding errors. The curvature is computed from one-sided differences of the force.
@@ -231,7 +231,7 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
-    """Return the power law with which the force vanishes at the end of its range; None if it is not clear.
+    """Return the power law by which the force vanishes at the end of its range; None if no law is clear.
 
     Args:
         edge: end of the interaction, approached from smaller distances; no other threshold is within `room`.
@@ -270,7 +270,7 @@ def smallest_steps(
 def _outliers(
     curve: Curve, places: Float[np.ndarray, "points"]
 ) -> tuple[list[tuple[float, float, float]], Float[np.ndarray, "intervals"]]:
-    """Return the intervals with unusually different predictions from left and right, and detection limits.
+    """Return intervals in which predictions from left and right differ unusually, and detection limits.
 
     Returns:
         (relative difference, left, right) of each outlier, the largest first; and the smallest detectable
@@ -303,7 +303,7 @@ def _outliers(
 
 
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
-    """Mismatch across each interval: in energy, in force, and in energy change plus work of the force.
+    """Mismatch, for each interval, of the energy, of the force, and of energy change plus work of the force.
 
     The mismatches of energy and force are |prediction from the left minus prediction from the right| at the
     midpoint. The mismatch of energy change and work falls with the fifth power of the spacing if the curve is
@@ -383,7 +383,7 @@ def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float
 
 
 def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
-    """Locate a kink of the force as the point where the extrapolations from both sides intersect."""
+    """Locate a kink of the force: the point at which the extrapolations from both sides intersect."""
     width = min(room / 8, 1e-3)
     middle, reach = 0.5 * (left + right), max(0.5 * (right - left), width / 8)
     roots = np.roots(-_pieces(curve, middle, reach, width, 3))
@@ -405,7 +405,7 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """Locate a jump of the energy's third derivative, using the force's second derivative on both sides.
 
-    Of several fit widths, the width is used for which a fit of half the width gives the most similar result.
+    Of several fit widths, the one is used at which halving the width changes the result least.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

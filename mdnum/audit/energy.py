@@ -210,7 +210,7 @@ class HiddenJump:
 
 @dataclass(frozen=True)
 class HiddenJumps:
-    """Energy jumps found in time steps in which the energy change was not explained otherwise."""
+    """Energy jumps found in time steps with an energy change that nothing else explains."""
 
     jumps: tuple[HiddenJump, ...] = ()  # found in the steps that were searched
     steps: Mapping[int, float] = field(default_factory=dict)  # those, with what they left unexplained, eV
@@ -236,7 +236,7 @@ class HiddenJumps:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Most frequent k for which neighbors k, k+1 of an atom swap at a jump, and the number of jumps."""
+        """Most frequent k for which neighbors k and k+1 of an atom swap at a jump, and how often they do."""
         return _most_frequent(k for jump in self.jumps for k in {k for _, k in jump.ties})
 
     @property
@@ -326,7 +326,7 @@ class EnergyBalance:
 
     @property
     def means(self) -> dict[PairThreshold, float]:
-        """Mean energy jump when the distance of a pair falls below a threshold, for each threshold, eV."""
+        """For each threshold, mean energy jump (eV) when the distance of a pair falls below the threshold."""
         found: dict[PairThreshold, list[float]] = {}
         for place, jump in self.measured.items():
             found.setdefault(self.crossed[place].threshold, []).append(self.crossed[place].sign * jump)
@@ -441,8 +441,7 @@ def wandering(time: Steps, increments: Steps) -> Drift:
 def ratio(time: Steps, total: Steps, kinetic: Steps) -> float:
     """Return the total energy drift of a run divided by the standard deviation of the kinetic energy.
 
-    Source:
-        the energy conservation score of the mlipaudit suite; lambench reports meV/atom/ps instead.
+    Source: the energy conservation score of mlipaudit; lambench instead reports the drift in meV/atom/ps.
     """
     slope = float(np.polyfit(time - time[0], total - total[0], 1)[0])
     scatter = float(np.std(kinetic))

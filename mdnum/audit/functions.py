@@ -1,4 +1,4 @@
-"""Use computed values to check how smooth a user's pair function is between close contact and cutoff.
+"""Check with computed values how smooth a user's pair function is between close contact and the cutoff.
 
 A run records the flips at the cutoff. If a pair function itself has a discontinuity, for example where two
 pieces do not join, a run records no flip there, and no derivative of the run includes the discontinuity.

@@ -1,4 +1,4 @@
-"""Measure the numerical noise of a calculator's energies and forces, and their number of digits."""
+"""Measure the numerical noise and the number of digits of a calculator's energies and forces."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class NoiseFloor:
 def along_a_line(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, points: int = _POINTS
 ) -> NoiseFloor:
-    """Estimate the noise from high-order differences at equally spaced points, where smooth functions cancel.
+    """Estimate the noise from high-order differences at equally spaced points, which cancel smooth functions.
 
     Source:
         J. J. Moré and S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33, 1292 (2011).

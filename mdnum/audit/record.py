@@ -139,7 +139,7 @@ class AuditState:
 
     @property
     def shown(self) -> list[CheckResult]:
-        """All results so far: of finished checks, of short forms of checks, and of interrupted checks."""
+        """All results so far, of finished checks, of checks in short form, and of interrupted checks."""
         return [*self.results, *(self.cut[name] for name in self.left if name in self.cut)]
 
     @property
@@ -171,7 +171,7 @@ def kept(folder: RunFolder) -> AuditState:
 
 
 def encoded(atoms: Atoms) -> str:
-    """Encode a structure as JSON without rounding; of its `info`, only text and numbers are kept."""
+    """Encode a structure as JSON without rounding; from its `info`, keep only text and numbers."""
     copy = atoms.copy()
     copy.info = {key: value for key, value in atoms.info.items() if isinstance(value, str | int | float)}
     copy.set_constraint()

@@ -21,7 +21,7 @@ _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked abou
 
 
 class SequenceStep(NamedTuple):
-    """A structure in a sequence, its difference from the previous one, and whether energies are compared."""
+    """A structure in a sequence, its difference from the previous one, and whether its energy is compared."""
 
     what: str
     atoms: Atoms
@@ -112,7 +112,7 @@ def _strain(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
 
 
 def _wrapping(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures whose atoms jump to other periodic images, as in codes that wrap positions."""
+    """Yield structures with atoms that jump to other periodic images, as in programs that wrap positions."""
     if not atoms.pbc.any():
         return
     there = atoms

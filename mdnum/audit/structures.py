@@ -150,7 +150,7 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
 
 
 def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
-    """Return a modified copy of a structure; if `scaled`, a new cell also scales the positions."""
+    """Return a modified copy of a structure; if `scaled`, the positions are scaled with the cell."""
     there = atoms.copy()
     if "cell" in values:
         there.set_cell(values.pop("cell"), scale_atoms=scaled)
@@ -160,7 +160,7 @@ def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
 
 
 def exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
-    """Return (atom, k) for each atom whose k-th and (k+1)-th nearest neighbors have swapped."""
+    """Return (atom, k) for each atom with k-th and (k+1)-th nearest neighbors that have swapped."""
     orders = []
     for atoms in (before, after):
         distances = atoms.get_all_distances(mic=bool(atoms.pbc.any()))

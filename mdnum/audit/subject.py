@@ -1,4 +1,4 @@
-"""Wrapper of an ASE calculator for audits: returns numbers or a clear error, never outdated results."""
+"""Wrapper of an ASE calculator for audits that returns numbers or a clear error, but no outdated results."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Repeats:
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
-        """Record the first energy or force of a new calculator object; `which` numbers the objects."""
+        """Record the first energy or force from a new calculator object; `which` is the object's number."""
         before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
@@ -189,7 +189,7 @@ class CalculatorSubject:
         return other
 
     def used(self) -> CalculatorSubject:
-        """Return a copy of the subject, with its safeguards off, to test how a calculator detects changes."""
+        """Return a copy of the subject without its safeguards, to test how a calculator detects changes."""
         other = self.fresh()
         other.forgets = other.renews = False
         return other
@@ -258,7 +258,7 @@ class CalculatorSubject:
 
     @contextmanager
     def trying(self) -> Iterator[None]:
-        """Save no structures on which the calculator fails within this block, where failures are expected."""
+        """Within this block, failures are expected: do not save structures on which the calculator fails."""
         before, self.saving = self.saving, False
         try:
             yield

@@ -57,7 +57,7 @@ class RouteCrossing(NamedTuple):
 
 @dataclass(frozen=True)
 class Route:
-    """A structure in which one atom or several move along a straight line."""
+    """A structure in which one or several atoms move along a straight line (a route)."""
 
     name: str
     atoms: Atoms  # the structure at 0
@@ -127,7 +127,7 @@ class EnvironmentWalks:
 
     @property
     def unexplained(self) -> list[Event]:
-        """Jumps that exceed noise and that no pair threshold explains."""
+        """Jumps that are larger than the noise and that no pair threshold explains."""
         return [one for one in self.events if one.threshold is None and one.jump.order < SMOOTH]
 
     @property
@@ -300,7 +300,7 @@ def _triples(subject: CalculatorSubject) -> list[tuple[Route, float, float]]:
 
 
 def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tuple[Route, float, float]]:
-    """Return (route, start, end) for randomly chosen atoms that move in random directions."""
+    """Return (route, start, end) for routes of randomly chosen atoms in random directions."""
     rng = np.random.default_rng(0)
     found: list[tuple[Route, float, float]] = []
     for k in rng.permutation(len(groups))[:count]:
@@ -313,7 +313,7 @@ def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tupl
 
 
 def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
-    """Return whether a jump is due to rounding, for a calculator whose results have few decimals."""
+    """Return whether a jump is due to rounding, for a calculator that returns few decimals."""
     if not any(quantum):
         return False
     small = abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]
@@ -324,7 +324,7 @@ def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
 
 
 class CrowdOrder(NamedTuple):
-    """Effect of the order of the atoms in a dense cluster on energy and forces."""
+    """How the order of the atoms in a dense cluster affects energy and forces."""
 
     # number of neighbors at which it starts to matter, None if it never does
     start: int | None = None
@@ -489,7 +489,7 @@ def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int)
 def _permuted(
     subject: CalculatorSubject, walk: PairWalk, radius: float, count: int, aside: bool = False
 ) -> tuple[float, float] | None:
-    """Return the changes of energy and force when atoms are reordered; None if rounding explains them.
+    """Return the changes of energy and force when atoms are reordered; None if rounding explains the changes.
 
     If `aside`, the last neighbor is moved out of the range of all other atoms.
     """

@@ -247,7 +247,7 @@ def _seen(
     rounding: float,
     known: Sequence[float],
 ) -> tuple[float, float, float, float] | None:
-    """Return (from, to, force step detectable at half of the distances, force step detectable at all).
+    """Return (first distance, last distance, median and largest of the detectable force steps).
 
     Distances close to a known threshold (which would hide another threshold) and distances beyond the end of
     the interaction are not counted.
@@ -272,7 +272,7 @@ def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThresh
 
 
 def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairThreshold]) -> bool:
-    """Return whether companion atoms of the pair cross another threshold at this pair distance."""
+    """Return whether companion atoms of the pair cross another threshold at the given pair distance."""
     others = pair.others(threshold.radius)
     radii = [one.radius for one in thresholds if one is not threshold]
     return len(others) > 0 and any(np.abs(others - radius).min() < 1e-5 for radius in radii)
@@ -447,7 +447,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 
 
 def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
-    """Energy change from the last point to infinity if the force follows a power law; inf for slow decay."""
+    """Energy change from the last point to infinity for a force with a power law; inf for a slow decay."""
     first, last = abs(float(forces[0])), abs(float(forces[-1]))
     if not last or not first:
         return np.inf

@@ -477,7 +477,7 @@ def transposed(
         return end.x, end.kicked, ahead, end.cell.matrix, end.v
 
     def look(row):
-        """Return cotangents of one frame and of the first frame, given the cotangents of the loss's sums."""
+        """Compute the cotangents of one frame and of the first frame from those of the loss's sums."""
 
         def seen_at(x, v, potential, virial, origin, timestep, *box):
             here = (in_box(around, *box) if box else around)._replace(timestep=timestep)

@@ -51,7 +51,7 @@ class BallMethod(Method):
     def of(
         self, value: float, slopes: dict[str, float], use: dict[str, Use], details: dict[str, Any]
     ) -> Gradient:
-        """Create a `Gradient` from derivatives, details, and notes on whether the run used each parameter."""
+        """Create a `Gradient` from derivatives, details, and notes on which parameters the run used."""
         gradient = {name: np.asarray(slope, np.float64) for name, slope in slopes.items()}
         made = self.result(value, gradient, {name: one.note for name, one in use.items()}, details)
         return replace(made, depends={name: one.depends for name, one in use.items()})
@@ -69,7 +69,7 @@ for _name, _class in {
 
 @result
 class BallGradients:
-    """Derivatives of one loss by several methods, and the reasons why other methods do not apply."""
+    """Derivatives of one loss, computed by several methods, and reasons why other methods do not apply."""
 
     gradients: tuple[Gradient, ...]  # of the methods that apply, in the order asked for
     refused: Mapping[str, str]  # why another does not, by its name
@@ -117,7 +117,7 @@ def dependence(
     names: Sequence[str] | None = None,
     rest: tuple[Any, ...] = (),
 ) -> dict[str, Dependence]:
-    """Determine whether a scalar loss depends on each parameter, in the branches and iterations that ran.
+    """Determine on which parameters a scalar loss depends, in the branches and iterations that ran.
 
     The test sets the tangent of a parameter to NaN. This NaN propagates through every operation that has a
     derivative, even a derivative of zero, and through no other operation.
@@ -197,7 +197,7 @@ def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 class _Rollout(eqx.Module):
-    """Loss after a given number of steps, as a function that is compiled only once for equal problems."""
+    """Function for the loss after a given number of steps; compiled only once for equal problems."""
 
     steps: int = eqx.field(static=True)
     loss: BallLoss

@@ -59,7 +59,7 @@ class MetRows(NamedTuple):
     slots: Int[np.ndarray, "most"]  # numbers from 0, as many as the row with the most has, or a few more
 
     def row(self, span: Int[Array, "2"], atoms: int) -> Met:
-        """Return the crossings of one step, given the index of the first crossing and their number."""
+        """Return the crossings of one step from the index of its first crossing and their number."""
         most = len(self.slots)
         own = Met(*(lax.dynamic_slice_in_dim(column, span[0], most, -1) for column in self.met))
         # behind them are those of the next row
@@ -70,7 +70,7 @@ class MetRows(NamedTuple):
 
 @dataclass(frozen=True)
 class Crossings:
-    """The flips of one stretch of steps as crossings of the cutoff, with normals, radial speeds and jumps."""
+    """Cutoff crossings in one stretch of steps, with their normals, radial speeds and force jumps."""
 
     ledger: FlipTable  # the flips
     row: Int[np.ndarray, "crossings"]  # row of each in its stretch, ascending
@@ -103,7 +103,7 @@ class Crossings:
         return self.force / self.speed
 
     def spans(self, room: int) -> Int[np.ndarray, "room 2"]:
-        """Return, for each of `room` steps, the index of the first crossing and the number of crossings."""
+        """For each of `room` steps, return the index of its first crossing and its number of crossings."""
         starts = np.searchsorted(self.row, np.arange(room + 1))
         return np.stack([starts[:-1], np.diff(starts)], axis=1)
 
@@ -324,7 +324,7 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
         return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)
 
     def apart(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return minimum-image displacements of pairs, and the lattice shifts to wrapped displacements."""
+        """Return minimum-image displacements of pairs, and the lattice shifts used for them."""
         start, end = positions(rows, i).astype(np.float64), positions(rows, j).astype(np.float64)
         inverse = inverses[rows + 1]
         if stretch.cell.size:

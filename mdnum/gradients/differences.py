@@ -94,7 +94,7 @@ def richardson(f: Callable[[float], float], x: float, step: float, levels: int =
 def noise_of(values: Float[np.ndarray, "points"]) -> float:
     """Estimate the standard deviation of noise in function values at small equal spacings.
 
-    Finite differences of order k cancel the smooth function and amplify the noise by a known factor.
+    Finite differences of order k cancel a smooth function and amplify noise by a known factor.
 
     Args:
         values: at least 4, so closely spaced that the function is nearly linear over all of them.
@@ -118,7 +118,7 @@ def noise_of(values: Float[np.ndarray, "points"]) -> float:
 
 
 class DifferenceStep(NamedTuple):
-    """Step for central differences, and standard deviation of the function's noise."""
+    """Step size for central differences of a function, and standard deviation of its noise."""
 
     size: float
     noise: float
@@ -157,7 +157,7 @@ def choose_step(f: Callable[[float], float], x: float, first: float, spacing: fl
 
 
 def nonzero(problem: Problem, name: str) -> float:
-    """Return the value of a scalar parameter; raise an error for 0, because steps are relative to the value.
+    """Return the value of a scalar parameter; raise an error if it is 0 (steps are relative to the value).
 
     Raises:
         InputError: the value is 0.
@@ -407,7 +407,7 @@ class Ensemble(Method):
 
 
 def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
-    """Yield the gradient of each problem, in order; the problems are distributed over all devices."""
+    """Distribute the problems over all devices, and yield their gradients in the same order."""
     devices = jax.local_devices()
     if len(devices) < 2:
         yield from (method(one, names) for one in problems)
@@ -483,7 +483,7 @@ class SmoothedDifferences(Method):
 
 
 def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable[[], None]):
-    """Return, for each initial state, the loss at given parameter values and the crossings (step, i, j)."""
+    """For each initial state, return the loss at given parameter values, and crossings (step, i, j)."""
     found = []
     for start in starts:
         made, met = start.at(values), set()
@@ -507,7 +507,7 @@ def _share(high, low) -> float | None:
 
 
 def _chosen(found: Float[np.ndarray, "steps replicas"]) -> tuple[Estimate, float, int]:
-    """Choose among extrapolated differences; return the derivative, its error and the index of its step."""
+    """Choose one extrapolated difference; return the derivative, its error and the index of its step."""
     if len(found) == 1:
         only = Estimate.from_replicas(found[0])
         return only, float(only.error), 0

@@ -49,7 +49,7 @@ class Cotangents:
 
 
 class Direction(NamedTuple):
-    """Derivatives of all inputs of a simulation with respect to one number, or to several (first axis)."""
+    """Derivatives of all inputs with respect to one number, or to several (along the first axis)."""
 
     # x, v: of the positions and velocities of step 0, user's order
     x: Float[Array, "*columns 3 atoms"]
@@ -69,7 +69,7 @@ def quantities(force: PairForce | ManyBodyForce) -> Any:
 
 
 def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce | ManyBodyForce:
-    """Return a force with other values of its differentiable parameters; can be used inside jit."""
+    """Return a copy of a force with other values of its parameters; can be called inside jit."""
     if isinstance(force, PairForce):
         return replace(force, model=values)
     return replace(force, potential=manybody.with_quantities(force.potential, values))
@@ -103,7 +103,7 @@ def names(simulation: Simulation) -> tuple[str, ...]:
 
 
 def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
-    """Return full names of parameters; a table such as "potential" stands for all its parameters.
+    """Return full names of parameters; a table name, such as "potential", stands for all its parameters.
 
     Raises:
         InputError: a parameter does not exist, or is not a differentiable quantity.

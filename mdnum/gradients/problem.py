@@ -140,7 +140,7 @@ class Method:
         return None
 
     def __call__(self, problem: Any, names: Sequence[str], progress: Progress | None = None) -> Gradient:
-        """Compute the gradient; for a complex loss, the real and the imaginary part require a run each.
+        """Compute the gradient; for a complex loss, run once for the real and once for the imaginary part.
 
         Raises:
             InputError: the method does not apply to this problem, or a parameter does not exist.
@@ -209,7 +209,7 @@ def method(name: str) -> Method:
 
 
 def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: bool) -> dict[str, str]:
-    """Return notes on derivatives that are exactly zero or lack the contribution of flips, by parameter."""
+    """Return, by parameter, notes on derivatives that are exactly zero or omit the effect of flips."""
     notes = {}
     missing = problem.jumps and not saltation
     for name, value in gradient.items():
@@ -239,14 +239,14 @@ def pairs_only(simulation: Simulation, *, any_step: bool = False) -> str | None:
 
 
 def one_term(simulation: Simulation) -> str | None:
-    """Return the reason why a method for a single pair potential does not apply, or None."""
+    """Return why a method for a single pair potential does not apply; None if it applies."""
     if simulation.pairwise and "" not in simulation.model.terms:
         return f"it is for one pair potential, and {simulation.potential.name} are several terms"
     return pairs_only(simulation)
 
 
 def rounded(simulation: Simulation) -> str | None:
-    """Return the reason why forces in a type below 32 bits have no derivative (rounding), or None."""
+    """Return why forces in a type of fewer than 32 bits have no derivative; None for other types."""
     if simulation.policy.dtype("force").itemsize < 4:
         precision = simulation.policy.force
         return f"forces in {precision} are rounded after every operation, which has no derivative"

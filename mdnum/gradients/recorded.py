@@ -267,7 +267,7 @@ class Reversible(Method):
 
 @dataclass(frozen=True)
 class Surrogate(Method):
-    """Gradient method: gradient of another program with a switched cutoff, whose force does not jump."""
+    """Gradient method: gradient of a program with a switched cutoff, so that the force does not jump."""
 
     cutoff: str = "quintic"  # of the twin; one with an onset
     onset: float = ONSET_FRACTION  # where its switching begins, as a share of the cutoff
@@ -298,7 +298,7 @@ class Surrogate(Method):
 
 
 def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
-    """Return the number of crossings and of grazing crossings, and the crossings with the largest weights."""
+    """Return how many crossings and how many grazing crossings occur, and those with the largest weights."""
     speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
     flips = {name: joined(crossings, name, ledger=True) for name in ("step", "i", "j", "entered")}
     key, heavy = -np.abs(weight), np.arange(len(weight))

@@ -39,7 +39,7 @@ _FINGERPRINTS = 256
 
 @dataclass(frozen=True)
 class TapeStretch:
-    """Recorded states and decisions of successive steps with one neighbor list, atoms in the list's order."""
+    """States and decisions of successive steps with one neighbor list; atoms are in the list's order."""
 
     # first, rows: its first step and the number of rows in use; those beyond are void
     first: int
@@ -77,7 +77,7 @@ class TapeStretch:
         return replace(self, **{name: jax.tree.map(copied, getattr(self, name)) for name in _COLUMNS})
 
     def roomy(self) -> TapeStretch:
-        """Return a copy padded to one of a few standard numbers of steps, to limit compilations."""
+        """Return a copy padded to one of a few standard numbers of steps, for fewer compilations."""
         columns = jax.tree.leaves([getattr(self, name) for name in _COLUMNS])
         per_row = sum(column[0].nbytes for column in columns)
         return self.cut(room_for(self.rows - 1, per_row))
@@ -307,7 +307,7 @@ class ReversibleTape(RunTape):
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:
-        """Run the steps again, because states are not stored, and yield the stretches of steps in order."""
+        """Run the steps again, whose states were not stored, and yield the stretches in order."""
         return RunTape(self.simulation, self.loss, self.steps, flips=self.flips).forward()
 
     def backward(self) -> Iterator[TapeStretch]:
@@ -365,7 +365,7 @@ def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.nda
 
 
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:
-    """Convert a recorded step to a `LossFrame` with unwrapped positions, atoms in the user's order."""
+    """Convert a recorded step to a `LossFrame`: positions unwrapped, atoms in the user's order."""
     step, x, v, images, potential, virial = row[:6]
     whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(x.dtype)
     return LossFrame(step, unsorted(whole, order), unsorted(v, order), potential, virial)

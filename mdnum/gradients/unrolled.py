@@ -83,7 +83,7 @@ class RunConstants(NamedTuple):
 
 
 class Place(NamedTuple):
-    """State without derivatives that is needed to continue a run: integers, and data of the neighbor list."""
+    """Nondifferentiable state, needed to continue a run: integers, and data of the neighbor list."""
 
     step: Int[Array, ""]  # the step whose forces come next
     images: Int[Array, "3 atoms"]  # lattice vectors taken off so far
@@ -208,7 +208,7 @@ def pull(back, onto_between: StepEnds, onto_inputs: Inputs) -> tuple[StepEnds, I
 
 
 class Snapshot(NamedTuple):
-    """A state between two chunks of steps; `slots` is the capacity of the neighbor list (0: default)."""
+    """State between two chunks of steps; `slots` is the capacity of the neighbor list (0 for default)."""
 
     between: StepEnds
     place: Place

@@ -1,4 +1,4 @@
-"""Registry of all calculator checks, from the modules of this package and from plugins."""
+"""Registry of all calculator checks in the modules of this package and in plugins."""
 
 from __future__ import annotations
 

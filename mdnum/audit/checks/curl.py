@@ -41,7 +41,7 @@ class Loop:
 
     @property
     def share(self) -> float:
-        """Antisymmetric part of the derivative matrix of the forces, divided by the symmetric part."""
+        """Ratio of the antisymmetric to the symmetric part of the derivative matrix of the forces."""
         return abs(self.curl) / self.stiffness if self.stiffness else (float("inf") if self.curl else 0.0)
 
 
@@ -52,7 +52,7 @@ class CurlCheck(AuditCheck):
     needed_to = ("differentiate",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compute the circulation of the forces around circles in several planes of coordinate space."""
+        """Compute the work of the forces around circles in several planes of coordinate space."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
         radii, ways = _RADII[:1] if self.brief else _RADII, Ways()
@@ -98,7 +98,7 @@ class CurlCheck(AuditCheck):
 
 
 def agreed(tried: Sequence[Loop]) -> Loop:
-    """Return the loop with the smallest error, which is increased if loops with other radii disagree.
+    """Return the loop with the smallest error; the error is increased if loops with other radii disagree.
 
     The curl is the same for every small circle, while the work due to a jump of the forces depends on the
     radius.
@@ -153,8 +153,7 @@ def around(
 ) -> Loop:
     """Compute the work of the forces around x + radius (u cos t + v sin t), for orthogonal unit vectors u, v.
 
-    Error:
-        the spread of the result over subsets of the points, and the noise of the forces.
+    Error: estimated from the spread of the result over subsets of the points, and from force noise.
     """
     angles = 2 * np.pi * np.arange(_POINTS) / _POINTS
     forces = [

@@ -121,7 +121,7 @@ def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor
 
 
 def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult:
-    """Return the result of a short run, which tests whether energies depend on earlier steps."""
+    """Return the result of a short run that tests whether energies depend on earlier steps."""
     (differs, allowed), steps = stale, len(ran.potential) - 1
     change = 1e3 * largest(ran.total - ran.total[0]) / ran.positions.shape[1]
     seen = Measured(differs, "energy", allowed)
@@ -143,7 +143,7 @@ def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
 
 @dataclass(frozen=True)
 class TwoRuns:
-    """Two runs, with the full and with half the time step, and their energy balance."""
+    """Two runs, one with the full and one with half the time step, and their energy balances."""
 
     subject: CalculatorSubject
     # whole, half: the run, and the one with half its time step
@@ -360,7 +360,7 @@ class TwoRuns:
 
 
 class _Bridge(Calculator):
-    """An ASE calculator around the audited calculator, to save structures on which the calculator fails."""
+    """An ASE calculator that calls the audited calculator, and saves structures on which it fails."""
 
     implemented_properties = ["energy", "forces"]  # noqa: RUF012
 

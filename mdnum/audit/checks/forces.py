@@ -1,4 +1,4 @@
-"""Compare forces with finite differences of the energy; the step is chosen from the calculator's noise."""
+"""Compare forces with finite differences of the energy, with a step that suits the calculator's noise."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ Displacement = Float[np.ndarray, "atoms 3"]
 
 @dataclass(frozen=True)
 class Slope:
-    """Derivative of the energy along a direction, from finite differences and from the forces."""
+    """Derivative of the energy along a direction, computed from finite differences and from the forces."""
 
     direction: str  # in words
     difference: float  # by differences of the energy, eV/Å
@@ -217,7 +217,7 @@ def slope(
     noise: NoiseFloor,
     what: str = "",
 ) -> Slope:
-    """Derivative of the energy along a line: from finite differences, with its error, and from the forces.
+    """Derivative of the energy along a line, from finite differences (with its error) and from the forces.
 
     Args:
         line: displacement of the atoms per Å of step; `what` is the name of the line.
@@ -342,7 +342,7 @@ def _row(one: Slope) -> dict[str, Any]:
 
 
 def _chart(slopes: list[Slope]) -> Chart:
-    """Chart of force error against finite-difference step: a valley for correct forces, else a plateau."""
+    """Chart of force error against finite-difference step; a valley for correct forces, else a plateau."""
     shown = slopes[:_DIRECTIONS]
     shown += [one for one in [_worst(slopes)] if one not in shown]
     lines = {one.direction: one.gaps[::-1].tolist() for one in shown}

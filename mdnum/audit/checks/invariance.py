@@ -184,7 +184,7 @@ class InvarianceCheck(AuditCheck):
     def _without_topology(
         self, wrong: dict[str, list[_Difference]], judge: _Judge
     ) -> dict[str, list[_Difference]]:
-        """Return the differences that remain if the calculator derives molecules from the atom order."""
+        """Return the differences without those due to the atom order, if this order defines the molecules."""
         rng = np.random.default_rng(self.seed + 1)
         grouped = by_molecule(judge.atoms, rng)
         try:
@@ -209,7 +209,7 @@ class InvarianceCheck(AuditCheck):
 
 
 class _Judge:
-    """Compares representations of a structure; allowed differences are measured for each size of rounding."""
+    """Compares representations of a structure; the allowed differences depend on the size of rounding."""
 
     def __init__(self, subject: CalculatorSubject, rng: np.random.Generator):
         self.subject, self.worker, self._rng = subject, subject.fresh(), rng
@@ -286,7 +286,7 @@ def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]
 
 
 def _in_turns(ways: Iterable[Same]) -> list[Same]:
-    """Order representations so that one of each kind is tested first, then a second of each kind."""
+    """Order representations so that one of each kind is tested first, and then a second one of each kind."""
     seen: dict[str, int] = {}
     turns = []
     for same in ways:
@@ -390,7 +390,7 @@ def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | None:
-    """Return structures with molecules reordered or in other images; None if the structure has none."""
+    """Return structures with molecules reordered or in other images; None if there are no molecules."""
     size = group(atoms)
     if size is None:
         return None
@@ -405,7 +405,7 @@ def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | N
 
 
 def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
-    """Yield structures whose cell is one rounding unit larger or smaller, with unchanged positions."""
+    """Yield structures with unchanged positions and a cell that is one rounding unit larger or smaller."""
     if not atoms.pbc.any():
         return
     for what, base in (("", atoms), (", of the structure as it was given", given)):

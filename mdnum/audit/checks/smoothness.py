@@ -151,7 +151,7 @@ def figures(
 
 
 def _rounded_up(value: float) -> float:
-    """Round a detection limit up to one significant digit."""
+    """Round a detection limit upward to one significant digit."""
     digit = 10.0 ** np.floor(np.log10(value))
     return float(np.ceil(value / digit) * digit)
 
@@ -186,7 +186,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
 
 
 def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield a finding if, at a pair threshold, a lower derivative jumps among many atoms than for a pair."""
+    """Yield a finding if, at a pair threshold, a lower derivative jumps for many atoms than for two atoms."""
     if not around.lower:
         return
     worst = min(
@@ -385,7 +385,7 @@ def _energies(walk: PairWalk, kT: float) -> Chart:
 
 
 def _close_up(walk: PairWalk, threshold: PairThreshold, subject: CalculatorSubject) -> Chart:
-    """Chart of energy or force at adjacent floating-point distances on both sides of a jump."""
+    """Chart of the energy or force near a jump, at adjacent floating-point distances on both sides."""
     below, above = [threshold.inside], [threshold.outside]
     for _ in range(_ULPS - 1):
         below.append(float(np.nextafter(below[-1], -np.inf)))

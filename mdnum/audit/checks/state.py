@@ -237,7 +237,7 @@ def _again(
 
 
 def _how(repeats: Mapping[str, Any]) -> str:
-    """Return the name of the text variant about repeated calls."""
+    """Return the name of the variant of a finding's text that describes repeated calls."""
     if not repeats["bit-identical"]:
         return "state_not_repeated"
     return "state_repeated" if repeats["bit-identical between objects"] else "state_not_between"
@@ -311,7 +311,7 @@ def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _kept_within(subject: CalculatorSubject, sizes: np.ndarray, at: Callable[[float], Atoms]) -> float:
-    """Return the longest of successive moves after which a calculator object repeats its last result."""
+    """Return the longest of several moves after which a calculator object returns its previous result."""
     used = subject.fresh()
     used.forgets = False
     places = np.array([0.0, *np.cumsum(sizes)])

@@ -152,7 +152,7 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 def _pair(
     back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
-    """Return atoms and distance of the pair to which an operation's result belongs; -1, -1, NaN if none."""
+    """Return both atoms and the distance of the pair of a result; -1, -1, NaN for a result without pair."""
     nowhere = (-1, -1, float("nan"))
     if made is None or not made.index:
         return nowhere

@@ -42,7 +42,7 @@ _FIRST, _FACTOR = 1e-12, 8.0
 class FlipTerms:
     """Contributions of all flips to the derivative with respect to each parameter entry, largest first.
 
-    A number here means a scalar parameter, or one entry of an array parameter ("potential.sigma[1]").
+    Here, a number is a scalar parameter or one entry of an array parameter ("potential.sigma[1]").
     """
 
     # a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the decision,
@@ -134,7 +134,7 @@ def flips(
 
 @dataclass(frozen=True)
 class DecisionEdge:
-    """Nearest parameter value, on one side, at which a decision changes, with gradients on both sides."""
+    """Nearest parameter value in one direction at which a decision changes, and gradients on both sides."""
 
     side: str  # "below" or "above"
     runs: int  # that the search took

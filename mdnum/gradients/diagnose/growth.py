@@ -219,7 +219,7 @@ class ScalingWatch:
             table["largest"][step] = np.inf
 
     def result(self) -> Scaling:
-        """Return counts of overflow and underflow, without scale and with the best scale of the loss."""
+        """Count overflow and underflow for the unscaled loss, and for the best scale of the loss."""
         form = self.format
         largest = float(self.table["largest"].max())
         there = self.exponents.sum(axis=1, dtype=np.int64)
@@ -303,7 +303,7 @@ class Jacobian:
         self.coordinates = 6 * tape.simulation.atoms
 
     def image(self, block: Float[np.ndarray, "coordinates vectors"], backward: bool = False) -> TangentImage:
-        """Return the image of a block under the Jacobian, or under its transpose if `backward`."""
+        """Return the Jacobian times a block of vectors; if `backward`, its transpose times the block."""
         stretches = self.tape.backward() if backward else self.tape.forward()
         vectors, steps = block.shape[1], self.tape.steps
         mixing, log_scale = np.eye(vectors), 0.0
@@ -460,7 +460,7 @@ def _defect(start, there: TangentImage, back: TangentImage) -> float:
 
 
 def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return logarithms of singular values, left and right singular vectors of a Jacobian on a block."""
+    """Return log singular values and singular vectors (left, right) of a Jacobian restricted to a block."""
     diagonal = image.stretches[-1]
     if diagonal.max() - diagonal.min() > _RANGE:
         # rounding has eaten the small ones in the product; the block is aligned, so its diagonal has them

@@ -77,12 +77,12 @@ class Turns:
 
     @property
     def gap(self) -> Float[np.ndarray, "turns"]:
-        """Distance to the cutoff in a run with shorter time steps; negative if the pair passed the cutoff."""
+        """Distance to the cutoff in a run with shorter steps; negative if the pair crossed the cutoff."""
         return self.table["gap"] + self.table["side"] * self.table["finer"]
 
     @property
     def reach(self) -> Float[np.ndarray, "turns"]:
-        """Uncertainty of the distance at each turning point, from its shifts in other runs."""
+        """Uncertainty of the distance at each turning point, estimated from its shifts in other runs."""
         if not len(self):
             return np.zeros(0)
         shift = self.table["shift"]
@@ -94,7 +94,7 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """True if the cutoff is within the distance's uncertainty, or was passed between two steps only."""
+        """True if a distance equals the cutoff within its error, or crosses it only between two steps."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
@@ -139,7 +139,7 @@ class Turns:
 
 @dataclass
 class Near:
-    """Collector of turning points of pair distances, with weights, tangents and shifts in other runs."""
+    """Collects turning points of pair distances, and their weights, tangents and shifts in other runs."""
 
     simulation: Simulation
     pace: Pace  # how often the loss looks
@@ -206,7 +206,7 @@ class Near:
         found["moved"] = np.asarray(along.r_cut).T[found["kind"]] - dr
 
     def compared(self, stretch: TapeStretch, per: int) -> None:
-        """Compare distances at turning points with another run, which takes `per` steps for each step."""
+        """Compare distances at turning points with those in a run of `per` steps for each step."""
         cell, place = HostCell(self.simulation.cell), stretch.table.place
         for found in self._found.values():
             for earlier, name in ((1, "before"), (0, "after")):

@@ -232,7 +232,7 @@ class Judgment:
 
 @dataclass(frozen=True)
 class Trust(Judgment):
-    """How far a gradient can be trusted: overall verdict on all parameters, and verdict on each parameter."""
+    """Number of steps for which a gradient can be trusted: verdicts on all parameters and on each."""
 
     by: dict[str, Judgment]  # of each parameter, by full name
     tolerance: float  # relative difference above which two precisions, or two time steps, disagree
@@ -403,7 +403,7 @@ def no_half_step(simulation: Simulation) -> bool:
 def verdict_of(
     limits: Sequence[Limit], steps: int, chaotic: bool, skipped: bool
 ) -> tuple[str, int, str, tuple[str, ...]]:
-    """Return the verdict, the horizon up to which no limit is reached, the first limit, unexamined limits."""
+    """Return the verdict, the last horizon within all limits, the first limit, and unexamined limits."""
     examined = [one for one in limits if one.horizon is not None]
     horizon = min((one.horizon or 0 for one in examined), default=0)
     met = [one.what for one in examined if one.reached and one.horizon == horizon]
@@ -422,7 +422,7 @@ def _unseen(part: StretchTangents) -> None:
 
 
 def _digits(*relative: float) -> int:
-    """Return the number of decimal digits in which values agree, from the largest relative difference."""
+    """From the largest relative difference, compute the number of decimal digits that agree."""
     worst = max(relative)
     if not np.isfinite(worst):
         return 0
@@ -486,7 +486,7 @@ def _left_out(
     made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
     tolerance: float,
 ) -> Limit | None:  # fmt: skip
-    """Return a limit if gradients lack a large contribution of grazing flips or of jumps of the loss."""
+    """Return a limit if gradients omit a large contribution of grazing flips or of jumps of the loss."""
     tape, met = made.tape, made.crossings[::-1]
     energy, virial, speed, weight, slow = (
         joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")
