@@ -301,7 +301,7 @@ def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]
         ),
         f"Each row has {fewer} to {most} starting states (see the tables); with fewer starting states, the "
         f"upper bound is larger. The verdict was undecided for these starting states: {open_ or 'none'}; in "
-        "the other rows it was never undecided.",
+        "the other rows the verdict was never undecided.",
     )
     return "\n\n".join(fill_text(one, 118, break_on_hyphens=False) for one in sentences)
 
