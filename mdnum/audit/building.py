@@ -264,7 +264,7 @@ def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """Estimate the cutoff of a pair interaction and the distance of lowest energy; None if not found.
+    """Estimate the cutoff of a pair interaction and the distance of lowest energy; None if there is none.
 
     If the calculator fails on atoms without neighbors, the cutoff is the distance at which it begins to fail.
     """

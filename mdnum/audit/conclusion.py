@@ -1,4 +1,4 @@
-"""Overall conclusion of all calculator checks: is it safe to run the calculator, and to differentiate it?"""
+"""Conclusion of all calculator checks: is it safe to run and to differentiate the calculator?"""
 
 from __future__ import annotations
 

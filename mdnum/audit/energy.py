@@ -90,7 +90,7 @@ class RunCrossing:
 
     @property
     def sign(self) -> float:
-        """Direction of the crossing: 1 if the distance falls below the threshold, -1 if it rises above."""
+        """1 if the pair distance falls below the threshold at this crossing, -1 if it rises above it."""
         return 1.0 if self.entered else -1.0
 
 
@@ -320,7 +320,7 @@ class EnergyBalance:
 
     @property
     def filled(self) -> Steps:
-        """Energy change at each step that is not explained by jumps, eV; the mean for steps not measured."""
+        """Energy change (eV) at each step that jumps do not explain; for unmeasured steps, the mean."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 
@@ -333,7 +333,7 @@ class EnergyBalance:
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
 
     def by_means(self, crossed: Sequence[RunCrossing], steps: int) -> Steps:
-        """Estimate the energy change by another run's flips at each step, from this run's mean jumps, eV."""
+        """From this run's mean jumps, estimate the energy change (eV) due to another run's flips by step."""
         jumps, means = np.zeros(steps), self.means
         for one in crossed:
             jumps[one.step] += one.sign * means.get(one.threshold, 0.0)

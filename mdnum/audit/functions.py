@@ -97,7 +97,7 @@ def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
 
 
 def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
-    """Return a function for the cut energy and its first derivatives just inside each given distance."""
+    """Return a function for the energy with cutoff and its first derivatives just inside given distances."""
 
     @jax.jit
     def evaluate(own, r_cut, r_onset, r):
@@ -172,7 +172,7 @@ def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float
 
 
 def _share(four: np.ndarray, width: float) -> np.ndarray:
-    """Relative difference between energy change and work of the force, from cubics through four points."""
+    """Relative difference of energy change and work of the force; cubics are fitted to four points."""
     u, f = np.moveaxis(four, -1, 1)
     with np.errstate(invalid="ignore"):
         change, work = u[2] - u[1], (13 * (f[1] + f[2]) - f[0] - f[3]) * width / 24
@@ -180,7 +180,7 @@ def _share(four: np.ndarray, width: float) -> np.ndarray:
 
 
 def _poles(curve: Curve, grid: np.ndarray, force: np.ndarray) -> list[float]:
-    """Return the distances at which the force diverges: there it grows each time the spacing is reduced."""
+    """Return distances at which the force diverges: it grows each time the point spacing is reduced."""
     inner = force[1:-1]
     peaks = 1 + np.flatnonzero((inner >= force[:-2]) & (inner >= force[2:]) & (inner > 0))
     found, usual = [], np.median(force[np.isfinite(force)])

@@ -284,7 +284,7 @@ def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairTh
 def _end_of(
     coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]
 ) -> tuple[float, float] | None:
-    """Return the last distance with a nonzero interaction and the next double; None without interaction.
+    """Return the last distance with a nonzero interaction, and the next double; None if there is none.
 
     A smooth switching function may round to zero at some distances before its end, so the search continues
     outward from any nonzero interaction found at a larger distance.

@@ -1,10 +1,10 @@
-"""Test whether a fork is benign: whether two programs with diverging runs give the same averages.
+"""Test whether a fork is benign, that is, whether two programs with diverging runs give the same averages.
 
-Runs of program B are compared with an ensemble of runs of program A, at a step that is found by calibration.
-At early steps, runs differ by less than rounding errors can cause; at late steps, every run has forgotten its
-start, and a changed program has the same scatter. The steps suitable for a comparison depend on the system.
-For calibration, programs with deliberate changes are run; at the chosen step, all deliberate changes are
-distinguishable from rounding.
+Runs of program B are compared with an ensemble of runs of program A at one step, which calibration
+determines. At early steps, runs differ by less than rounding errors can cause; at late steps, every run has
+forgotten its start, and a changed program has the same scatter. The steps suitable for a comparison depend on
+the system. For calibration, programs with deliberate changes are run; at the chosen step, all deliberate
+changes are distinguishable from rounding.
 
 The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
 Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
@@ -111,7 +111,7 @@ class Space:
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations above which a principal component counts as an outlier.
 
-    The limit is two, or more if needed for at most a tenth of the ensemble's own runs to be outliers. Each
+    The limit is two; it is raised if more than a tenth of the ensemble's own runs would be outliers. Each
     run is judged by components of other runs: a run stands out less in components that it influenced.
     """
     seconds = np.empty(len(features))
@@ -133,7 +133,7 @@ def two_of_three(rate: float) -> float:
 
 
 def bounds(count: int, of: int) -> tuple[float, float]:
-    """Compute the exact (Clopper-Pearson) 95 % confidence interval of a rate from `count` of `of` trials."""
+    """Compute the exact (Clopper-Pearson) 95 % confidence interval of a rate: `count` of `of` trials."""
     tail = 0.025
     low = betaincinv(count, of - count + 1, tail) if count else 0.0
     high = betaincinv(count + 1, of - count, 1 - tail) if count < of else 1.0
@@ -395,7 +395,7 @@ def _check(twin: Twin) -> None:
 
 
 def _failing(calibration: Calibration, rows: np.ndarray, scores: np.ndarray) -> dict[str, float]:
-    """Return the features that contribute most to the principal components beyond the limit."""
+    """Return the features that contribute most to the principal components that exceed the limit."""
     space, limit = calibration.window.space, calibration.window.limit
     z = np.median(space.standardized(rows), axis=0)
     middle = np.median(scores, axis=0)

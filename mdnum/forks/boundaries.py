@@ -162,7 +162,7 @@ class NumberLine:
         return self.known[place].digest
 
     def changes(self, a: int, b: int) -> Iterator[tuple[int, int, dict[int, DecisionHistory]]]:
-        """Yield adjacent ordinals with different histories, upward, and the runs that were made to find them.
+        """Yield, in ascending order, adjacent ordinals with different histories, and the runs made.
 
         Cells whose ends have the same history are not searched.
         """
@@ -289,7 +289,7 @@ def _unpacked_line(data: bytes) -> NumberLine:
 
 
 def _run(task: tuple[NumberLine | bytes, int]) -> DecisionHistory:
-    """Run the program at one ordinal."""
+    """Run the program for the parameter value with one ordinal."""
     line, place = _line_of(task[0]), task[1]
     line.digest(place)
     return line.known[place]
@@ -349,7 +349,7 @@ def digests_elsewhere(
 ) -> Iterator[str]:
     """Yield digests of all decisions of runs in a new process, to confirm boundaries independently.
 
-    The system is restored there bit for bit, and its program is compiled again under the same environment.
+    The new process restores the system bit for bit, and compiles its program again in the same environment.
 
     Raises:
         MdnumError: the process failed.

@@ -1,4 +1,4 @@
-"""Reliability of the decisions of a run, by itself and relative to another run.
+"""Certify the decisions of one run, and the agreement of its decisions with those of another run.
 
 Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound: exact arithmetic
 would give the same decisions for the same states. Up to the end of *protection*, the pair of atoms closest to
@@ -113,7 +113,7 @@ def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
 
 
 def wider(twin: Twin) -> str | None:
-    """Return the program that is more precise in some role and less precise in none; None if there is none.
+    """Return the program that is more precise in some role and less precise in none, or None.
 
     The programs must be identical otherwise: the effect of a different time step is not rounding.
     """
@@ -169,8 +169,7 @@ class CertifiedHorizon:
 
 
 def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
-    """Compare every pair decision of a run with its rounding bound; repeat ambiguous ones in exact
-    arithmetic.
+    """Compare every margin of a run with its rounding bound; repeat ambiguous decisions in exact arithmetic.
 
     Raises:
         InputError: the rule for rebuilding neighbor lists may miss pairs.

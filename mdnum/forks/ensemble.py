@@ -1,4 +1,4 @@
-"""Runs from perturbed starts, features measured at a few steps, and programs with deliberate changes.
+"""Make runs from perturbed starts, measure features of these runs, and make deliberately changed programs.
 
 Every feature is a continuous function of the positions, so that small differences between the runs of an
 ensemble remain small in the features. Pairs are therefore counted with hat functions and not in bins.
@@ -55,7 +55,7 @@ def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]
 
 
 def feature_names(nodes: Float[np.ndarray, "nodes"]) -> tuple[str, ...]:
-    """Return the names of the features, in the order of the values returned by `measure`."""
+    """Return the names of the features in the order of the values that `measure` returns."""
     return (*_NUMBERS, *(f"pairs at distance {r:.3g}" for r in nodes[:-1]))
 
 
@@ -134,7 +134,7 @@ def starts(simulation: Simulation, count: int, seed: int, start: Start | None = 
 
 
 def stretches(simulation: Simulation, start: Start, steps: Iterable[int]) -> Iterator[Segment]:
-    """Run to each of several ascending steps, and yield each part of the run; stop if the run blows up."""
+    """Run to several ascending steps in turn, and yield each part of the run; stop if the run blows up."""
     for step in steps:
         for segment in Engine(simulation, step, start=start, record=False).segments():
             if segment.closes in FAILURES:
@@ -202,9 +202,9 @@ class Change:
 def planted(a: Simulation) -> tuple[Change, ...]:
     """Create the programs with deliberate changes that are possible for a simulation.
 
-    The test must detect a longer time step and a shorter cutoff. Forces in another precision, pairs in
-    another order and the other neighbor search must pass. The cutoff and the precision of a many-body
-    potential cannot be changed, so these two changes are omitted for it.
+    The test must detect programs with a longer time step or a shorter cutoff. Forces in another precision,
+    pairs in another order and the other neighbor search must pass. The cutoff and the precision of a
+    many-body potential cannot be changed, so these two changes are omitted for it.
     """
     longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
     search = next(name for name in BUILDERS if name != a.builder)

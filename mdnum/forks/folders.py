@@ -92,7 +92,7 @@ class FolderFork:
 
 
 def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> FolderFork:
-    """Find the point at which two runs diverge, from their folders.
+    """Find the point at which two runs diverge, reading only their folders.
 
     Args:
         a, b: run folders, both of molecular dynamics or both of a ball; or folders of `mdnum flips` and
@@ -356,7 +356,7 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
 
 
 def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
-    """Compare two sets of atoms property by property; yield whether they agree, with a message if not."""
+    """Compare two sets of atoms; for each property, yield whether it agrees, and a message if it does not."""
     yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
     symbols = [each.get_chemical_symbols() for each in (one, other)]
     yield symbols[0] == symbols[1], "species or their order differ"

@@ -244,8 +244,8 @@ class Lyapunov:
     def steps_to(self, start: float, end: float) -> float | None:
         """Return the step at which an initial displacement has grown from one length to another.
 
-        The growth is taken from the run, and extrapolated exponentially beyond the end of the run. The result
-        is None if the run is not chaotic and the displacement does not reach the final size.
+        The growth is that of the run; beyond the end of the run, the growth is extrapolated exponentially.
+        The result is None if the run is not chaotic and the displacement does not reach the final size.
 
         Args:
             start: largest displacement of an atom at the start, length; for example one rounding unit.
@@ -368,7 +368,7 @@ class Forecast:
     def first(self, amplitude: float, count: int = 3) -> tuple[PredictedFlip, ...]:
         """Predict the decisions that a perturbation flips first, by step, while the forecast is valid.
 
-        At most `KEPT` flips of a step are listed; if there are `KEPT`, more decisions may flip at this step.
+        At most `KEPT` flips per step are listed; if `KEPT` flips are listed, the step may have more flips.
 
         Args:
             amplitude: amplitude of the perturbation; its sign matters.
@@ -421,7 +421,7 @@ class Forecast:
 
 
 def _each_pair_once(flips: Iterable[PredictedFlip], count: int) -> tuple[PredictedFlip, ...]:
-    """Return the first `count` flips, no more than one for each pair of atoms."""
+    """Return the first `count` predicted flips, at most one for each pair of atoms."""
     found: dict[tuple[int, int], PredictedFlip] = {}
     for flip in flips:
         found.setdefault((flip.i, flip.j), flip)

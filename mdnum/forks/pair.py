@@ -1,4 +1,4 @@
-"""Compare two runs until they split: steps of fork and split, the deciding flip, and the verdict."""
+"""Compare two runs until they split; find the steps of fork and split, the deciding flip, and the verdict."""
 
 from __future__ import annotations
 
@@ -327,7 +327,7 @@ def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
 
 @result
 class Screened:
-    """Effect of one numerical choice within the steps that were run."""
+    """Effect of one numerical choice within the steps of the comparison."""
 
     choice: str  # its name
     difference: str  # one line; why it does not apply where it does not

@@ -118,7 +118,7 @@ class Variants:
 
     @property
     def clusters(self) -> list[list[str]]:
-        """Names of variants whose results agree bit for bit, in groups; that of the reference is first."""
+        """Names of variants, in groups with bit-identical results; the group of the reference comes first."""
         count = max(row.cluster for row in self.rows) + 1
         return [[row.variant.name for row in self.rows if row.cluster == k] for k in range(count)]
 
@@ -371,9 +371,9 @@ def _question(system: Simulation | BallSystem, steps: int, folder: Path) -> dict
 
 
 def _ask(question: Mapping[str, Any], file: Path, settings: Mapping[str, str]) -> str:
-    """Run a process that executes a task; return the reason if the process fails, and "" otherwise.
+    """Run a process that executes a task; return why the process failed, or "" if it succeeded.
 
-    `settings` are environment variables.
+    `settings` are environment variables of the new process.
     """
     file.write_text(json.dumps(question))
     try:

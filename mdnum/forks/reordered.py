@@ -1,5 +1,4 @@
-"""Simulations whose neighbor lists hold the same pairs in another order: that of a jax-md format, or
-shuffled.
+"""Simulations with neighbor lists in another order: the order of a jax-md format, or a random order.
 
 The two forces of a pair are exactly opposite, so that a list format changes only the order of sums. Dense and
 sparse lists contain each pair twice, and each entry contributes half of the pair force. For a sparse list,

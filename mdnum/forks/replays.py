@@ -89,7 +89,7 @@ def neighborhood(fork: Fork) -> Neighborhood | None:
 
 @dataclass(frozen=True)
 class Pinned:
-    """Result of a run B in which decisions of run A were imposed on some pairs of atoms."""
+    """Result of repeating run B with decisions of run A imposed on some pairs of atoms."""
 
     pairs: tuple[tuple[int, int], ...]  # whose decisions were
     # first, last: steps of the window in which they were
@@ -196,7 +196,7 @@ def check_pins(fork: Fork) -> None:
 
 
 def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
-    """Return intervals (first step, end step or None) in which the decisions of two runs on a pair differ.
+    """Return intervals (first step, end step or None) in which two runs make different decisions on a pair.
 
     Only the stored differences between the decisions of the two runs are used.
     """
@@ -216,7 +216,7 @@ def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
 
 @dataclass(frozen=True)
 class Minimal:
-    """A smallest set of atom pairs such that imposing run A's decisions on them keeps run B close to A."""
+    """A minimal set of atom pairs: imposing run A's decisions on these pairs keeps run B close to run A."""
 
     # pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A; None where
     # no set does
@@ -237,7 +237,7 @@ class Minimal:
 def minimal_cause(
     fork: Fork, *, tests: int = 80, progress: Callable[[int, int], None] | None = None
 ) -> Minimal:
-    """Find a minimal set of atom pairs such that imposing run A's decisions on it prevents a split of run B.
+    """Find a minimal set of atom pairs on which imposing run A's decisions prevents the split of the runs.
 
     Args:
         fork: a pair of runs with the same atom labels that has forked and split.
@@ -271,7 +271,7 @@ def minimal_cause(
 
 
 class _Search:
-    """Runs of B with decisions of run A imposed on some pairs, to test whether B stays close to A."""
+    """Repeats run B with decisions of run A imposed on some pairs, to test whether B stays close to A."""
 
     def __init__(
         self,
@@ -331,8 +331,8 @@ class _Search:
 def _required(keys: list[int], search: _Search, until: int) -> list[int]:
     """Find a sufficient set of pairs by bisecting for one necessary pair after another (QuickXplain).
 
-    Each pair takes about log2(n) runs; for delta debugging, the runs are quadratic in the number of pairs.
-    The method assumes that imposing more decisions does no harm, and stops after `until` runs.
+    Each pair requires about log2(n) runs; for delta debugging, the number of runs is quadratic in that of
+    pairs. The method assumes that imposing more decisions never causes a split; it stops after `until` runs.
 
     Source: Junker, QuickXplain, AAAI 2004.
     """

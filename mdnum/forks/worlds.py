@@ -90,7 +90,7 @@ def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> A
 
 
 def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> Twin:
-    """Make a pair of programs, for a system and for the same system with other values of some keys."""
+    """Make a pair of programs: one of a system, and one of the same system with other values of some keys."""
     other = varied(system, values, name)
     a, b = map(program_of, alike(system, other))
     return Twin(a, b, difference, changes(system, other))
@@ -109,7 +109,7 @@ def alike(a: Any, b: Any) -> tuple[Any, Any]:
 
 
 def changes(a: Any, b: Any) -> dict[str, list[Any]]:
-    """Return the keys whose values differ between two systems, with both values."""
+    """Return the keys with values that differ between two systems, and both values of each key."""
     if isinstance(a, BallSystem):
         tables = tuple(one.spec.model_dump(mode="json", exclude={"variants"}) for one in (a, b))
     else:

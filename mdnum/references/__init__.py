@@ -1,4 +1,4 @@
-"""Reference calculations with ASE, neighbor searches of libraries and numpy; mdnum as an ASE calculator.
+"""Reference results from ASE, from neighbor searches of libraries and from numpy; mdnum as an ASE calculator.
 
 Modules are imported at first use, since importing ASE, MDAnalysis or jax takes a second or more.
 """

@@ -87,7 +87,7 @@ def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, An
 
 
 def evaluate(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
-    """Return energy, forces, stress (3, 3) and atomic energies of a structure; None for missing values."""
+    """Return energy, forces, stress (3, 3) and atomic energies of a structure; missing values are None."""
     # ASE gives a stress for a molecule in a box, of the box's volume
     results = _results(calculator, atoms, atoms.cell.rank == 3 and bool(atoms.pbc.all()))
     if "stress" in results:

@@ -1,6 +1,6 @@
 """Choose the reference calculator for a simulation: the corresponding ASE class, or else plain numpy.
 
-Differences between mdnum and ASE, and the conversions of ASE's results that remove these differences:
+Differences between mdnum and ASE, and conversions of ASE's results that remove these differences:
 
 | system file | ASE | conversion |
 |---|---|---|
@@ -70,7 +70,7 @@ class Reference:
 
 
 def reference(subject: Simulation | System) -> Reference:
-    """Return the best available reference for a simulation: an ASE class if there is one, else plain numpy.
+    """Return the best reference for a simulation: an ASE class if there is one, and otherwise plain numpy.
 
     Args:
         subject: a `Simulation`, or a `System`, whose box may be too small for its skin.

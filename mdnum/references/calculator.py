@@ -31,7 +31,7 @@ _SAID = {"potential", "cutoff", "terms", "units"}
 
 
 class _Recipe(NamedTuple):
-    """Recipe for building a simulation of given atoms."""
+    """Recipe for building a simulation of given atoms with a given potential."""
 
     make: Callable[[Atoms], Simulation]  # without a skin: the evaluator keeps what the box has room for
     skin: float  # length
@@ -78,7 +78,7 @@ class MdnumCalculator(ClassicalCalculator):
 
     Use this calculator to relax structures with ase.optimize, to compute stress and equations of state, and
     to compare mdnum's forces with ASE's own tools. The Verlet list is kept between calls until motion and box
-    strain exceed its skin. For molecular dynamics use mdnum's rollout, which records flips.
+    strain exceed its skin. For molecular dynamics, use the function `rollout` of mdnum, which records flips.
 
     Args:
         system: a `Simulation`, a `System`, or the name or path of a system file; the evaluated atoms may
@@ -168,7 +168,7 @@ class MdnumCalculator(ClassicalCalculator):
         return results
 
     def _made_for(self, atoms: Atoms) -> Evaluator:
-        """Return an evaluator for the given atoms, at any positions and in any cell."""
+        """Return a function that evaluates the given atoms at any positions and in any cell."""
         # only what the forces depend on: constraints and the like stay with ASE
         bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
         if self._given is not None:

@@ -74,7 +74,7 @@ class FrameComparison:
 
 @dataclass(frozen=True)
 class EnergyReport:
-    """Comparison of energies, forces and stresses with a reference."""
+    """Comparison of mdnum's energies, forces and stresses with those of a reference."""
 
     system: str  # name
     reference: str  # what it was compared with; says so when it is not ASE
@@ -100,7 +100,7 @@ class EnergyReport:
         return worst if self.sampled is None else {**worst, "sampled": self.sampled}
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a table row for each compared frame."""
+        """Return table rows with the comparison of each frame."""
         narrow = {"energy, roundings": "energy_roundings", "force, roundings": "force_roundings"}
         columns = {
             "energy": "energy", "energy, relative": "energy_rel", "force, largest": "force_max",
@@ -257,7 +257,7 @@ def _off(mine: Evaluation, other: Mapping[str, Any], scale: float) -> tuple[floa
 
 
 def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
-    """Return energy and forces of the first `count` atoms only."""
+    """Return the energy and forces of only the first `count` atoms."""
     if len(results["forces"]) == count:
         return results
     energies = results["energies"][:count]
@@ -266,7 +266,7 @@ def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
 
 
 def _over(difference: float, scale: float) -> float:
-    """Return difference / scale, or 0 for a zero difference."""
+    """Return the difference divided by the scale; 0 for a zero difference."""
     return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
 
 
@@ -397,7 +397,7 @@ class DynamicsReport:
 
 
 def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
-    """Compare a run with ASE's velocity Verlet, starting from the same positions and velocities.
+    """Compare a run with a velocity Verlet run of ASE that starts from the same positions and velocities.
 
     A thermostat is switched off. A hard cutoff gives the same forces as ASE's shifted potential, so the
     trajectories must agree although the energies differ by constants.
@@ -463,7 +463,7 @@ PLACES, ATOMS = 8, 32  # places at random, and atoms nearest to each whose energ
 def neighborhoods(
     atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
 ) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
-    """Yield free clusters at random positions: a group of atoms with all atoms within `reach` of the group.
+    """Yield free clusters at random positions: a group of atoms, and all atoms within `reach` of this group.
 
     For a pair potential with range `reach`, the atoms of the group have the same energies and forces in the
     cluster as in the whole system. Neighbors are found from distances between atoms and images, without

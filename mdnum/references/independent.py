@@ -85,7 +85,7 @@ class Model(ABC):
     @property
     @abstractmethod
     def reach(self) -> float:
-        """Length beyond which an edge (a directed pair) does not contribute to the energy."""
+        """Distance beyond which an edge (a directed pair) does not contribute to the energy."""
 
     @abstractmethod
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
@@ -99,7 +99,7 @@ class ClassicalCalculator(Calculator):
     nolabel = True
 
     def calculate(self, atoms=None, properties=None, system_changes=all_changes):
-        """Evaluate a structure, as defined by ase.calculators.calculator.Calculator."""
+        """Evaluate a structure; the arguments are those of ase.calculators.calculator.Calculator."""
         super().calculate(atoms, properties or ["energy"], system_changes)
         results = self.evaluated(cast(Atoms, self.atoms), system_changes)
         self.results = {"free_energy": results["energy"], **results}

@@ -1,4 +1,4 @@
-"""LAMMPS as a reference for pair functions, evaluated and differentiated by its pair style `lepton`.
+"""LAMMPS as a reference for pair functions, which its pair style `lepton` evaluates and differentiates.
 
 The function traced by jax is translated to an expression that LAMMPS parses and differentiates symbolically,
 so an independent program computes pairs, sums, energies and derivatives.
@@ -95,7 +95,7 @@ def expression(function: Any) -> str:
 
 
 def expressions(simulation: Simulation) -> list[str]:
-    """Return the cut energy of a user's pair function as lepton expressions, one for each pair type.
+    """Return the energy of a user's pair function with cutoff as lepton expressions, one for each pair type.
 
     Raises:
         Untranslated: the model is not a single pair function, or lepton does not support it.

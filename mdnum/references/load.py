@@ -164,6 +164,6 @@ def place(text: str) -> NamedObject | None:
 
 
 def public(scope: Any) -> list[str]:
-    """Return the names of the public callables of a module or a class."""
+    """Return the names of the public functions and other callables of a module or a class."""
     scope = scope if isinstance(scope, ModuleType | type) else type(scope)
     return [name for name in vars(scope) if name[0] != "_" and callable(getattr(scope, name, None))]

@@ -36,7 +36,7 @@ class PairSet:
         return len(self.i)
 
     def select(self, mask: Bool[ndarray, "pairs"]) -> PairSet:
-        """Return the pairs for which `mask` is true."""
+        """Return only the pairs for which `mask` is true."""
         columns = self.i, self.j, self.shift, self.distance, self.inside, self.exact
         return PairSet(*(column[mask] for column in columns))
 
@@ -49,7 +49,7 @@ def widths(cell: Vectors) -> Float[ndarray, "3"]:
 def rounding_bound(
     positions: Positions, cell: Vectors, r_cut: float, *, unit_roundoff: float = 2.0**-53
 ) -> float:
-    """Upper bound on the rounding error of a computed distance that is close to r_cut, length.
+    """Upper bound on the rounding error (length) of a computed distance that is close to r_cut.
 
     The bound is valid for a code that wraps coordinates, adds a lattice vector, subtracts and takes the norm:
     numbers are at most as large as the coordinates plus the cell, and each operation rounds once or twice.
@@ -69,7 +69,7 @@ def rounding_bound(
 def exactly_inside(
     positions: Positions, cell: Vectors, i: int, j: int, shift: Shift, r_cut: float, *, closed: bool = False
 ) -> bool:
-    """Decide in exact arithmetic whether a pair is inside r_cut; `closed` counts r == r_cut as inside.
+    """Decide in exact arithmetic whether a pair is inside r_cut; if `closed`, r == r_cut counts as inside.
 
     In exact arithmetic, r < r_cut and r² < r_cut² are equivalent; rounding can make them differ.
     """
@@ -155,7 +155,7 @@ def completed(cell: Vectors, pbc: Axes) -> Vectors:
 
 
 def _within(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):
-    """Yield (i, j, shift, distance) of the pairs within `reach`, block by block."""
+    """Yield (i, j, shift, distance) of the pairs within `reach`, in several blocks of pairs."""
     n, stored, width = len(positions), np.where(pbc[:, None], cell, 0.0), widths(cell)
     fractional = np.linalg.solve(cell.T, positions.T).T
     # |normal component| <= reach, so when reach is under half a width the image in reach can only be

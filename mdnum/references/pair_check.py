@@ -43,7 +43,7 @@ class Search:
 
     @property
     def ours(self) -> bool:
-        """True if the neighbor search is used by mdnum, so that decisions of a run depend on the search."""
+        """True if mdnum uses the neighbor search, so that decisions of a run depend on this search."""
         return self.listed.package == "mdnum"
 
     @property
@@ -57,7 +57,7 @@ class Search:
 
     @cached_property
     def _full(self) -> bool:
-        """True if the neighbor search lists every pair twice, once from each atom."""
+        """True if the neighbor search lists every pair twice, once for each of its two atoms."""
         if self.listed.full is not None:
             return self.listed.full
         pair, cell, pbc = np.array([[0.0, 0, 0], [0.5, 0, 0]]), 4.0 * np.eye(3), np.ones(3, bool)
@@ -66,7 +66,7 @@ class Search:
         return len(read(self._call(pair, cell, pbc, 1.0))) > 1
 
     def refusal(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> str | None:
-        """Return the reason if the neighbor search does not support a structure; None if it does."""
+        """Return the reason why the neighbor search does not support a structure; None if it does."""
         if self.listed.version is None:
             return "not installed"
         positions, cell = self._placed(positions, cell, pbc)
@@ -205,7 +205,7 @@ class SearchResult:
 
 @dataclass(frozen=True)
 class PairsReport:
-    """Comparison of the pairs found by all neighbor searches with brute force."""
+    """Comparison of the pairs that neighbor searches find with those that brute force finds."""
 
     system: str  # name
     compare: str  # what inside means in this system
@@ -220,7 +220,7 @@ class PairsReport:
         return all(one.verdict in (AGREES, AT_THE_CUTOFF, NOT_TESTED) for one in self.results if one.ours)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a table row for each neighbor search."""
+        """Return table rows with the result of each neighbor search."""
         counts = ("pairs", "missing", "extra", "borderline")
         return [
             {"search": one.name, "version": one.version}
@@ -300,7 +300,7 @@ def check_pairs(
 
 
 def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: float) -> tuple[int, int, int]:
-    """Return the numbers of (missing, extra, borderline) pairs in a neighbor search, against brute force.
+    """Return the numbers of (missing, extra, borderline) pairs of a neighbor search, from brute force.
 
     Args:
         i, j: pairs from the neighbor search, i <= j, one row per periodic image.
@@ -335,7 +335,7 @@ class EffectiveCutoff:
 
     @property
     def stops(self) -> str:
-        """Deviation of the effective cutoff from the requested cutoff, as text."""
+        """Difference between the effective and the requested cutoff, as text."""
         if abs(self.ulps) < 1000:
             return f"{self.ulps:+d} ulp"
         return f"{self.last_counted / self.r_cut - 1:+.1e} relative"

@@ -105,7 +105,7 @@ def _edited(
 
 
 def _buffers(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """Test that returned arrays stay unchanged, and that writing to these arrays changes no later result."""
+    """Test that returned arrays stay unchanged, and that writing to these arrays affects no later result."""
     used, there = subject.fresh(), atoms.copy()
     used.copies = False
     used.both(there)

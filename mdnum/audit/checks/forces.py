@@ -281,7 +281,7 @@ def _best(
 
 
 def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dict[str, Any]]:
-    """Net force, and net torque of a nonperiodic structure; both are zero for a correct calculator."""
+    """Net force of a structure, and net torque if nonperiodic; for a correct calculator, both are zero."""
     size = float(np.sum(np.abs(forces)))
     allowed = noise.allowed.force * np.sqrt(len(atoms)) + 40 * np.finfo(float).eps * size
     net = float(np.linalg.norm(forces.sum(axis=0)))

@@ -253,7 +253,7 @@ class _Judge:
         ), answer
 
     def reference(self, base: Atoms, rounding: float) -> tuple[float, Forces, NoiseFloor]:
-        """Return energy and forces of a structure, and the differences allowed for this size of rounding."""
+        """Return energy and forces of a structure, and allowed differences for a given size of rounding."""
         power = int(np.ceil(np.log2(rounding))) if rounding > 0 else -9999
         key = id(base), power
         if key not in self._known:
@@ -519,6 +519,6 @@ def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
 
 
 def ulp(*structures: Atoms) -> float:
-    """Return the unit in the last place (ulp) of the largest coordinate or cell entry of structures, Å."""
+    """Return the unit in the last place (Å) of the largest coordinate or cell entry of structures."""
     parts = (part for one in structures for part in (one.positions, one.cell.array))
     return float(np.spacing(max(map(largest, parts))))

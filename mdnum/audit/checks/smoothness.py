@@ -243,7 +243,7 @@ def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) 
 
 
 def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
-    """Yield findings about atoms with many neighbors: a limit on the number of neighbors, or another jump."""
+    """Yield findings about atoms with many neighbors: a limit on this number, or another energy jump."""
     values: dict[str, Any] = {"species": one.species, "radius": one.radius}
     if one.kept:
         values |= {"kept": one.kept, "distance": one.distance, "force": one.force}
@@ -265,7 +265,7 @@ def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
 
 
 def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
-    """Yield findings about a pair interaction: no cutoff, a steep switch, or distances not examined."""
+    """Yield findings about a pair interaction: no cutoff, a steep switch, or unexamined distances."""
     further = walk.further
     if walk.cutoff is None and np.abs(walk.energy).max() > 0:
         # what was searched for an end, and no more
@@ -285,7 +285,7 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
 
 
 def _steepness(walk: PairWalk) -> tuple[float, float] | None:
-    """Return the largest curvature beyond the energy minimum, relative to the minimum, and its distance."""
+    """Return the largest ratio of curvatures beyond and at the energy minimum, and the distance."""
     curvature = -np.gradient(walk.force, walk.distance)
     bottom = int(np.argmin(walk.energy))
     if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:

@@ -154,7 +154,7 @@ class Comparison:
 
     @property
     def refused(self) -> CalculatorError | None:
-        """Error of the new calculator object, or else of the used object; None if there was no error."""
+        """Error of the new calculator object or, if none, of the used object; None if both succeeded."""
         return next((one for one in (self.new, self.old) if isinstance(one, CalculatorError)), None)
 
     @property
@@ -294,7 +294,7 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
 
 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Return the longest move of an atom or cell edge, Å, that leaves energy and forces unchanged; or 0.
+    """Return the longest move (Å) of an atom or cell edge that leaves energy and forces unchanged, or 0.
 
     A move is taken into account only if it should change several of the last digits of the results; the
     expected change is proportional to the length of the move.

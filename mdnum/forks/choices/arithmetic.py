@@ -174,7 +174,7 @@ class Order(Summed):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """True if sums do not depend on order, or if each ball is stopped separately."""
+        """True if sums do not depend on order, or if the solver stops separately for each ball."""
         return self.both in (*ORDERLESS, "alone")
 
     def describe(self, world: str = "md") -> str:
@@ -328,7 +328,7 @@ class RebuildChoice(Summed):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """True if sums do not depend on order and lists are rebuilt in time; else pairs may be missed."""
+        """True if sums do not depend on order and lists are rebuilt before a pair can be missed."""
         return super().must_hold and self.every in (1, None)
 
     @classmethod

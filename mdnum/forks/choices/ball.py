@@ -136,7 +136,7 @@ class ContactStep(Choice):
 
 @choice("iterations")
 class Iterations(Choice):
-    """One solve that makes more or fewer iterations than its stopping rule requires."""
+    """One call of the solver that makes more or fewer iterations than its stopping rule requires."""
 
     worlds = ("ball",)
     shown = True

@@ -236,7 +236,7 @@ def some(count: int, where: str) -> None:
 
 
 def plural(count: int, noun: str) -> str:
-    """Return the noun, with a final s unless the count is one."""
+    """Return the noun, with a final s if the count is not one."""
     return noun if abs(count) == 1 else f"{noun}s"
 
 

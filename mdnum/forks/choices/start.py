@@ -94,8 +94,8 @@ class Relabel(Summed):
 class Rotate(Summed):
     """The axes of the box exchanged or reversed.
 
-    An exchange of axes is exact, but the squared components of a distance vector are added in another order.
-    If the sign of an axis changes, positions are rounded once more when they are wrapped into the box.
+    An exchange of axes is exact, but afterwards squared components of a distance vector are added in another
+    order. If the sign of an axis changes, positions are rounded once more when they are wrapped into the box.
     """
 
     screened = "rotate rotate@exact"
@@ -189,7 +189,7 @@ class Images(Choice):
 
     @property
     def name(self) -> str:
-        """Text form of the choice: "translate=lattice", "unwrapped" or "unwrapped=3"."""
+        """The choice as text: "translate=lattice", "unwrapped" or "unwrapped=3"."""
         if self.seed is None:
             return "translate=lattice"
         return self.family if self.seed == 1 else f"{self.family}={self.seed}"
@@ -217,7 +217,7 @@ class Images(Choice):
 def exact_images(
     cell: Any, positions: Float[np.ndarray, "atoms 3"], images: Int[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"], int]:
-    """Return wrapped positions near given ones, their images, and the number of atoms without exact image.
+    """Return wrapped positions near given positions, their images, and how many atoms have no exact image.
 
     Wrapping the images gives the wrapped positions, bit for bit. In a box along the axes, a position with a
     rounded image has an exact image (Sterbenz's lemma: the lattice vector is subtracted again without

@@ -82,7 +82,7 @@ def ball_history(world: World, start: BallState, steps: int) -> BallRun:
 
 
 class _ExactBall:
-    """State of the balls in exact numbers, and the function that makes one time step."""
+    """State of the balls in exact numbers, with the function that makes one time step."""
 
     def __init__(self, world: World, start: BallState):
         contact, scheme = world.contact, world.integrator
@@ -204,7 +204,7 @@ class _ExactBall:
 
 
 class _ExactRule:
-    """A stopping rule of the solver in exact numbers; residuals and thresholds are per batch or per ball."""
+    """A stopping rule of the solver, in exact numbers; the residual is that of the batch or of each ball."""
 
     def __init__(self, world: World):
         rule: Any = world.contact.stop  # type: ignore[attr-defined]
@@ -217,7 +217,7 @@ class _ExactRule:
         self.tol = None if isinstance(rule, FixedCount) else _held(world, rule.tol)
 
     def measure(self, depths: Balls) -> Balls:
-        """Return the residual of the batch of balls, or the residual of each ball."""
+        """Return the residual of the whole batch of balls, or the residual of each ball."""
         if isinstance(self.rule, PerInstance):
             return depths
         if isinstance(self.rule, GlobalSum):

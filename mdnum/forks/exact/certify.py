@@ -1,4 +1,4 @@
-"""Find the step at which runs of each precision leave the exact history (decisions in exact arithmetic)."""
+"""Find the step at which runs in each precision leave the exact history (decisions in exact arithmetic)."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class PolicyHorizon:
         return float("nan") if self.decision is None else self.decision.margins["A"]
 
     def is_all(self, dtype: str) -> bool:
-        """Return True if every role has this dtype."""
+        """Return True if every role has the given dtype."""
         return set(self.roles.values()) == {dtype}
 
 
@@ -103,7 +103,7 @@ def certify(
     policies: Mapping[str, Roles] | None = None,
     progress: Progress | None = None,
 ) -> Certificate:
-    """Compute the exact history of a system, and the step at which runs of each precision leave this history.
+    """Compute the exact history of a system, and the step at which runs in each precision leave this history.
 
     The numbers of the system file are rounded to float64. A run in lower precision rounds these numbers
     further, and this rounding is included in its deviation.
@@ -227,7 +227,7 @@ def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], 
 
 
 def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
-    """Return ln 2 / growth rate (steps per bit) for the run in which growth was measured longest."""
+    """Return ln 2 / growth rate, in steps per bit, for the run in which growth was measured for longest."""
     # separations that grow by a power of time, as those of a lone pair, are no exponentials
     fits = [row.growth for row in rows if row.growth is not None]
     fits = [fit for fit in fits if fit.rate > 0 and fit.r_squared > _EXPONENTIAL]

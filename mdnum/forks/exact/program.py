@@ -49,7 +49,7 @@ _U = 2.0**-53
 def pull_of(
     potential: PairPotential, constants: Mapping[str, float], cutoff: str, r_cut: float, r_onset: float
 ) -> Callable[[Any], Any]:
-    """Return the function that computes 2 du/d(r²) of a pair inside the cutoff from an interval of r².
+    """Return a function that computes 2 du/d(r²) for a pair inside the cutoff from an interval of r².
 
     The factor 2 du/d(r²) multiplies the displacement x_j - x_i in the force on i. Constants are exactly the
     given doubles; derived values are intervals of the precision set at the time of the call.
@@ -102,7 +102,7 @@ def _enclosed(
 
 @dataclass(frozen=True)
 class ExactHistory:
-    """The exact history of a run: all its decisions, with proof."""
+    """The exact history of a run: all its decisions, each one proven."""
 
     tape: DecisionTape  # every decision, proven
     # smallest |threshold - r²| of any pair at each step, length², shape (steps + 1,); good to about ten

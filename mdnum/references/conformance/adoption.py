@@ -47,7 +47,7 @@ class NeighborListConformance:
         return found.with_options(full=self.full, unit=self.unit, superset=self.superset, limits=self.limits)
 
     def asked(self, tested: PairList, area: str) -> list[Case]:
-        """Return the test cases of one area of the conformance suite."""
+        """Return the test cases from one area of the conformance suite."""
         if area == "large":
             return list(questions.lattices()) if self.large else []
         count = self.cases if area == "random" else 0

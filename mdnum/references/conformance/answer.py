@@ -1,4 +1,4 @@
-"""Convert the pairs returned by a neighbor list to named arrays; several forms are supported.
+"""Convert the pairs that a neighbor list returns, in one of several forms, to named arrays.
 
 This file is copied into the scripts that reproduce a failure; it requires only numpy.
 """

@@ -113,7 +113,7 @@ class Case:
 
 
 def matrix(cell: Any) -> ndarray:
-    """Return lattice vectors as rows, from a matrix, from three edge lengths or from the edge of a cube."""
+    """Convert a matrix, three edge lengths or the edge of a cube to lattice vectors, as rows."""
     cell = np.asarray(cell, np.float64)
     return np.diag(cell * np.ones(3)) if cell.ndim < 2 else cell
 
@@ -154,7 +154,7 @@ def sequence(
 
 
 def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
-    """Return the pairs among some of the atoms, with the indices of these atoms in the smaller test case."""
+    """Return the pairs among some of the atoms, with these atoms renumbered as in the smaller test case."""
     most = int(max(atoms.max(initial=-1), pairs.i.max(initial=-1), pairs.j.max(initial=-1))) + 1
     new = np.full(most, -1)
     new[atoms] = np.arange(len(atoms))

@@ -81,7 +81,7 @@ def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DO
 
 
 def conditioning(cell: ndarray, pbc: ndarray) -> float:
-    """Factor by which conversion to fractional coordinates and back can amplify rounding errors, at least 1.
+    """Factor, at least 1, by which conversion to fractional coordinates and back can amplify rounding errors.
 
     Source: Higham, Accuracy and Stability, 2nd ed., section 7.1: the condition number of the periodic lattice
     vectors, each scaled to length 1 because lengths alone have no effect.
@@ -118,7 +118,7 @@ def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tup
 
 @dataclass(frozen=True)
 class Conventions:
-    """Conventions of a neighbor list, such as the sign of shifts; any choice is accepted as correct."""
+    """Conventions of a neighbor list, such as the sign of shifts; every convention is accepted as correct."""
 
     full: bool = True  # every pair from both of its atoms (True), or once (False)
     sign: int = 1  # +1 where shifts are added to atom j, -1 where they are added to atom i
@@ -136,7 +136,7 @@ class Failure:
 
     @property
     def kind(self) -> tuple[str, str]:
-        """Error code and exception message, which must stay the same when the test case is reduced."""
+        """Error code and exception message, which must not change when the test case is reduced."""
         text = self.text if self.code in ("RAISED", "CRASHED", "MALFORMED") else ""
         return self.code, without_numbers(text)
 
@@ -147,7 +147,7 @@ def without_numbers(text: str) -> str:
 
 
 def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Return all errors in the pairs from a neighbor list; an empty list if there are none.
+    """Return all errors in the pairs from a neighbor list; the result is empty if there are no errors.
 
     A pair within rounding error of the cutoff (`Truth.scale` times the unit roundoff) may be listed or not,
     but consistently for both of its atoms.
@@ -241,7 +241,7 @@ def _compare(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure
 
 
 def _through(shift: ndarray) -> str:
-    """Return the periodic image shift as text; empty for a zero shift."""
+    """Return a periodic image shift as text; the text is empty for a zero shift."""
     return f" + ({', '.join(str(int(part)) for part in shift)})" if np.any(shift) else ""
 
 
@@ -421,7 +421,7 @@ class RefusalKind:
 
 @dataclass
 class AreaTally:
-    """Numbers of test cases in one area of the suite, by result."""
+    """Numbers of test cases in one area of the suite, counted by their results."""
 
     # asked, refused, skipped: cases; refused by the list itself, skipped because of its limits
     asked: int = 0
@@ -521,7 +521,7 @@ class Report:
         return usual if own < 0.31 else max(usual, (1 + 2 * own) * case.r_cut)
 
     def total(self, count: str) -> int:
-        """Return the sum of a count over all areas of the conformance suite."""
+        """Return a count, summed over all areas of the conformance suite."""
         return sum(getattr(tally, count) for tally in self.areas.values())
 
     @property

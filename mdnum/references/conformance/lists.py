@@ -19,7 +19,7 @@ from mdnum.registry import Registry
 
 
 class KeptList(Protocol):
-    """A neighbor list that is built once and then updated; `answer.read` describes the form of the pairs.
+    """A neighbor list that is built once and then updated; for the form of the pairs, see `answer.read`.
 
     `allocate` builds a new neighbor list and may be called again on the same object; `update` receives the
     current positions. The returned pairs must include every pair within r_cut at the current positions, and
@@ -73,7 +73,7 @@ class ListLimits:
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
-        """Yield (whether a test case exceeds a limit, name of the limit), fastest tests first."""
+        """Yield (whether a test case exceeds a limit, name of the limit), starting with the fastest tests."""
         pbc, cells = np.array(case.pbc), [still.cell for still in case.stills]
         least = min(len(still.positions) for still in case.stills)
         yield least < self.atoms, f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"

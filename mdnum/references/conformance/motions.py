@@ -1,4 +1,4 @@
-"""Motion sequences that test updatable neighbor lists with the smallest motions that require a rebuild.
+"""Test updatable neighbor lists with sequences of the smallest motions that require a rebuild of the list.
 
 A pair just beyond r_cut + padding when the list is built is inside the cutoff after its two atoms have
 approached by the padding; the smallest such motion is along the line between the two atoms. A rebuild
@@ -275,7 +275,7 @@ def _ways() -> list[ndarray]:
 
 
 def _closing(room: float) -> float:
-    """Return the decrease of a pair distance from just beyond r_cut + padding to inside the cutoff."""
+    """Return by how much a pair distance decreases from just beyond r_cut + padding to inside the cutoff."""
     return (1 + 2 * HAIR) * room
 
 
@@ -288,7 +288,7 @@ def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
 def _walk(
     room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float] = (0.0, 1.0)
 ) -> list[ndarray]:
-    """Return a path of two atoms that approach each other by given fractions of the smallest motion."""
+    """Return a path of two atoms; each makes a given fraction of the smallest motion toward the other."""
     start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
@@ -323,7 +323,7 @@ def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: f
 
 
 def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:
-    """Return a path of a pair among ten atoms that all drift, across or along the motion of the pair."""
+    """Return a path of a pair among ten atoms that all drift across or along the motion of the pair."""
     start, end = _with(gas(12, edge, 180 + n), [4, 5], _walk(room, way, 0.5, edge, n))
     across = np.cross(way, np.roll(way, 1) + np.array([0.3, -0.2, 0.1]))
     across /= np.linalg.norm(across)
@@ -373,7 +373,7 @@ def _ladder(room: float, way: ndarray, n: int) -> Case:
 
 
 def _one_by_one(room: float, way: ndarray, share: float, n: int) -> Case:
-    """Return a test case in which pairs at different distances approach and return, one pair at a time."""
+    """Return a test case in which the atoms of one pair after another approach each other and return."""
     count = len(_RUNGS)
     start = _around(_places(count, 12.0, n + 1), room * _RUNGS[:, None], way)
     path = [start]

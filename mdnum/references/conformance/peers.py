@@ -1,4 +1,4 @@
-"""Neighbor searches of libraries, and lookup of any neighbor list by name or `module:function`.
+"""Neighbor searches of libraries; any neighbor list can be found by name or `module:function`.
 
 Every function and class in this module imports what it requires and uses nothing else in the module, since
 its source is copied into scripts that reproduce a failure without mdnum. Each function calls its library as a

@@ -122,7 +122,7 @@ def _outside() -> Named:
 def _across_walls() -> ndarray:
     """Return pairs along x: one atom just below a multiple of the cutoff, the other almost a cutoff lower.
 
-    If an atom is assigned to the next cell, as after rounding to float32, its partner is two cells away.
+    If an atom is assigned to the next cell, as happens if rounded to float32, its partner is two cells away.
     """
     hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
     pairs = []
@@ -309,7 +309,7 @@ def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
 def _positions(
     place: str, count: int, cell: ndarray, pbc: ndarray, r_cut: float, rng: np.random.Generator
 ) -> tuple[ndarray, float]:
-    """Return positions and a cutoff; for atoms "at the cutoff", the cutoff is the distance of a pair."""
+    """Return positions and a cutoff; for atoms "at the cutoff", the cutoff equals the distance of a pair."""
     full = completed(cell, pbc)
     # free axes have vectors of length 1, which would be no room
     room = np.where(pbc, 1.0, np.maximum(1.0, 3.0 * r_cut / np.linalg.norm(full, axis=1)))
@@ -357,9 +357,9 @@ def plan(
     far: bool = False,
     large: bool = False,
 ) -> list[tuple[int, Iterable[Case]]]:
-    """Return the test cases for a neighbor list, in order, as several tuples (number of cases, cases).
+    """Return the test cases for a neighbor list in order, as tuples (number of test cases, test cases).
 
-    The first tuple has `BREADTH` test cases of each area, without random cases and thousands of atoms.
+    The first tuple has `BREADTH` test cases of each area, but no random test cases or thousands of atoms.
 
     Args:
         count: number of random cases.
@@ -398,7 +398,7 @@ def lattices() -> Iterator[Case]:
 
 
 def as_kept(tested: PairList, asked: Iterable[Case]) -> Iterator[Case]:
-    """Yield test cases with a single call, with a skin if the neighbor list is an updatable one."""
+    """Yield test cases with a single call; if the neighbor list is updatable, they have a skin."""
     for case in asked:
         yield replace(case, skin=0.3 * case.r_cut) if tested.kept else case
 

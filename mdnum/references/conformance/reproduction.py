@@ -145,7 +145,7 @@ def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | Non
 
 
 def _array(values: np.ndarray) -> str:
-    """Return an array as a Python expression that evaluates to the same bits."""
+    """Return a Python expression that evaluates to an array with the same bits."""
     if len(values) > _PRINTED:
         sink = io.BytesIO()
         np.save(sink, np.ascontiguousarray(values))

@@ -59,7 +59,7 @@ class CallOutcome:
 
 
 class Session:
-    """Calls a neighbor list; with `reuse`, the same object of the list is used for all test cases."""
+    """Calls a neighbor list; if `reuse`, one object of the neighbor list is used for all test cases."""
 
     starts, deadline = 0, Deadline()  # of a process; calls in this one have none
 
@@ -97,7 +97,7 @@ class Session:
                 return
 
     def close(self) -> None:
-        """Release the object of the neighbor list."""
+        """Release the object that represents the neighbor list."""
         self._made, self._returned = None, []
 
     def _call(
@@ -194,7 +194,7 @@ def _is_own(module: str, own: str) -> bool:
 
 
 def _at_raise(place: TracebackType) -> bool:
-    """Return whether a stack frame is at a `raise` statement."""
+    """Return whether a stack frame is currently at a `raise` statement."""
     code, at = place.tb_frame.f_code.co_code, place.tb_lasti
     if 0 <= at < len(code) and dis.opname[code[at]] == "RAISE_VARARGS":
         return True
@@ -260,7 +260,7 @@ class RemoteSession:
         self._from = 0
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """Return the pairs or error of every call in a test case, up to the first call without pairs.
+        """Return the pairs or the error from every call in a test case, up to the first call without pairs.
 
         Raises:
             TimeUp: the deadline passed during the call; the separate process is terminated.
@@ -342,7 +342,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Kill a process that exceeds its time limit for an answer, and describe the delay in `late`."""
+    """Kill a process that does not answer within its time limit, and describe the delay in `late`."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):
@@ -358,7 +358,7 @@ def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Eve
 
 
 def _processor_seconds(process: int) -> float | None:
-    """Return the processor time of a process over all threads, s; None if unknown."""
+    """Return the processor time (s) of a process, summed over all threads; None if unknown."""
     try:
         # the second word is the name of the program in brackets, which may hold blanks
         words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()

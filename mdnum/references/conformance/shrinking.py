@@ -32,7 +32,7 @@ Failures = Callable[[Case], Sequence[Failure]]
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
     """Return the smallest test case, among those tried before the deadline, that fails with the same code.
 
-    `failures` runs a test case on the neighbor list, with a new object if the list is updatable.
+    `failures` runs a test case on the neighbor list; an updatable list gets a new object.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)
@@ -176,7 +176,7 @@ def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadli
 def _needing(
     examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline
 ) -> Failed | None:
-    """Find earlier test cases that a new process must run first to show a failure; None if not found."""
+    """Find earlier test cases that a new process must run first to show a failure; None if none are found."""
     session, began = examiner.session, time.perf_counter()
 
     def fails(cases: Sequence[Case]) -> bool:

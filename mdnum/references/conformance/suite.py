@@ -378,7 +378,7 @@ def _too_long(report: Report, case: Case) -> str | None:
 
 
 def _refusals(examiner: Examiner) -> list[RefusalKind]:
-    """Return each kind of rejected test case, with variants for which the neighbor list returns pairs.
+    """Return each kind of rejected test case, with variants of it for which the neighbor list returns pairs.
 
     Each variant of a test case is run in a new process, or with a new object.
     """
