@@ -55,7 +55,7 @@ class RuleResult:
 
     @property
     def ambiguous(self) -> float:
-        """Fraction of the flips that are uncertain at the resolution of the file; nan without any flips."""
+        """Fraction of flips that are uncertain at the resolution of the file; nan if there are no flips."""
         return float(self.flips.ambiguous.mean()) if len(self.flips) else float("nan")
 
     def entered(self) -> Int[np.ndarray, "frames"]:
@@ -227,7 +227,7 @@ class NeighborFlips(AnalysisBase):
     def _setup_computation_groups(
         self, n_parts: int, start: Any = None, stop: Any = None, step: Any = None, frames: Any = None
     ) -> list[np.ndarray]:
-        """Split the frames by MDAnalysis's method, and determine the properties common to all groups."""
+        """Split the frames into groups as MDAnalysis does, and determine properties common to all groups."""
         groups = super()._setup_computation_groups(n_parts, start, stop, step, frames)
         # who names the frames gets those
         self._to_the_end = frames is None and (stop is None or stop > len(self._trajectory))

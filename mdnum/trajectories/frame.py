@@ -49,7 +49,7 @@ class Box:
 
     @cached_property
     def longest(self) -> float:
-        """Length of the longest lattice vector; 0 unless the box is periodic along all axes and finite."""
+        """Length of the longest lattice vector; 0 for a box not finite, or not periodic on all axes."""
         if not np.all(self.pbc) or not np.isfinite(self.matrix).all():
             return 0.0
         return float(np.linalg.norm(self.matrix, axis=1).max())
@@ -84,7 +84,7 @@ class Frame:
 
     @cached_property
     def furthest(self) -> float:
-        """Largest absolute coordinate, in length units; inf or nan if one coordinate is; 0 without atoms."""
+        """Largest absolute coordinate (length); not finite if any coordinate is not; 0 without atoms."""
         return furthest(self.positions)
 
     def furthest_of(self, atoms: AtomIndices) -> float:

@@ -22,7 +22,7 @@ _ROOM = 2**62
 
 
 class Sums:
-    """Counts for a subset of the pairs; adding two objects gives the counts for both subsets together."""
+    """Counts for a subset of the pairs; the sum of two objects counts both subsets together."""
 
     # what is the same for all pairs
     _common: tuple[str, ...] = ()
@@ -184,7 +184,7 @@ class Strides(Sums):
 
     @classmethod
     def of_history(cls, history: History, strides: Sequence[int]) -> Strides:
-        """Count flips found at each stride; an odd number of a pair's flips per stride gives one flip."""
+        """Count the flips found at each stride, where an odd number of flips of a pair counts as one flip."""
         found = []
         for stride in strides:
             rows = np.flatnonzero(history.frame <= (history.frames - 1) // stride * stride)

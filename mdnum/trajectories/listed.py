@@ -96,7 +96,7 @@ class GivenList(NamedTuple):
         return _has(self.first, self.j, self.image, i, j, image, self.shifted)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
-        """Return the number of entries missing from the list for each pair: up to 1, or 2 in a full list."""
+        """Return how many entries of each pair are missing: up to 1, or 2 if a list has each pair twice."""
         i, j, image, near = pairs.i, pairs.j, np.zeros(len(pairs), np.int64), pairs.rank == 0
         if self.shifted:
             image, near = _image(*image_shifts(frame, pairs).T), np.True_
@@ -273,7 +273,7 @@ class ListCheck:
         return bool((distance <= self._radii[self._kinds[i], self._kinds[j]] + placed.rounding).any())
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
-        """Return table rows of pairs missing from the list until a frame; by default, all still missing."""
+        """Return table rows of pairs that were missing until a frame; by default, of all missing pairs."""
         names = ("i", "j", "rank", "missing", "begin", "number", "deepest", "end")
         held = sorted((self._open if stays is None else stays).items())
         rows = [(*key, *told, at) for key, told in held if told[-1] > bound]

@@ -320,7 +320,7 @@ def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
 
 
 def _behind_text(file: Any) -> str | None:
-    """Describe lines after the last frame of a text file, except trailing blank lines; None without them."""
+    """Describe lines after the last frame of a text file, except blank lines at the end; None if absent."""
     if file is None or file.closed:
         return None
     lines = 0

@@ -1,6 +1,6 @@
 """Contacts between residues: two residues are in contact if any pair of their atoms is within the cutoff.
 
-Decisions are made for pairs of atoms, and the ledger contains the smallest distance between two residues.
+Decisions are made for pairs of atoms; the ledger contains the smallest atom distance of two residues.
 Hydrogens and virtual sites are excluded by default: their positions depend on constraints and on the program
 that wrote the file, and customary contact cutoffs are defined for heavy atoms.
 """
@@ -36,7 +36,7 @@ _TOGETHER = 20_000
 
 @dataclass(frozen=True)
 class ByResidue:
-    """Residues of a file, which replace atoms in the analysis of pairs."""
+    """Residues of a file, whose pairs are analyzed in place of pairs of atoms."""
 
     of: Int[np.ndarray, "atoms"]  # residue of each atom of the file
     table: AtomTable  # of the residues, an entry each
@@ -91,7 +91,7 @@ class ByResidue:
 
 
 def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarray, "atoms"]]:
-    """Return (mask of hydrogens, by element; mask of virtual sites, by name)."""
+    """Return a mask of hydrogens, found by element, and a mask of virtual sites, found by name."""
     water = {str(name) for name in np.unique(table.residue_names.astype(str)) if _WATER.fullmatch(str(name))}
     virtual = [
         _VIRTUAL.fullmatch(str(name)) is not None or (name in _OF_WATER and residue in water)
@@ -182,7 +182,7 @@ class ResidueTracker:
         return Members(i, j, np.zeros_like(i), self._closest(self._last, i, j)[0])
 
     def _closest(self, frame: Frame, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return lengths (distance, threshold) of the atom pair with the largest margin, per residue pair."""
+        """Return distance and threshold of the atom pair with the largest margin, for each residue pair."""
         placed, found = self._placed(frame), np.full((2, len(i)), np.inf)
         for begin in range(0, len(i), _TOGETHER):
             part = slice(begin, begin + _TOGETHER)
@@ -212,7 +212,7 @@ class ResidueTracker:
 
 
 def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (atoms sorted by residue, offset of the first atom of each residue and of the end)."""
+    """Return the atoms sorted by residue, and the index of each residue's first atom, then of the end."""
     atoms = np.arange(len(of)) if atoms is None else atoms
     order = atoms[np.argsort(of[atoms], kind="stable")]
     return order, np.searchsorted(of[order], np.arange(count + 1))
@@ -252,7 +252,7 @@ class ResidueNames(Columns):
 def contacts_over_time(
     stays: Contacts, residues: int, frames: int
 ) -> tuple[Int[np.ndarray, "moments"], Float[np.ndarray, "residues moments"]]:
-    """Return (first frame of each of up to `MOMENTS` intervals, mean number of contacts per residue)."""
+    """Return the first frames of up to `MOMENTS` intervals, and each interval's mean contacts per residue."""
     edges = np.unique(np.linspace(0, frames, min(frames, MOMENTS) + 1).astype(np.int64))
     found = np.zeros((residues, len(edges) - 1))
     for k, (low, high) in enumerate(pairwise(edges)):

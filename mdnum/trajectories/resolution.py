@@ -1,14 +1,14 @@
 """Resolution of the positions in a file, inferred from the numbers, and its effect on pair decisions.
 
 Rounding to three decimals changes every coordinate by up to half a unit of the third decimal. The decision
-whether a pair is inside a cutoff is uncertain if the pair distance deviates from the cutoff by less than the
-rounding error of a distance. `infer` finds the decimal grid of the coordinates, so that no documented
-precision is needed.
+whether a pair is inside the cutoff is uncertain if pair distance and cutoff differ by less than the rounding
+error of a distance. `infer` finds the decimal grid of the coordinates, so that no documented precision is
+needed.
 
-Rounding of coordinates shifts a crossing to another frame, hides a short visit, or makes a pair near the
-cutoff cross it. The affected flips cannot be identified from one file, but their number is estimated by
-`grid_effect`. Random pairs near the cutoff are moved by displacements between two frames of the file, and
-decided with and without rounding. For nearest neighbors, a flip exchanges two atoms at about the same
+Rounding of coordinates shifts a crossing to another frame, hides a short visit, or creates a crossing of a
+pair near the cutoff. The affected flips cannot be identified from one file, but their number is estimated by
+`grid_effect`. Random pairs near the cutoff are moved by displacements found in the file; their flips are
+counted with and without rounding. For nearest neighbors, a flip exchanges two atoms at about the same
 distance from a third atom, so triples of atoms are drawn.
 """
 
@@ -175,7 +175,7 @@ def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resoluti
 
 
 def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
-    """Return positions as fractional coordinates of the box vectors."""
+    """Return positions as fractional coordinates of the box."""
     return np.linalg.solve(frame.box.matrix.T, (frame.positions - frame.box.origin).T).T
 
 
@@ -185,7 +185,7 @@ def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
 def decimal_grid(
     values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values"]
 ) -> tuple[float, int]:
-    """Find the decimal grid that contains all values, each within its tolerance `slack`.
+    """Find the decimal grid on which all values lie, each within its tolerance `slack`.
 
     Returns:
         (the coarsest decimal step of which all values are multiples, 0); or (the step of the largest value,
@@ -233,7 +233,7 @@ def _fixed(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values
 
 
 def _chance(parts: Float[np.ndarray, "values"]) -> float:
-    """Return the log probability that random values all lie within given fractions of a step of the grid."""
+    """Return the log probability that random values all lie within the given fractions of a grid step."""
     return float(np.log(np.maximum(parts, 1e-300)).sum())
 
 
@@ -303,7 +303,7 @@ def grid_effect(
     before, after = _drawn(random, one, other, radius, steps, draws, ranked)
 
     def decided(places: Places) -> np.ndarray:
-        """Return True if a pair is inside, or if the second atom of a triple is nearer than the third."""
+        """Return True if a pair is inside the cutoff, or a triple's second atom is nearer than the third."""
         squares = [((place - places[0]) ** 2).sum(axis=1) for place in places[1:]]
         return squares[0] < (squares[1] if ranked else radius**2)
 
@@ -326,7 +326,7 @@ def _drawn(
     draws: int,
     ranked: bool,
 ) -> tuple[Places, Places]:
-    """Draw pairs near the radius, or triples with two equal distances; return start and end positions."""
+    """Draw random pairs near the radius, or triples with two equal distances; return their two positions."""
     moved = [moves[random.integers(len(moves), size=draws)] for moves in (one, other, other)[: 2 + ranked]]
     # the distance of the middle one of three counts twice where the others are on opposite sides
     spread = float(np.sqrt((1 + ranked) * (one**2).mean() + (1 + ranked) * (other**2).mean()))
@@ -368,7 +368,7 @@ def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]
 
 
 def unrounded(variance: float, size: float) -> float:
-    """Return the variance of displacements before positions were rounded to multiples of `size`.
+    """Return the variance that displacements had before positions were rounded to multiples of `size`.
 
     If a displacement is n + f steps with integer n and 0 <= f < 1, rounding adds size² f (1 - f) to the mean
     square over all starting points. For normally distributed displacements of variance v, the mean of this

@@ -64,9 +64,9 @@ class _Membership:
 
 @dataclass(frozen=True)
 class CutoffRule(_Membership):
-    """Rule by which a pair is inside if its distance is less than `radius`, a length.
+    """Rule by which a pair is inside if its distance is less than `radius` (length).
 
-    Like most codes, the rule compares r² with radius² in float64. A pair whose distance equals the radius
+    The rule compares r² with radius² in float64, as most codes do. A pair whose distance equals the radius
     within rounding error is marked as ambiguous.
     """
 
@@ -191,5 +191,5 @@ Rule = CutoffRule | SpeciesCutoffs | Nearest | Capped
 
 
 def smallest_radius(rules: Sequence[Rule]) -> float:
-    """Return the smallest cutoff radius of several rules, a length; infinite if no rule has a radius."""
+    """Return the smallest cutoff radius of several rules (length); infinite if no rule has a radius."""
     return float(min((one.shortest for one in rules), default=math.inf))

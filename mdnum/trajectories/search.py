@@ -1,4 +1,4 @@
-"""Search for all pairs of a frame within a distance, and for nearest neighbors; comparison of two frames.
+"""Searches for pairs within a distance and for nearest neighbors in a frame; comparison of two frames.
 
 Distances in a search contain the rounding error of wrapped coordinates. A pair in a guard band around its
 threshold is decided from the stored coordinates (`lattice.square_of`), so all search algorithms agree.
@@ -117,7 +117,7 @@ def search(
 
 @njit(inline="always")
 def exact_square(x, home, i, j, n0, n1, n2, vectors):
-    """Return the squared distance that decides a pair, given the image shift n of wrapped coordinates of j.
+    """Return the squared distance that decides on a pair, given the image shift n of atom j after wrapping.
 
     Exchanging the two atoms only changes the signs of all rounded numbers, so the result is bitwise the same.
     """
@@ -214,7 +214,7 @@ class Chosen(NamedTuple):
 def nearest(
     placed: Placed, who: Participants, rule: Nearest | Capped, *, band: float, bound: float
 ) -> Chosen:
-    """Find the nearest neighbors of each center, as many as the rule defines; arguments as in `search`."""
+    """Find as many nearest neighbors of each center as the rule defines; for arguments, see `search`."""
     positions, lattice = placed.positions, placed.lattice
     atoms, reach, centers = len(positions), rule.reach, who.centers
     # a distance that no pair exceeds: a lattice has no end
@@ -254,7 +254,7 @@ def nearest(
 def _choose(
     rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
 ):  # fmt: skip
-    """Sort the neighbors in each row, keep the nearest; return (written, close, smallest, lacking)."""
+    """Sort the neighbors in each row and keep the nearest; return (written, close, smallest, lacking)."""
     written, close, smallest, short = 0, 0, np.inf, 0
     for i in range(rows.first.shape[0]):
         if not centers[i]:

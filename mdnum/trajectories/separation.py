@@ -43,7 +43,7 @@ class Separation:
 def displacements(
     start: Frame, end: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | float = 0.0
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """Return (displacements between two frames minus a common shift, numbers of lattice vectors removed)."""
+    """Return displacements between two frames minus a common shift, and counts of lattice vectors removed."""
     x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
     shared = np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool)
     return shortest(y - x - shift, Box(end.box.matrix, shared))
@@ -95,7 +95,7 @@ def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[n
 
 
 def velocities_of(frame: Frame) -> Frame:
-    """Return a frame that contains the velocities of the given frame in place of positions."""
+    """Return a frame with the velocities of the given frame in place of its positions."""
     assert frame.velocities is not None
     return Frame(frame.index, frame.time, frame.velocities, Box())
 
@@ -134,8 +134,8 @@ class FreeFlight(NamedTuple):
 def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
     """Compare displacements between two frames with velocities; return None without velocities or motion.
 
-    The ratio `moved` is near 1 for straight paths, below 1 if atoms turn around, and never far above 1. The
-    ratio `factor` is near 1 if velocities keep their directions and have the right unit.
+    The ratio `moved` is near 1 for straight paths and below 1 if atoms turn around, but never far above 1.
+    The ratio `factor` is near 1 if velocities keep their directions and have the right unit.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None
@@ -157,11 +157,11 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
 
 
 def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
-    """Return the inconsistency between displacements, velocities and times, if any, by medians over frames.
+    """Return the inconsistency between displacements, velocities and times, or None, from medians of frames.
 
     If atoms turn around between two frames, displacements are smaller than predicted from velocities, but not
-    inconsistent. Smaller displacements count only if velocities kept their directions and are parallel to
-    displacements.
+    inconsistent. Smaller displacements are inconsistent only if velocities kept directions and are parallel
+    to displacements.
 
     Returns:
         the factor by which displacements are too large (or too small, below 1), and whether it is a lower

@@ -85,7 +85,7 @@ class Survival:
     longest: int  # frames for which any was followed: nothing is known beyond
 
     def at(self, share: float) -> int | None:
-        """Return the number of frames after which at most this fraction survives (0.5: median), or None."""
+        """Return after how many frames at most a fraction of contacts survives (0.5: median), or None."""
         below = np.flatnonzero(self.share <= share)
         return int(self.frames[below[0]]) if len(below) else None
 
@@ -114,7 +114,7 @@ def survival(found: Durations) -> Survival:
 
 
 def mean_by_rate(found: Durations) -> tuple[float, float]:
-    """Return (contact frames per departure, standard error) over all contacts; inf without departures.
+    """Return the contact frames per departure, over all contacts, and its standard error; inf if none left.
 
     The error is valid for independent departures; with repeated crossings, the true error is larger.
     """
@@ -125,10 +125,10 @@ def mean_by_rate(found: Durations) -> tuple[float, float]:
 
 
 def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
-    """Return the fraction of pairs in contact at a frame that stay in contact, without a break, by lag.
+    """Return, by lag, the fraction of pairs in contact at a frame that stay in contact without a break.
 
-    Lags begin at 0. A fraction is averaged over all frames with a later frame at this lag, and is nan if no
-    pair was inside. `pairs` is the number of pairs inside at each frame.
+    Lags begin at 0. The fraction at a lag is averaged over all frames that have a later frame at this lag;
+    nan if no pair was inside. `pairs` is the number of pairs inside at each frame.
     """
     count, lags = found.all, np.arange(len(pairs))
     stays = np.cumsum(count[::-1])[::-1]
@@ -230,7 +230,7 @@ class ClassTally(Sums):
     def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> ClassTally:
         """Count flips and frames in contact by the classes of both atoms, over the given number of frames.
 
-        For a directed rule, i -> j and j -> i are counted separately; otherwise the lower class comes first.
+        For a directed rule, i -> j and j -> i are counted separately; otherwise, i is in the lower class.
         """
         first, second = classes.of[stays.i], classes.of[stays.j]
         if not directed:
@@ -327,7 +327,7 @@ class Busiest(Columns):
 
 @dataclass(frozen=True)
 class Residues(Sums):
-    """Flips of each group of atoms (such as a residue), with other groups and within the group."""
+    """Numbers of flips of each group of atoms (such as a residue), with other groups and within the group."""
 
     between: Int[np.ndarray, "groups"]
     within: Int[np.ndarray, "groups"]
@@ -347,7 +347,7 @@ class Residues(Sums):
 
 @dataclass(frozen=True)
 class AgainSums(Sums):
-    """Sums of the counts returned by `again`, over a sample of the contacts."""
+    """Sums, over a sample of the contacts, of the counts that `again` returns."""
 
     both: Int[np.ndarray, "lags"]
     once: Int[np.ndarray, "lags"]
@@ -374,7 +374,7 @@ class Statistics(Sums):
     def of(
         cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
     ) -> tuple[Statistics, Contacts]:
-        """Return statistics of a subset of the pairs, added to `before`, and the contacts of these pairs.
+        """Add statistics of a subset of the pairs to `before`; return the sum, and the subset's contacts.
 
         A flip reversed within `window` frames is counted as chatter. Intermittent contacts include absences
         of up to `window` frames.
@@ -428,7 +428,7 @@ class Statistics(Sums):
 
 @dataclass(frozen=True)
 class Lifetime:
-    """Median, mean and other measures of contact lifetimes, in frames; None for undetermined values."""
+    """Median, mean and other measures of contact lifetimes, in frames; a value not determined is None."""
 
     followed: int  # contacts seen to begin
     median: int | None  # frames after which so many are over

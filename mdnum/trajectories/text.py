@@ -4,7 +4,7 @@ This module reads three text formats itself, because other libraries lose inform
 tests/trajectories/test_source.py):
 
 - LAMMPS's `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org/dump.html,
-  Howto_triclinic). MDAnalysis would reduce their coordinates to float32 and ignore the tilt of the box.
+  Howto_triclinic). MDAnalysis would reduce coordinates of dumps to float32 and ignore the tilt of the box.
 - GROMACS's gro files with any number of frames, whose column width is the distance of two decimal points
   (manual.gromacs.org, reference manual, file formats). MDAnalysis and ASE read only the first frame.
 - Extended XYZ, with ASE called for each frame: otherwise, ASE scans the whole file before the first frame.
@@ -137,7 +137,7 @@ def format_of(path: Path) -> str:
 
 
 def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
-    """Reject a last line that was truncated within its last number, which would be read as another number.
+    """Reject a last line that ends within its last number, which would be read as a different number.
 
     A missing newline is not sufficient evidence, since some programs omit the last newline. The number counts
     as truncated if it has fewer digits than the numbers in the same column of earlier lines.
@@ -368,13 +368,13 @@ class LammpsDump(TextTrajectory):
 
 
 def _labels(columns: list[str], rows: np.ndarray) -> np.ndarray | None:
-    """Return the elements of the atoms, or their types if there are no elements; None without either."""
+    """Return the elements of the atoms, or their types if elements are missing; None if both are missing."""
     name = next((one for one in ("element", "type") if one in columns), None)
     return None if name is None else rows[:, columns.index(name)].astype(str)
 
 
 def _items(block: list[str]) -> dict[str, list[str]]:
-    """Return the lines of a frame by the name of their ITEM header."""
+    """Return the lines of a frame, in groups named by their ITEM headers."""
     items: dict[str, list[str]] = {}
     rows: list[str] = []
     for k, line in enumerate(block):
@@ -391,7 +391,7 @@ def _items(block: list[str]) -> dict[str, list[str]]:
 
 
 def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
-    """Return (names of the columns, words of all atoms with shape (atoms, columns))."""
+    """Return the column names, and the words of all atoms with shape (atoms, columns)."""
     head, *rows = items["ATOMS"]
     columns = head.split()
     words = np.array("".join(rows).split(), dtype=object)
@@ -481,7 +481,7 @@ class GroTrajectory(TextTrajectory):
 
 
 def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray, "atoms numbers"]:
-    """Return the numbers in columns of fixed width, which need not be separated by spaces."""
+    """Return the numbers in columns of fixed width, even if no spaces separate the columns."""
     size = _HEAD + count * width
     text = np.array([row[:size].ljust(size).encode() for row in rows], dtype=f"S{size}")
     letters = np.frombuffer(text.tobytes(), "S1").reshape(len(rows), size)[:, _HEAD:]
@@ -500,5 +500,5 @@ def _gro_box(line: str) -> Box:
 
 
 def _box_words(line: str) -> list[str]:
-    """Split a box line into numbers with five decimals, not separated by spaces in boxes above 10 µm."""
+    """Split a box line into numbers with five decimals, which in boxes above 10 µm no space separates."""
     return _TOUCHING.findall(line) if max(map(len, line.split())) > _LONG else line.split()

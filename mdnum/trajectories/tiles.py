@@ -1,8 +1,8 @@
-"""Decisions on all near pairs of each frame, sixteen at a time in float32 vectors.
+"""Decisions on all near pairs of each frame, made in float32 for sixteen pairs at a time.
 
-Atoms are sorted into clusters of sixteen by bisecting space. A tile consists of two clusters and the lattice
-vector between them, with sixteen decisions, as bits, for each atom of the first cluster. At each frame, the
-decisions of near clusters are computed in float32 and compared with the previous frame; only changed
+Atoms are sorted into clusters of sixteen by bisecting space. A tile consists of two clusters, the lattice
+vector between the clusters and, for each atom of the first cluster, sixteen decisions as bits. At each frame,
+the decisions of near clusters are computed in float32 and compared with the previous frame; only changed
 decisions are processed further. If float32 cannot decide a pair, or the margin of a pair is needed, the exact
 squared distance is computed (`search.exact_square`).
 
@@ -83,7 +83,7 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Update to a frame; return True if the tiles contain all pairs within `clear` of their radius."""
+        """Update tiles to a frame; return True if they contain all pairs within `clear` of the radius."""
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
@@ -163,7 +163,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if at most one image per pair can be inside the cutoff after an approach by `moved`."""
+    """Return True if at most one image per pair can be inside the cutoff after atoms approach by `moved`."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
@@ -236,7 +236,7 @@ def tiles_of(
 
 
 def _aligned(clusters: int) -> Float32[np.ndarray, "clusters 3 16"]:
-    """Allocate an array of coordinates aligned such that no vector spans two cache lines."""
+    """Allocate an array of coordinates, aligned so that no vector spans two cache lines."""
     room = np.empty(3 * CLUSTER * clusters + CLUSTER, np.float32)
     first = -room.ctypes.data % 64 // 4
     return room[first : first + 3 * CLUSTER * clusters].reshape(clusters, 3, CLUSTER)
@@ -446,7 +446,7 @@ def _box(columns, boxes):
 
 @njit
 def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count):
-    """Decide the pairs of tiles from tile `begin` on; return (next tile, flips, close, smallest |margin|)."""
+    """Decide the pairs of all tiles from `begin`; return (next tile, flips, close, smallest |margin|)."""
     close, smallest, room = 0, np.inf, flips.i.shape[0]
     first, second, vector, rows, inside = tiled.first, tiled.second, tiled.vector, tiled.rows, tiled.inside
     order, low, high, scratch = numbers.order, limits.low, limits.high, np.empty(4 * CLUSTER, np.float32)
@@ -499,7 +499,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
 
 @njit(inline="never")
 def _settled(inside, doubtful, i, slot, code, numbers, limits):
-    """Decide the doubtful pairs of one atom; return (bits inside, number within bound, smallest |margin|)."""
+    """Decide the uncertain pairs of an atom; return (bits inside, number within bound, smallest |margin|)."""
     close, smallest, vectors, order = 0, np.inf, numbers.vectors, numbers.order
     n0, n1, n2 = np.intp(code // 9) - 1, np.intp(code // 3 % 3) - 1, np.intp(code % 3) - 1
     while doubtful != np.uintp(0):

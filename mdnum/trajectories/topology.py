@@ -4,14 +4,14 @@ MDAnalysis stores three lengths and three angles of a box, and assumes (like mos
 vector is along x and the second in the xy plane. For a box in another orientation, the periodic images
 computed from MDAnalysis's box are silently wrong:
 
-- CHARMM (since version 22) writes symmetric box matrices to dcd files, without a record (see dcd_boxes).
+- CHARMM (since version 22) writes symmetric box matrices to dcd files, which do not record this.
 - HOOMD's boxes have tilt factors, which MDAnalysis interprets as cosines of angles (in gsd files).
-- Boxes in H5MD files and DL_POLY's HISTORY files have vectors in any direction.
+- Boxes in H5MD files and DL_POLY's HISTORY files may have vectors in any direction.
 
 In a PDB file with many models, MDAnalysis loses boxes outside the models. Programs write CRYST1 once in the
 header (OpenMM), before each model (GROMACS), or inside each model. MDAnalysis reads a model from its MODEL
-record to the next MODEL record. A box before the first model is therefore never read, and a box between two
-models is assigned to the first instead of the second.
+record to the next MODEL record. MDAnalysis therefore never reads a box before the first model, and assigns a
+box between two models to the first of the two instead of the second.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class AtomTable:
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
-        """Atom names, residue names and numbers, and segments by column name; empty columns are left out."""
+        """Atom names, residue names and numbers, and segments, by column name; empty columns are omitted."""
         numbered = any(self.residue_names) or self.residues.any()
         every = {
             "atom_name": self.names if self.named else (), "residue_name": self.residue_names,
@@ -205,7 +205,7 @@ def topology_universe(topology: str | Path) -> Any:
 
 
 def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
-    """Return the number of atoms in a trajectory, or None; some formats need the number in the topology."""
+    """Return a trajectory's number of atoms, or None; for some formats, the topology supplies the number."""
     from MDAnalysis.core._get_readers import get_reader_for
 
     for known in ({}, {"n_atoms": topology}):
@@ -233,7 +233,7 @@ def file_of(trajectory: Any) -> Path | None:
 
 
 class Boxes:
-    """Boxes of an MDAnalysis reader, in the same orientation as the coordinates.
+    """Boxes of an MDAnalysis reader, oriented as the file's coordinates are.
 
     Attributes:
         notes: sentences for the user on the interpretation of the boxes.
@@ -360,7 +360,7 @@ _MATRICES = {"DCD": _dcd, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
 
 @lru_cache(maxsize=4)
 def _models(path: str, size: int, changed: int) -> tuple[tuple[Dimensions, ...], int]:
-    """Return (lengths and angles of each model's box, number of CRYST1 records); results are cached."""
+    """Return lengths and angles of each model's box, and the number of CRYST1 records; both are cached."""
     from MDAnalysis.lib.util import anyopen
 
     found: list[Dimensions] = []

@@ -157,7 +157,7 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return threshold distances of a directed rule at the last frame, by center; nan for other atoms.
+        """Return threshold distances of a directed rule at the last frame, for each center; nan for others.
 
         Returns:
             (distance below which a neighbor stays one, distance below which another atom becomes a neighbor).
@@ -335,7 +335,7 @@ def _by_place(who: Participants, frame: Frame) -> Participants:
 
 
 def _taken(positions: np.ndarray, labels: np.ndarray) -> tuple[Float[np.ndarray, "taken 3"], float]:
-    """Return the positions of the given atoms, and the largest |coordinate| (not finite if any is not)."""
+    """Return positions of the given atoms, and the largest |coordinate| (not finite if one is not finite)."""
     x = np.take(np.asarray(positions, np.float64), labels, axis=0)
     return x, furthest(x)
 

@@ -74,7 +74,7 @@ class Trajectory(ABC):
         self.table = AtomTable.plain(["X"] * atoms, named=False) if table is None else table
 
     def _belongs(self, topology: int, atoms: int) -> None:
-        """Raise an error if the topology has another number of atoms than the trajectory."""
+        """Raise an error if topology and trajectory have different numbers of atoms."""
         if self.topology is not None and topology != atoms:
             seen = (
                 f"the topology {self.topology.path.name} has {topology:,} atoms and the trajectory {atoms:,}"
@@ -117,7 +117,7 @@ class Trajectory(ABC):
         return None if self.in_file is None else len(range(*self.slice.indices(self.in_file)))
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the requested frames in order, from the first one at each call, with one frame in memory.
+        """Yield the requested frames in order, with one frame in memory; each call begins at the first frame.
 
         Raises:
             UnreadableFrame: a frame cannot be read; all earlier frames have been yielded.
@@ -143,7 +143,7 @@ class Trajectory(ABC):
                 raise self._unreadable(end, rest)
 
     def sample(self) -> list[Frame]:
-        """Return the first `SAMPLE` of the requested frames, or only the frames before an unreadable frame.
+        """Return the first `SAMPLE` requested frames, or fewer if one of these frames is unreadable.
 
         Raises:
             InputError: there is no frame, or the first frame cannot be read.
@@ -238,7 +238,7 @@ class Trajectory(ABC):
 
 
 def chosen(frames: slice, total: int | None) -> Iterator[int]:
-    """Return the frame numbers of a slice, ascending; unlimited if the slice and `total` have no end."""
+    """Return the frame numbers of a slice, ascending; without end if slice and `total` have no end."""
     if total is not None:
         return iter(range(*frames.indices(total)))
     return islice(count(), frames.start, frames.stop, frames.step)

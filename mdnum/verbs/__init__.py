@@ -1,8 +1,8 @@
-"""Commands of mdnum, called verbs; each verb has a module, and a function in the package `mdnum`.
+"""Commands of mdnum, called verbs; each verb has a module here, and a function in the package `mdnum`.
 
 Each verb is declared in its module (see `mdnum.verbs.frame`) and in the text file of the same name;
-`__init__.toml` explains the tables in text files. No other file lists commands and kinds of output folders.
-The module of a verb is imported when the verb is first used.
+`__init__.toml` explains the tables in text files. No other file lists the commands or the kinds of output
+folders. The module of a verb is imported when the verb is first used.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def home(kind: str) -> str:
 
 
 def schema(kind: str) -> dict[str, Any]:
-    """Return the JSON Schema of a kind of document; the schema of answer.json if the kind has no schema.
+    """Return the JSON Schema of a kind of document, or that of answer.json if the kind has no schema.
 
     Raises:
         InputError: no installed verb makes such documents.

@@ -1,4 +1,4 @@
-"""`mdnum audit`: tests of whether an ASE calculator is safe to run and to differentiate.
+"""`mdnum audit`: tests whether an ASE calculator is safe to run and to differentiate.
 
 The checks of `mdnum.audit.checks.CHECKS` run in order, and each result is saved in the output folder. If an
 audit is interrupted, the completed results are in the folder, and the remaining checks can be run later. A
@@ -62,9 +62,9 @@ def audit(
 ) -> Outcome:
     """Test whether a calculator is safe to run and to differentiate.
 
-    The number of calls of the calculator is limited, independent of its speed: about 6,000 calls for one
-    element, and at most 12,000. Calls of the calculator that are needed for a verdict come first. If an audit
-    is interrupted, the results of the completed checks are in its folder.
+    The number of calls of the calculator is limited, whatever the calculator's speed: about 6,000 calls for
+    one element, and at most 12,000. Calls of the calculator that are needed for a verdict come first. If an
+    audit is interrupted, the results of the completed checks are in its folder.
 
     Example:
         >>> mdnum.audit_calculator(ase.calculators.emt.EMT(), "copper.xyz").verdict
@@ -243,7 +243,7 @@ def answer_of(
 
 
 def _keep_evidence(folder: RunFolder, loaded: LoadedCalculator, check: AuditCheck) -> None:
-    """Write structures, exact to the last bit, and a script to reproduce a finding without mdnum."""
+    """Write structures, exact to the last bit, and a script that reproduces a finding without mdnum."""
     from mdnum.audit.record import STRUCTURES, script
 
     _write_structures(folder, check.structures)
@@ -288,7 +288,7 @@ def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
 
 
 def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: Path) -> LoadedCalculator:
-    """Return the calculator of an audit that is resumed; raise an error if a different one was given."""
+    """Return the calculator of an audit to resume; raise an error if another calculator was given."""
     if calculator is None and not state.named:
         raise InputError(
             "the calculator of the stored audit was a Python object, which is not stored in the folder",
@@ -332,7 +332,7 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
 
 
 def _summary(state: AuditState) -> dict[str, Any]:
-    """Return the content of an audit's summary.json, except the verdict."""
+    """Return the content of an audit's summary.json, except for the verdict."""
     atoms, given = state.atoms, units.get(state.units)
     texts, said = Texts(__file__, given), conclusion.answers(state.shown, state.checks)
     why = state.why or "not finished"
@@ -383,7 +383,7 @@ def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _named(value: Any, given: units.Units) -> Any:
-    """Return the results of a check, with placeholders for units replaced by the names of units."""
+    """Return the results of a check, with each placeholder for a unit replaced by the unit's name."""
     if isinstance(value, units.Measured):
         return value.to("", vars(given))
     if isinstance(value, str):
@@ -459,7 +459,7 @@ def _judge(view: AuditView) -> Verdict:
 
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
-    """Return the headline of an audit: two conclusions, missing checks, and the most severe finding."""
+    """Return the headline of an audit: both conclusions, missing checks, and the most severe finding."""
     shown, early = state.shown, conclusion.to_come(state.shown, state.checks)
     said, begun = conclusion.answers(shown, state.checks), {one.name for one in shown}
     name = TEXTS("on", name=state.name, formula=state.atoms.get_chemical_formula())

@@ -1,4 +1,4 @@
-"""`mdnum ball` as a function: simulation of bouncing balls, with variants, gradients, verdict and report."""
+"""`mdnum ball`: simulation of bouncing balls, with variants, gradients, verdict and report."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def bounce(
 
 
 def command(system: str | None = None, *, demo: str | None = None, **given: Any) -> Outcome | Reply:
-    """Execute `mdnum ball`: simulate a ball or run a demonstration; list both kinds if no name is given.
+    """Execute `mdnum ball`: simulate a ball or run a demonstration; without a name, list all names.
 
     Raises:
         InputError: a demonstration was requested together with options of a ball.
@@ -115,7 +115,7 @@ def _loaded(
 
 
 def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun, float | None]:
-    """Run a ball; return the run and its steps per second after compilation (None for a short run)."""
+    """Simulate a ball; return the run, and steps per second after compilation (None for a short run)."""
     marks: list[tuple[float, int]] = []
 
     def rate() -> float | None:
@@ -172,7 +172,7 @@ def _differentiated(
 
 
 def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dict[str, Any]]:
-    """Return the derivatives by each requested method, one mapping of plain values per method.
+    """Return the derivatives by each requested method, as one mapping of plain values per method.
 
     Args:
         asked: the [gradient] table.
@@ -209,7 +209,7 @@ def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
 
 
 def judge(view: BallView) -> Verdict:
-    """Return findings on a ball's run, and evidence that the run is correct, from its folder alone."""
+    """Return findings on a ball's run, and evidence that the run is correct, from the run's folder alone."""
     summary = view.summary
     rules = (
         _finite, _ledger, _finite_gradient, _independent, _ambiguous, _cap, _disagree, _forks, _iterations,
@@ -250,7 +250,7 @@ def _evidence(view: BallView, codes: set[str]) -> Iterator[str]:
 
 
 def differs(first: float | None, second: float | None) -> bool:
-    """True if two derivatives differ by more than one percent of the larger, or if one of the two is None."""
+    """True if two derivatives differ by more than one percent of the larger one, or if either is None."""
     if first is None or second is None:
         return first is not second
     return abs(first - second) > _DISAGREE * max(abs(first), abs(second))

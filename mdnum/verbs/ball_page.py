@@ -99,7 +99,7 @@ def page(view: BallView, verdict: Verdict) -> Page:
 
 
 def _groups(x: np.ndarray, y: np.ndarray, *groups: tuple[np.ndarray, str, Role]) -> tuple[Series, ...]:
-    """Split points (x, y) into groups, and return one data series for each group with any finite y."""
+    """Split points (x, y) into groups; return a data series for each group that has a finite y."""
     return tuple(
         Series(label, x[mine], y[mine], "points", role)
         for mine, label, role in groups
@@ -146,7 +146,7 @@ def _nearest(view: BallView) -> Iterator[Plot]:
 
 
 def _ranges(view: BallView) -> Iterator[Any]:
-    """Yield a table of smallest and largest magnitudes, and of steps at which narrower formats fail."""
+    """Yield a table of extreme magnitudes, and of steps at which narrower number formats fail."""
     table = range_table(lambda name: TEXTS(f"range_{name}"), view.table("steps"))
     if table.rows:
         yield table

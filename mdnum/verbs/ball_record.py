@@ -75,10 +75,10 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
-    """Return a table with one row per stop decision of the solver, for all steps that required a solve.
+    """Return a table with one row per stop decision of the solver, for all steps that needed the solver.
 
-    All decisions are included if one solver handles all balls and histories of residuals were kept;
-    otherwise, only the last two decisions of each solve are included.
+    If one solver handles all balls and histories of residuals were kept, all decisions are included;
+    otherwise, only the last two decisions of each solve.
     """
     rule = rule_of(run)
     if rule is None:
@@ -142,7 +142,7 @@ def heights(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
-    """Return a table with one row per step: the separation in height between a variant and the run."""
+    """Return a table with, for each step, the separation in height between a variant and the run."""
     size = len(found.separation)
     return {"variant": np.full(size, name), "step": np.arange(size), "separation": found.separation}
 
@@ -284,12 +284,12 @@ def solved(run: BallRun) -> np.ndarray:
 
 
 def ambiguous_flips(run: BallRun) -> np.ndarray:
-    """True for contact flips whose margin is within a rounding bound greater than zero."""
+    """True for contact flips whose margin is at most the rounding bound, if this bound is not zero."""
     return run.contacts.ambiguous & (run.contacts.bound > 0)
 
 
 def ambiguous_stops(run: BallRun) -> np.ndarray:
-    """Count, for each step, the stop decisions that may depend on the summation order of the residual."""
+    """Count, at each step, stop decisions that may depend on the order in which the residual is summed."""
     rule = rule_of(run)
     if rule is None or isinstance(rule, FixedCount):
         return np.zeros(run.steps, np.int64)
@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step; if each ball has a solve, those with the smallest margin."""
+    """Residual and stop margin of each step; of balls solved separately, the ball with the least margin."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

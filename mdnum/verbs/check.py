@@ -1,4 +1,4 @@
-"""`mdnum check`: comparison of a system's energies, pairs or dynamics with other codes; makes no folder."""
+"""`mdnum check`: comparison of a system's energies, pairs or dynamics with those of other codes."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def temperature_findings(start: float, requested: float, atoms: int, unit: str) 
 
 
 def would_show(report: Any, units: Units) -> Iterator[str]:
-    """Yield sentences on differences from other codes, with the smallest difference that is an error."""
+    """Yield sentences on differences from other codes, each with the limit above which it is an error."""
     from mdnum.references.energy_check import FORCE, ROUNDINGS
 
     if frames := getattr(report, "frames", ()):

@@ -46,7 +46,7 @@ _RETURNS = "(i, j), (i, j, shift), (i, j, shift, distance) or a mapping with i a
 
 @dataclass(frozen=True)
 class Options:
-    """Options of an examination (a test of a neighbor list), fixed when the examination starts."""
+    """Options of the examination of a neighbor list, fixed when the examination starts."""
 
     cases: Annotated[int, Ge(0), Le(MOST_CASES)]
     seed: int = 0
@@ -76,7 +76,7 @@ class Options:
 
 @dataclass
 class Examination(CaseAnswers):
-    """State of an examination (a test of a neighbor list), stored in answers.json for resumption."""
+    """State of the examination of a neighbor list, stored in answers.json to resume the examination."""
 
     word: str = field(kw_only=True)  # what names the list; empty where it has no name
     tested: tuple[str, str | None] = field(kw_only=True)  # name and version of the list
@@ -246,7 +246,7 @@ def _script(code: str) -> str:
 
 
 def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
-    """Write a script that reproduces each failure, remove obsolete scripts, and return the file names."""
+    """Write a script to reproduce each failure, remove obsolete scripts, and return the file names."""
     from mdnum.references.conformance.reproduction import script
 
     scripts = []
@@ -320,7 +320,7 @@ def summary_of(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
 
 
 def _cases(summary: Mapping[str, Any], code: str) -> int:
-    """Return the number of test cases whose most severe failure has the given code."""
+    """Return the number of test cases in which the most severe failure has the given code."""
     return sum(row["codes"].get(code, 0) for row in summary["areas"])
 
 
@@ -481,7 +481,7 @@ def page(view: View, verdict: Verdict) -> Page:
 
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
-    """Yield tables with one row per subject: for lists built once, and for lists updated in a run."""
+    """Yield two tables with one row per subject: for lists built once, and for lists updated in a run."""
     columns: dict[str, Any] = {
         "area": "area", "tested": "asked", "right": "passed",
         "wrong": lambda row: row["failed"] - row["silent"] or None,

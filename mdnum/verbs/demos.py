@@ -1,4 +1,4 @@
-"""`mdnum ball --demo` as a function: short demonstrations of numerical effects, each with tested claims.
+"""`mdnum ball --demo`: short demonstrations of numerical effects, each with claims that are tested.
 
 A demonstration is a script `NN_its_name.py` in the folder `demos` next to the shipped systems. The first line
 of the script states the subject; the function `run()` of the script returns a `Demo`.
@@ -72,7 +72,7 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> 
 
 @frame.keywords_checked
 def demonstrate(name: str, **keep: Unpack[Keep]) -> Outcome:
-    """Run a demonstration, or all of them.
+    """Run one demonstration, or all demonstrations.
 
     Example:
         >>> mdnum.demonstrate("fork")
@@ -126,7 +126,7 @@ def about(name: str) -> str:
 
 
 def load(name: str) -> ModuleType:
-    """Return the module of a demonstration, whose `run()` runs it.
+    """Return the module of a demonstration; its function `run()` runs the demonstration.
 
     Raises:
         InputError: no demonstration has this name.
@@ -190,7 +190,7 @@ def _plots(document: Mapping[str, Any], curves: Mapping[str, np.ndarray]) -> Ite
 
 
 def judge(view: View) -> Verdict:
-    """Return a finding for every demonstration whose checks failed."""
+    """Return a finding for every demonstration in which a check failed."""
     demos = _demos(view)
     found = []
     for demo in demos:
@@ -240,7 +240,7 @@ def _demos(view: View) -> Sequence[Mapping[str, Any]]:
 
 
 def _heading(demo: Mapping[str, Any], demos: Sequence[Any]) -> str:
-    """Return the heading of a demonstration's section on a page of one or of several demonstrations."""
+    """Return the heading of a section of a demonstration, on a page of one or several demonstrations."""
     return demo["title"] if len(demos) > 1 else TEXTS("detail")
 
 
@@ -268,7 +268,7 @@ def _digits(values: Iterable[Any], least: int) -> int:
 
 
 def shown(value: Any, digits: int = 10) -> str:
-    """Format a plain value for reading: numbers with the given significant digits, lists in brackets."""
+    """Format a plain value as text: numbers with the given significant digits, lists in brackets."""
     if isinstance(value, Mapping):
         return ", ".join(f"{str(key).replace('_', ' ')} {shown(item, digits)}" for key, item in value.items())
     if isinstance(value, list):

@@ -261,7 +261,7 @@ def _replied(trajectories: Sequence[str], **given: Any) -> Reply:
 
 @dataclass
 class FrameExamination:
-    """A trajectory that is being examined frame by frame, with the output folder for the results."""
+    """Examination of a trajectory, frame by frame, with the output folder for the results."""
 
     answer: Answer  # its folder takes what follows from the tables, when all frames were examined
     rows: HeldRows  # to be handed over to the folder by then
@@ -275,7 +275,7 @@ def examining(
     opened: Trajectory, asked: tuple[Rule, ...], between: tuple[str, str] | None, window: int,
     live: bool = False, hydrogens: bool | None = None, **keep: Unpack[Keep],
 ) -> Iterator[FrameExamination]:  # fmt: skip
-    """Context manager: make an output folder and examine frames inside the block; arguments as for `flips`.
+    """Context manager: make an output folder, and examine frames inside the block; arguments: see `flips`.
 
     Args:
         live: whether frames come from a running program. Frame numbers are then time steps, with no decisions
@@ -358,7 +358,7 @@ def rules(
     nearest: int | Sequence[int] = (),
     most: int | None = None,
 ) -> tuple[Rule, ...]:
-    """Return the rules that decide which pairs are neighbors: cutoffs, cutoffs by species, nearest neighbors.
+    """Return the rules that define neighbors: cutoffs, cutoffs by pair of species, or nearest neighbors.
 
     Raises:
         InputError: a value is not a valid rule, a rule is repeated, or `most` is given without a cutoff.
@@ -426,7 +426,7 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
 
 
 def _refuse_topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
-    """Raise an error if a topology is given before the trajectory, which is the order in other programs."""
+    """Raise an error if the topology is given before the trajectory, as other programs require."""
     from mdnum.trajectories.readers import IN_MEMORY, open_trajectory
 
     for one in (first, second):
@@ -468,7 +468,7 @@ def _with_other_box(
 
 
 def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
-    """True if reading stopped at an incomplete frame that is probably the last frame of the file."""
+    """True if reading stopped at an incomplete frame that is probably the last one in the file."""
     from mdnum.reading import UnreadableFrame
 
     if not isinstance(error, UnreadableFrame):
@@ -522,7 +522,7 @@ def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
-    """Yield (part, number of parts, history): the flips of one neighbor rule, pair by pair, in parts.
+    """Yield (part, number of parts, history): the flips of one neighbor rule, in parts, sorted by pair.
 
     The table of flips is ordered by frame and may be larger than memory. Each part therefore contains all
     flips of some of the pairs, and the table is read once for each group of parts that fits into memory.
@@ -533,7 +533,7 @@ def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, 
     parts = max(1, -(-sum(stream.flushed for stream in streams.values()) // _PART_ROWS))
 
     def columns(name: str, wanted: range, kinds: list[str]) -> Iterator[dict[str, np.ndarray]]:
-        """Yield the columns of a table for each part in turn."""
+        """Yield the columns of a table, part by part."""
         found: list[list[dict[str, np.ndarray]]] = [[] for _ in wanted]
         names, stream = ["rule", *kinds], streams[name]
         for batch in chain([stream.read(names, rows=0)], stream.batches(names)):
@@ -687,7 +687,7 @@ def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:
-    """Swap the two classes of atoms in a table row if only the swapped order matches the selections."""
+    """Swap the two atom classes of a table row if only the swapped order matches the two selections."""
     if groups[0] is None or groups[1] is None:
         return row
     first, second = ({classes.names[at] for at in np.unique(classes.of[group])} for group in groups)
@@ -698,7 +698,7 @@ def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str
 
 
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
-    """Estimate the rate of cutoff crossings from velocities, and compare with the rate of observed flips."""
+    """Estimate the rate of cutoff crossings from velocities, and compare it with the observed flip rate."""
     duration = steps["last_time"] - steps["first_time"]
     if not one.flux or not steps["timed"] or not duration > 0 or found.odd is not None:
         return None

@@ -102,7 +102,7 @@ def compare(
 
 
 def _alike(a: Trajectory, b: Trajectory) -> bool:
-    """True if two files may contain the same atoms: species agree as far as the files contain species."""
+    """True if two files may contain the same atoms, judged by the species that the files contain."""
     first, second = ([str(one) for one in file.species] for file in (a, b))
     if not (a.table.named and b.table.named) or first == second:
         return True
@@ -131,13 +131,13 @@ class ComparisonView(FlipsView):
 
     @property
     def largest(self) -> tuple[str, str]:
-        """Largest separation of an atom in any frame, and the separation due to rounding in this frame."""
+        """Largest separation of an atom in any frame, and the part of it that rounding can explain."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
 
     def frame(self, at: int | None) -> str:
-        """Format the index of a frame in the comparison and, if different, its numbers in the files."""
+        """Format the index of a frame in the comparison and, if they differ, its numbers in the two files."""
         if at is None:
             return "no frame"
         a, b = (int(self.table("apart")[f"number_{one}"][at]) for one in "ab")
@@ -149,7 +149,7 @@ class ComparisonView(FlipsView):
 
     @property
     def shift(self) -> dict[str, Any]:
-        """Common displacement of all atoms between the trajectories: its vector, and range of its size."""
+        """Displacement common to all atoms between the trajectories: vector, and range of its length."""
         table, at = self.table("apart"), self.summary["shift"]
         vectors = np.stack([table[f"shift_{one}"] for one in "xyz"], axis=1)
         sizes = np.sqrt((vectors**2).sum(axis=1))
@@ -188,7 +188,7 @@ def judge(view: ComparisonView) -> Verdict:
 
 
 def _headline(view: ComparisonView) -> str:
-    """Return the verdict on the first neighbor rule, followed by a sentence on each further rule."""
+    """Return the verdict on the first neighbor rule, and then a sentence on each further rule."""
     first, *others = view.summary["rules"]
     text = TEXTS(f"head_{_head(view, first)}", **view.values(first))
     if view.summary["shift"] is not None:
@@ -220,7 +220,7 @@ def _in_short(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _evidence(view: ComparisonView) -> Iterator[str]:
-    """Yield sentences on differences of positions and neighbor sets, and on what differed first."""
+    """Yield sentences on differences of positions and neighbor sets, and on which differed first."""
     summary, (one, *others) = view.summary, view.summary["rules"]
     seed, beyond, first, values = summary["seed"], summary["beyond"], one["first"], view.values(one)
     if seed is not None:
@@ -255,7 +255,7 @@ def _certain(one: Mapping[str, Any]) -> str:
 
 
 def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
-    """Classify what differed first: positions, boxes or neighbor sets."""
+    """Classify which quantity differed first: positions, boxes or neighbor sets."""
     at, beyond, certain = one["first"]["frame"], view.summary["beyond"], one["certain"]
     if beyond is not None and beyond < at:
         return "positions"

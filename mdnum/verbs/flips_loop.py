@@ -19,7 +19,7 @@ _POINTS = 2_000
 
 
 def loop_told(folder: RunFolder) -> dict[str, Any]:
-    """Return statistics of a loop's neighbor lists and energy; None for quantities that were not recorded."""
+    """Return statistics of a loop's neighbor lists and energy; None for a quantity not recorded."""
     loop = folder.read("loop")
     return {"lists": _lists_told(loop, folder), "energy": _energy_told(loop, folder)}
 
@@ -111,7 +111,7 @@ def sections(view: FlipsView) -> Iterator[Section]:
 
 
 def unfinished(view: FlipsView) -> Verdict:
-    """Return the verdict on a loop that ended before its recorder was closed."""
+    """Return the verdict on a simulation loop that ended before its recorder was closed."""
     frames, one = view.table("frames"), view.summary["rules"][0]
     number, entered, left = (frames[name][frames["rule"] == 0] for name in ("number", "entered", "left"))
     flips, last = int((entered + left).sum()), int(number[-1])

@@ -105,7 +105,7 @@ def _ended(view: FlipsView) -> Iterator[Finding]:
 
 
 def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
-    """Return the frames at which the number of pairs is not the previous number + entered - left."""
+    """Return the frames whose number of pairs is not the previous frame's number + entered - left."""
     table = view.table("frames")
     rows = table["rule"] == place
     net = (table["entered"][rows] - table["left"][rows])[1:]
@@ -113,7 +113,7 @@ def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
 
 
 def _of_rules(view: FlipsView) -> Iterator[Finding]:
-    """Yield one finding per code, which joins the sentences on all neighbor rules."""
+    """Yield one finding per code, with the sentences on all neighbor rules."""
     by_code: dict[str, list[Finding]] = {}
     for place, one in enumerate(view.summary["rules"]):
         for code, variants, values in _limits(view, place, one):
@@ -129,7 +129,7 @@ def _of_rules(view: FlipsView) -> Iterator[Finding]:
 
 
 def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
-    """Yield codes of findings on limitations of one neighbor rule's flips, with text variants and values."""
+    """Yield codes of findings on limits of the flips found by one rule, with text variants and values."""
     if len(wrong := _disagreeing(view, place)):
         yield "EVENT_ALGEBRA", (), {"first": int(wrong[0]) + 1, "frames": len(wrong)}
     flips, frames = one["flips"], view.summary["frames"]
@@ -249,7 +249,7 @@ def _others(view: FlipsView) -> Iterator[Finding]:
 
 
 def _time_goes_back(view: FlipsView) -> Finding:
-    """Return a finding on frames at which time decreases or repeats."""
+    """Return a finding on frames at which the time decreases or repeats."""
     rows = view.table("frames")
     numbers, times = (rows[name][rows["rule"] == 0] for name in ("number", "time"))
     told = view.again(view.summary["repeats"].get("again", ()))
@@ -514,7 +514,7 @@ def _lasting(view: FlipsView, place: int) -> Table | None:
 def _maps(
     view: FlipsView, pairs: Mapping[str, np.ndarray], moments: Mapping[str, np.ndarray], x: np.ndarray
 ) -> Iterator[tuple[str, tuple[str, ...], tuple[str, ...], Region]]:
-    """Yield the contact matrix, and a map of contacts per residue over time, each with axis labels."""
+    """Yield the contact matrix, and a map of each residue's contacts over time, both with axis labels."""
     index, first = np.unique(moments["index"], return_index=True)
     if not len(index):
         return

@@ -40,7 +40,7 @@ def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
 
 
 def stem(trajectory: Trajectory) -> str:
-    """Return the default stem of the output folder's name, from the name of the trajectory or its run."""
+    """Return the default stem of an output folder's name, from the name of a trajectory or of its run."""
     name = trajectory.path.name.split(".")[0]
     return trajectory.path.resolve().parent.name if name == "trajectory" else name
 
@@ -76,7 +76,7 @@ def in_python(text: str) -> str:
 
 @contextmanager
 def as_python(in_memory: bool) -> Iterator[None]:
-    """Replace command-line options in error messages by Python arguments, if the frames were arrays."""
+    """Replace command-line options in error messages by Python arguments, if frames were given as arrays."""
     try:
         yield
     except InputError as error:
@@ -86,7 +86,7 @@ def as_python(in_memory: bool) -> Iterator[None]:
 
 
 def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = False) -> dict[str, Any]:
-    """Return summary entries on whether all frames were read, and on the error otherwise."""
+    """Return summary entries on whether all frames were read and, if not, on the error."""
     told = None if stopped is None else str(stopped)
     return {
         "stopped": in_python(told) if told and in_memory else told,
@@ -134,7 +134,7 @@ class HeldRows:
 
     @property
     def full(self) -> bool:
-        """True if the buffer has enough rows to be written."""
+        """True if the buffer has so many rows that they should be written."""
         return self._count > _ROWS_HELD
 
     def hand_over(self, folder: RunFolder) -> None:
@@ -187,7 +187,7 @@ class FlipsView(View):
         return f"{plain(frames, digits)} frame{'' if frames == 1 else 's'}"
 
     def life(self, one: Mapping[str, Any], name: str = "median", of: str = "lifetime") -> str:
-        """Format a contact lifetime: its value, a bound, or the reason why no lifetime is known.
+        """Format a contact lifetime: a value, a bound, or the reason why the lifetime is unknown.
 
         If the median lifetime is one frame, all lifetimes are upper bounds, because pairs crossed the cutoff
         several times between frames.
@@ -204,7 +204,7 @@ class FlipsView(View):
         return bound * (life[name] is not None) + self.duration(life[name])
 
     def rate(self, per_frame: float | None) -> str:
-        """Format a rate per frame, or per time if frames have times; None becomes a dash."""
+        """Format a rate per frame or, if frames have times, per time; format None as a dash."""
         if per_frame is None:
             return "–"
         if self.timed:

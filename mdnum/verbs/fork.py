@@ -1,4 +1,4 @@
-"""`mdnum fork`: the step at which two runs that differ in one numerical choice diverge, and the cause.
+"""`mdnum fork`: the step at which two runs that differ in one numerical choice diverge, and why.
 
 For molecular dynamics and for a ball, `fork` varies one numerical choice and `fork_screen` each choice in
 turn; `fork_folders` compares or replays two finished runs; `fork_benign` compares ensembles of runs.
@@ -140,9 +140,9 @@ def fork_screen(
     workers: int | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system once per choice, and rank the choices by the step at which decisions first differ.
+    """Run a system once per numerical choice; rank the choices by the step at which decisions first differ.
 
-    For a choice that matters, the function `fork` also tests whether a flip is the cause of divergence.
+    For a single choice, the function `fork` also tests whether a flip is the cause of divergence.
 
     Example:
         >>> mdnum.fork_screen("argon/crystal-108", steps=200)
@@ -181,7 +181,7 @@ def fork_screen(
 def fork_folders(
     a: str | Path, b: str | Path, *, replay: bool = False, objects: Sequence[Simulation] = (), **asked: Any
 ) -> Outcome:
-    """Compare two finished runs (molecular dynamics or a ball): settings, and the step of divergence.
+    """Compare two finished runs (molecular dynamics or a ball): their settings and the step of divergence.
 
     Example:
         >>> mdnum.fork_folders("runs/liquid-864", "runs/liquid-864-2")
@@ -246,7 +246,7 @@ def fork_folders(
 def fork_benign(
     system: Simulation | System | str | Path, vary: str, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Test whether a choice changes any measured quantity, by an ensemble-consistency test.
+    """Test, by an ensemble-consistency test, whether a numerical choice changes any measured quantity.
 
     Example:
         >>> mdnum.fork_benign("argon/liquid-864", "order")
@@ -273,7 +273,7 @@ def fork_benign(
 
 
 def listed() -> Reply:
-    """Execute `mdnum fork choices`: list the numerical choices that can be varied."""
+    """Execute `mdnum fork choices`: list the numerical choices that can differ between two runs."""
     from mdnum.forks.choices import shipped
 
     document, tables = {}, []
@@ -326,7 +326,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """Draw one line per choice, with marks at the first different bit, at the fork and at the split."""
+    """Draw a line for each choice, with marks at the first differing bit, at the fork and at the split."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (

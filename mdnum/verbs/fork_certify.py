@@ -1,4 +1,4 @@
-"""`mdnum fork certify`: runs versus exact arithmetic; `mdnum fork processes`: variants of one program."""
+"""`mdnum fork certify` (runs against exact arithmetic) and `mdnum fork processes` (program variants)."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def fork_certify(
 
 
 def _ranking(answer: Answer) -> list[dict[str, Any]]:
-    """Return the ranking of precisions for the summary; add tables of the ranking and of separations."""
+    """Return the ranking of precisions for the summary; add tables of the ranking and the separations."""
     ranking, rows, table = answer.result.ranking, [], []
     for row in ranking:
         decision, growth, separation = row.decision, row.growth, row.separation
@@ -111,7 +111,7 @@ def _ranking(answer: Answer) -> list[dict[str, Any]]:
 
 
 def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[str, Any]:
-    """Stack several named lines into one table, with the columns name, step and separation."""
+    """Join several named lines into one table, with the columns name, step and separation."""
     return {
         name: np.concatenate([np.full(len(line), key) for key, line in lines.items()]),
         "step": np.concatenate([first + np.arange(len(line)) for line in lines.values()]),
@@ -120,7 +120,7 @@ def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[s
 
 
 def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
-    """Count, for each precision, decisions within rounding bounds, and evaluate these decisions exactly."""
+    """Count, for each precision, decisions within rounding bounds, and evaluate each of them exactly."""
     from mdnum.forks.certified import certified_horizon
     from mdnum.numerics import PrecisionPolicy
 
@@ -135,7 +135,7 @@ def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
 
 
 def judge_certify(view: View) -> Verdict:
-    """Return the verdict: at which precisions do all decisions agree with exact arithmetic, and how long?"""
+    """Return the verdict: at which precisions, and how long, decisions agree with exact arithmetic."""
     s = view.summary
     rows = [row for row in s["policies"] if row["reason_unavailable"] is None]
     left = [row for row in rows if row["horizon"] is not None]
@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """Yield a sentence for each run with another precision in a single role, on steps gained or lost."""
+    """Yield, for each run with another precision in one role, a sentence on the steps gained or lost."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip
@@ -240,7 +240,7 @@ def _drawn(table: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> tuple[
 
 
 def _bars(s: Mapping[str, Any], figure: Canvas) -> None:
-    """Draw one bar per precision; its length is the number of steps with exact decisions."""
+    """Draw a bar for each precision; the bar's length is the number of steps with exact decisions."""
     axes, rows, last = figure.subplots(), s["policies"], s["steps"]
     place = np.arange(len(rows))[::-1]
     ends = [last if row["horizon"] is None else row["horizon"] for row in rows]
@@ -266,7 +266,7 @@ def fork_processes(
     which: Sequence[Variant] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system in several ways (jitted, eager, batched, in a gradient, XLA flags), and compare results.
+    """Run a system in several ways (jit, eager, batched, in a gradient, XLA flags); compare the results.
 
     Example:
         >>> mdnum.fork_processes("argon/crystal-108", steps=100)
@@ -327,7 +327,7 @@ def _cause(code: str, names: Sequence[str] = (), program: str = "", **values: An
 
 
 def judge_processes(view: View) -> Verdict:
-    """Return the verdict: how many different trajectories do the variants of one program compute?"""
+    """Return the verdict: the number of different trajectories that the variants of one program compute."""
     s = view.summary
     seeds = [row["first_bit"] for row in s["variants"] if row["first_bit"] is not None]
     ran, clusters = len(s["variants"]) - len(s["failed_variants"]), len(s["clusters"])

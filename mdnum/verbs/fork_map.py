@@ -1,4 +1,4 @@
-"""`mdnum fork map` and `mdnum fork forecast`: decisions that change with a parameter or the start."""
+"""`mdnum fork map` and `mdnum fork forecast`: decisions that change with a parameter or initial state."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def command(system: str, along: str, **given: Any) -> Outcome:
 
 
 def interval(text: str) -> tuple[str, float, float]:
-    """Split a text KEY=LOW:HIGH into the key and the two ends of the interval.
+    """Split a text of the form KEY=LOW:HIGH into the key and the two ends of the interval.
 
     Raises:
         InputError: the text is not of the form KEY=LOW:HIGH.
@@ -78,7 +78,7 @@ def fork_map(
     workers: int | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find the values of a parameter at which decisions of a run change, each between two adjacent floats.
+    """Find parameter values at which decisions of a run change, each value between two adjacent floats.
 
     Example:
         >>> mdnum.fork_map("argon/crystal-108", "cutoff.radius", 1.58, 1.59, steps=100)
@@ -268,7 +268,7 @@ def page_map(view: View, verdict: Verdict) -> Page:
 
 
 def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
-    """Yield figures of the loss along the parameter, of the loss minus its trend, and of its jumps."""
+    """Yield figures of the loss, of the loss minus its trend, and of its jumps, all versus the parameter."""
     s, points = view.summary, view.table("points")
     at, loss = points["at"], points["loss"]
     finite = np.isfinite(loss)
@@ -331,7 +331,7 @@ def _with_unit(text: str, unit: str) -> str:
 def fork_forecast(
     system: Simulation | System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Predict the first decisions that a random displacement of the start changes, from one tangent run.
+    """Predict, from one tangent run, which decisions a random displacement of the start changes first.
 
     Example:
         >>> mdnum.fork_forecast("argon/liquid-864", 1e-9)

@@ -1,4 +1,4 @@
-"""Report page of two runs that differ in one choice, made from the output folder alone."""
+"""Report page of two runs that differ in one numerical choice, made from the output folder alone."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ARROW = 0.5
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Return the report page of two runs that differ in one choice."""
+    """Return the report page of two runs that differ in one numerical choice."""
     s = view.summary
     return view.page(f"{view.name}: {s['choice']}", str(s["difference"]), TEXTS.keys(**_numbers(view)), [
         Section("Separation", list(_separation(view))),
@@ -84,7 +84,7 @@ def _has(table: Mapping[str, np.ndarray], name: str) -> bool:
 
 
 def _separation(view: View) -> Iterator[Plot | str]:
-    """Yield figures of the separation of runs A and B, with own decisions and with imposed decisions."""
+    """Yield figures of the separation of runs A and B, where B uses its own or A's decisions."""
     s, table = view.summary, view.table("separation")
     if not _has(table, "free"):
         return
@@ -159,7 +159,7 @@ def _decision(view: View) -> Iterator[Any]:
 
 
 def _around(view: View) -> Iterator[Any]:
-    """Yield a figure of the atoms around the pair at the fork, or of the heights of the ball at the fork."""
+    """Yield a figure of the atoms around the pair, or of the heights of the ball, at the fork."""
     d = view.summary["decision"]
     if d is None:
         return
@@ -183,7 +183,7 @@ def _around(view: View) -> Iterator[Any]:
 
 
 def _atoms(view: View, figure: Canvas) -> None:
-    """Draw the atoms of A and of B in two panels; the pair lies in the plane, and a circle is the cutoff."""
+    """Draw the atoms of A and B in two panels, with the pair in the plane and the cutoff as a circle."""
     d, table = view.summary["decision"], view.table("neighborhood")
     x, moved = (
         np.stack([table[k] for k in names], axis=1) for names in (("x", "y", "z"), ("dx", "dy", "dz"))
@@ -222,7 +222,7 @@ def _atoms(view: View, figure: Canvas) -> None:
 
 
 def _two_by_two(view: View) -> Iterator[Any]:
-    """Yield the two-by-two table: steps of the split for each arithmetic with the decisions of each run."""
+    """Yield a two-by-two table: the step of the split for either arithmetic with either run's decisions."""
     s, unit = view.summary, view.units.length
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for cell in s["table"]:
@@ -297,7 +297,7 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
 
 
 def _certain(view: View) -> Iterator[Any]:
-    """Yield tables and a figure on the steps up to which rounding cannot have changed a decision."""
+    """Yield tables and a figure of the steps up to which rounding cannot have changed any decision."""
     s, rows = view.summary, []
     for name, step in (s.get("certified_horizon") or {}).items():
         ambiguous, first = s["ambiguous"][name], s["ambiguous_first"][name]

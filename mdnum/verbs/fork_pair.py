@@ -1,4 +1,4 @@
-"""Run two simulations that differ in one choice, and write the results to an output folder."""
+"""Run two simulations that differ in one numerical choice, and write the results to an output folder."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MD_ALONE = ("energy_back", "nearest_a", "nearest_b", "ambiguous_a", "ambiguous_
 
 @dataclass(frozen=True)
 class PairQuestion:
-    """Options for a pair of runs, with the names and meanings of arguments of `fork`."""
+    """Options for a pair of runs; names and meanings are those of the arguments of `fork`."""
 
     steps: int | None = None
     split: float | None = None
@@ -56,7 +56,7 @@ class PairQuestion:
 
 
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
-    """Return the given last step; if none is given, return the system's own last step, at most `most`.
+    """Return the last step: the given one or, by default, the system's own last step, but at most `most`.
 
     Raises:
         InputError: steps is below 1.
@@ -159,7 +159,7 @@ def followed(
 
 
 def _numbers(made: Fork) -> dict[str, Any]:
-    """Return summary entries of any pair of runs: steps of divergence, verdict, growth of separation."""
+    """Return summary entries of a pair of runs: steps of divergence, verdict, growth of the separation."""
     step, verdict, growth = made.twin.a.timestep, made.verdict, made.growth["B"]
     dates = {"first_bit": made.dates.first_bit, "fork": made.dates.fork, "split": made.dates.split}
     free, imposed, overridden = (
@@ -204,7 +204,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
 
 
 def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
-    """Return the strain between the boxes of A and B at the end, at its maximum, and at the divergence."""
+    """Return the strain between the boxes of A and B at the end, the largest, and at the divergence."""
     if "strain" not in made.series:
         return {}
     strain, free = made.series["strain"], made.series["B"]
@@ -217,7 +217,7 @@ def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
-    """Return the fit separation = exp(intercept + rate * step), with its first and last step."""
+    """Return the fit separation = exp(intercept + rate * step), with the first and last fitted step."""
     if not np.isfinite(fit.rate):
         return dict.fromkeys(("rate", "r_squared", "first", "last", "intercept"))
     step = np.arange(fit.first, fit.last + 1)
@@ -226,7 +226,7 @@ def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
 
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Predict the step of a split that has not occurred, from observed growth or the Lyapunov exponent."""
+    """Predict, from the observed growth or the Lyapunov exponent, the step of a split that did not occur."""
     from mdnum.numerics.verdicts import expected
 
     exponent = summary.get("lyapunov")
@@ -357,7 +357,7 @@ def _of_ball(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
 
 
 def _exponent(made: Fork) -> dict[str, Any]:
-    """Return the largest Lyapunov exponent of run A, or the reason why no exponent is available."""
+    """Return the largest Lyapunov exponent of run A, or the reason why the exponent is unknown."""
     from mdnum.forks.linearized import lyapunov
 
     def why(name: str, **values: Any) -> dict[str, Any]:
@@ -391,7 +391,7 @@ def _exponent(made: Fork) -> dict[str, Any]:
 
 
 def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
-    """Run B with one or more decisions of A imposed; return the result, or why the run is impossible."""
+    """Run B with decisions of A imposed; return the result, or the reason why the run is impossible."""
     from mdnum.forks.replays import parse_pin, pinned
 
     try:
@@ -408,7 +408,7 @@ def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
 
 
 def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
-    """Return the smallest set of decisions that must be overridden to keep the runs together, if found."""
+    """Return, if found, the smallest set of decisions that, when overridden, keep the runs together."""
     from mdnum.forks.replays import disagreements, minimal_cause
 
     try:

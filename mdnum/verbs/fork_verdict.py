@@ -36,7 +36,7 @@ def subject(s: Mapping[str, Any]) -> str:
 
 
 def of_pair(flip: Mapping[str, Any]) -> str:
-    """Return the label of the pair (with the energy term, if there are several) or the ball of a flip."""
+    """Return the label of a flip's pair (with the energy term, if there are several terms) or ball."""
     i, *j = flip["subject"]
     return pair_name({"i": i, "j": j[0], "terms": flip["terms"]}) if j else str(i)
 
@@ -50,7 +50,7 @@ def judge(view: View) -> Verdict:
 
 
 def _headline(view: View) -> tuple[str, dict[str, Any]]:
-    """Return the key of the headline's text, and the values for this text."""
+    """Return the key of the headline's text, and the values to fill in."""
     s = view.summary
     failed, word, fork, split = (s.get(name) for name in ("failed", "effect", "fork", "split"))
     values = {name: s.get(name) for name in ("steps", "first_bit", "fork", "split", "predicted_split")}
@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """Return a phrase on how many repeats agree that runs split later if decisions are imposed."""
+    """Return a phrase on the number of repeats in which runs split later if decisions are imposed."""
     said: list[str] = []
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -114,7 +114,7 @@ def decided(decision: Mapping[str, Any]) -> str:
 
 
 def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the decisions of A and B where they first differ, and which run decided yes and which no."""
+    """Return the first differing decisions of A and B, and which run decided yes and which decided no."""
     yes = "A" if decision["decided"]["A"] > decision["decided"]["B"] else "B"
     return {"yes": yes, "no": "B" if yes == "A" else "A", "a": decision["decided"]["A"],
             "b": decision["decided"]["B"]}  # fmt: skip
@@ -164,7 +164,7 @@ def must_hold(row: Mapping[str, Any]) -> Finding:
 
 
 def judge_screen(view: View) -> Verdict:
-    """Return the verdict on all choices: the first to change a decision, and unexpected changes of bits."""
+    """Return the verdict on all choices: which first changes a decision, and unexpected changes of bits."""
     rows, found = view.summary["ranking"], []
     broken = [row for row in rows if row["must_hold"] and row["first_bit"] is not None]
     forked = [row for row in rows if row["fork"] is not None]
@@ -210,7 +210,7 @@ def judge_compare(view: View) -> Verdict:
 
 
 def judge_benign(view: View) -> Verdict:
-    """Return the verdict: are the runs of B consistent with the ensemble of runs of A?"""
+    """Return the verdict on whether the runs of B are consistent with the ensemble of runs of A."""
     summary = view.summary
     values = {"difference": summary["difference"], "step": summary["window"]}
     if summary["passed"]:

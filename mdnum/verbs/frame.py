@@ -1,8 +1,8 @@
 """Functions common to all verbs (commands), which make, fill, judge and show an output folder.
 
-The module of a verb contains its function (options → output folder), `judge` (view of the folder → findings
-and a headline) and `page` (view → sections). The sentences of findings and pages are in a text file with the
-name of the module. A module declares its verb in one line:
+The module of a verb contains three functions: the verb (options → output folder), `judge` (view of the folder
+→ findings and a headline) and `page` (view of the folder → sections). The sentences of findings and pages are
+in a text file named after the module. A module declares its verb in one line:
 
     KINDS = {"flips": Verb(judge, page)}
 
@@ -94,7 +94,7 @@ class View:
         return self._tables[name]
 
     def kept(self, codes: Mapping[str, Any]) -> list[Finding]:
-        """Return the stored findings whose codes are not in `codes`: findings of other modules."""
+        """Return the stored findings of other modules, whose codes are not in `codes`."""
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
 
@@ -126,7 +126,7 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether control-C was pressed; a second press raises KeyboardInterrupt.
+    """Yield a function that returns True after control-C; a second control-C raises KeyboardInterrupt.
 
     Python delivers signals only to the main thread; in other threads the function always returns False.
     """
@@ -252,7 +252,7 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
 
 @dataclass
 class Answer:
-    """An output folder that is being filled, with the summary, tables and result to be stored."""
+    """Output folder while it is being filled: the summary, tables and result to be stored."""
 
     folder: RunFolder  # that is filled
     log: Progress  # passes progress on and writes it to log.txt
@@ -274,7 +274,7 @@ def answering(
     progress: Progress | None = None,
     allow_code: bool = False,
 ) -> Iterator[Answer]:
-    """Context manager for a new output folder; at its end, the results are stored, judged and shown.
+    """Context manager for a new output folder; on exit, the results are stored, judged and shown.
 
     Args:
         kind, name, system: as for `new_folder`.
@@ -386,7 +386,7 @@ def finish(
 
 
 def read(folder: str | Path) -> Outcome:
-    """Return the outcome stored in an output folder; results are judged again, but nothing is written.
+    """Return the outcome stored in an output folder; judge the results again, but write nothing.
 
     Example:
         >>> mdnum.read("runs/argon-crystal-108-1").table("flips")
@@ -398,7 +398,7 @@ def read(folder: str | Path) -> Outcome:
 
 
 def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **counts: Any) -> None:
-    """Call the progress function, if there is one, with the phase and the current step."""
+    """Call the progress function, if one was given, with the phase and the current step."""
     if progress is not None:
         progress(step, steps, {"phase": phase, **counts})
 
@@ -443,7 +443,7 @@ def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
 
 
 def logged(folder: RunFolder, progress: Progress | None, lines: int = 10) -> Progress:
-    """Wrap a progress function so that each new phase, and progress at intervals, is logged in log.txt.
+    """Wrap a progress function to log each new phase, and progress at intervals, in log.txt.
 
     Args:
         lines: approximate number of lines for a phase that counts its steps.

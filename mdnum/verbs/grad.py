@@ -146,7 +146,7 @@ def _problem(
 def plan(
     problem: Problem, names: Sequence[str], asked: Sequence[str] | None, replicas: int = 0
 ) -> tuple[list[Method], list[dict[str, str]]]:
-    """Return the gradient methods to run, and omitted methods, each with a reason and an option to add it.
+    """Return the gradient methods to run, and omitted methods with reasons and the options to add them.
 
     Args:
         asked: names of methods; None for the fast ones.
@@ -179,7 +179,7 @@ def plan(
 
 
 def _too_long(method: Method, problem: Problem, names: int) -> str:
-    """Return the reason why a gradient method is too slow to be run by default, or ""."""
+    """Return the reason why a gradient method is too slow to run by default; "" if it is fast enough."""
     runs = getattr(method, "runs", 0) * names + 1
     if runs * problem.simulation.atoms * problem.steps <= AFFORDABLE or runs == 1:
         return ""
@@ -187,7 +187,7 @@ def _too_long(method: Method, problem: Problem, names: int) -> str:
 
 
 def _over(method: Any, replicas: int, horizons: bool = True) -> Method:
-    """Return a method with the given number of initial states, if the method averages over states."""
+    """Return a method with the given number of initial states, or unchanged if the method uses only one."""
     if not replicas or not hasattr(method, "replicas"):
         return method
     changed = replace(method, replicas=replace(method.replicas, count=replicas))
@@ -290,7 +290,7 @@ def _not_run(
     asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
     further: Sequence[str], half_step: bool,
 ) -> list[dict[str, str]]:  # fmt: skip
-    """Return a list of results that were not computed, each with a reason and an option to add it."""
+    """Return a list of results that were not computed, each with the reason and the option that adds it."""
     from mdnum.gradients.diagnose.trust import no_half_step
 
     own, rows = problem.simulation.steps, []
@@ -340,7 +340,7 @@ def _method(found: Gradient) -> dict[str, Any]:
 
 
 def brief(value: Any) -> Any:
-    """Shorten an array: return a number, a short list, or the norm and the largest entry of a large array."""
+    """Return an array as a number or a short list; for a large array, return the norm and largest entry."""
     array = np.asarray(value, np.float64)
     if array.ndim == 0:
         return float(array)
@@ -431,7 +431,7 @@ def _differentiated(system: BallSystem, methods: list[str], answer: Answer) -> N
 
 
 def relative(value: float, right: float) -> float:
-    """Return |value - right| / |right|, or infinity if `right` is 0 and `value` is not."""
+    """Return |value - right| / |right|, or infinity if `right` is 0 and `value` is not 0."""
     if value == right:
         return 0.0
     return abs(value - right) / abs(right) if right else float("inf")

@@ -48,12 +48,12 @@ def magnitude(value: Any, missing: float | None = None) -> float:
 
 
 def digits_of(summary: Mapping[str, Any], name: str) -> int | None:
-    """Return the number of digits of a derivative that are unchanged at half the time step, if known."""
+    """Return how many digits of a derivative do not change at half the time step; None if unknown."""
     return ((summary.get("trust") or {}).get("digits") or {}).get(name)
 
 
 def digits_note(summary: Mapping[str, Any], name: str) -> str:
-    """Return a note if a derivative has no valid digit, or an unknown number of valid digits; else ""."""
+    """Return a note if no digit of a derivative is valid, or it is unknown which are valid; otherwise ""."""
     known = digits_of(summary, name)
     if summary.get("trust") and known is None:
         return TEXTS("digits_unknown")
@@ -72,7 +72,7 @@ def resolved(summary: Mapping[str, Any], name: str, value: float | None, most: i
 
 
 def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str, most: int = 6) -> str:
-    """Format a derivative, rounded to its valid digits, with its error if one is known."""
+    """Format a derivative, rounded to its valid digits, with its error if the error is known."""
     if found is None or name not in found["gradient"]:
         return "–"
     value = found["gradient"][name]
@@ -111,7 +111,7 @@ def closeness(row: Mapping[str, Any]) -> str:
 
 
 def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
-    """Return the sentence on one limit on the number of steps for which a gradient can be trusted."""
+    """Return a sentence on one of the limits on the number of steps for which a gradient can be trusted."""
     code = f"{limit['what']}_{limit['code']}".replace(" ", "_")
     values = {"horizon": limit["horizon"], **limit["values"]}
     first = values.get("first")
@@ -120,7 +120,7 @@ def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
 
 
 def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, Any]]:
-    """Group parameters with the same judgment on trust; the key is empty if all judgments are the same."""
+    """Group parameters that have the same judgment on trust; if there is only one group, its key is empty."""
     trust = summary.get("trust")
     if not trust:
         return {}
@@ -143,7 +143,7 @@ def trust_sentence(summary: Mapping[str, Any], names: tuple[str, ...], one: Mapp
 
 
 def trust_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on whether derivatives can be trusted, up to which step, and what limits them."""
+    """Yield sentences on whether and up to which step derivatives can be trusted, and on the limit."""
     for names, one in judgments(summary).items():
         yield trust_sentence(summary, names, one)
         yield from (limit_sentence(summary, limit) for limit in one["limits"] if limit["reached"])
@@ -269,7 +269,7 @@ def _horizons(view: View) -> Iterator[Any]:
 
 
 def _limits(view: View) -> Iterator[tuple[float, str]]:
-    """Yield the steps at which trust in derivatives ends, each with the limit that was reached."""
+    """Yield the steps from which derivatives cannot be trusted, each with the limit that was reached."""
     for names, one in judgments(view.summary).items():
         if one["limited_by"]:
             yield one["horizon"], ", ".join([f"limit: {one['limited_by']}", *names])

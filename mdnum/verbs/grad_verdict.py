@@ -73,7 +73,7 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def _of_methods(view: View) -> Iterator[Finding]:
-    """Yield findings on gradients that are not finite, zero, unexplained, misleading or not available."""
+    """Yield findings on gradients that are infinite, NaN, zero, unexplained, misleading or unavailable."""
     summary, methods, section = view.summary, view.summary["methods"], "By method"
     where = summary.get("detective") or {}
     variants = []
@@ -145,7 +145,7 @@ def _of_trust(view: View) -> Iterator[Finding]:
 
 
 def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the remedies for limits that were not examined, as names of variants of a finding."""
+    """Yield remedies for limits on trust that were not examined, as names of variants of a finding."""
     unseen = {one["what"] for one in trust["limits"] if one["horizon"] is None}
     aware = by(view.summary, "event-aware") is not None
     if any(one["what"] == "half the time step" for one in view.summary["left_out"]):

@@ -1,4 +1,4 @@
-"""Return value of every command: a summary, a verdict, and access to tables and figures of its folder."""
+"""Return value of every command: a summary, a verdict, and access to the folder's tables and figures."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Outcome:
 
     @property
     def page(self) -> Page:
-        """Content of report.html and of the terminal output; FolderError if the folder is missing."""
+        """Content of report.html and of the terminal output; raises FolderError if the folder is missing."""
         if self._page is None:
             object.__setattr__(self, "_page", self._read(self._place).page)
         return cast(Page, self._page)

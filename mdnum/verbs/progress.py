@@ -27,10 +27,10 @@ _OUTERMOST = threading.Lock()
 
 @contextmanager
 def reported(progress: Wanted) -> Iterator[Progress | None]:
-    """Context manager: yield the function that receives reports of progress, or None.
+    """Context manager: yield the function to which progress is reported, or None.
 
-    If `progress` is a function, this function is used; None gives a bar, except in a command called by
-    another command and in the workers of a pool; True always gives a bar, False gives no bar.
+    If `progress` is a function, this function is used; True always shows a bar, False never; None shows a
+    bar, except in the workers of a pool and in a command that another command calls.
     """
     from multiprocessing import parent_process
 
@@ -88,7 +88,7 @@ class ProgressBar:
         self.folder = info.get("folder", self.folder)
 
     def _watch(self) -> None:
-        """Draw the bar, or print a line, at intervals, until the progress bar is closed."""
+        """Draw the bar or print a line, at intervals, until the progress bar is stopped."""
         while not self._over.wait(self._pause):
             step, steps, info = self._last
             phase = str(info.get("phase", "run"))

@@ -35,8 +35,8 @@ class Recorder:
     """Recorder of flips, and of pairs that are missing from the neighbor list, for any simulation loop.
 
     The results are the same as from `mdnum.flips` for a file with the recorded frames. Decisions (pair inside
-    or outside the cutoff) are computed from the positions in float64. Decisions that are uncertain because of
-    rounding of the positions to float32 are marked.
+    or outside the cutoff) are computed from the positions in float64. Decisions that are uncertain because
+    positions were rounded to float32 are marked.
 
     Example:
         >>> with mdnum.Recorder(8.5, box=box, fractional=True, out="runs/mine") as rec:
@@ -167,7 +167,7 @@ class Recorder:
         self.see(step, atoms.positions, atoms.cell.array, pbc=atoms.pbc, velocities=speeds, energy=energy)
 
     def __call__(self, *args: Any, **given: Any) -> None:
-        """Call `see`; without arguments, as in a call by an ASE dynamics object, call `see_atoms`."""
+        """Call `see` or, without arguments (as ASE dynamics objects call the recorder), `see_atoms`."""
         if len(args) > 1 or given:
             self.see(*args, **given)
         elif args or self._atoms is not None:
@@ -189,7 +189,7 @@ class Recorder:
 
     @property
     def outcome(self) -> Outcome:
-        """The outcome of the recording, as from `mdnum.flips`; reading this attribute closes the recorder."""
+        """Outcome of the recording, as from `mdnum.flips`; reading this attribute closes the recorder."""
         return self.close()
 
     def __enter__(self) -> Recorder:
@@ -239,7 +239,7 @@ class Recorder:
         return compare_folders(self.outcome.path, other.outcome.path)
 
     def _advance(self) -> None:
-        """Examine all recorded frames that were not yet examined, and write table rows at intervals."""
+        """Examine all recorded frames not yet examined, and write table rows at intervals."""
         try:
             if self._one is None:
                 self._one = self._stack.enter_context(examining(self._source, self._rules, **self._how))

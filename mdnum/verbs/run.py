@@ -148,7 +148,7 @@ def run(
 
 
 def _compile_beside() -> None:
-    """Start a second process that compiles the simulation's functions, if the compilation cache is empty.
+    """If the compilation cache is empty, start a second process that compiles the simulation's functions.
 
     The first command after an installation finds an empty cache and spends most of its time on compilation,
     and a single process uses only one processor for compilation.
@@ -224,7 +224,7 @@ def _keep(run: RunView, compared: EnergyReport | None, period: float | None, fun
 
 
 def _beside_float64(run: RunView, result: RunResult) -> None:
-    """For a fixed-point run, add energy fluctuations of this run and of a float64 run to the summary."""
+    """Add, for a fixed-point run, the energy fluctuations of this run and a float64 run to the summary."""
     from mdnum.rollout.engine import FAILURES, Engine
 
     simulation, summary = result.simulation, run.summary
@@ -439,7 +439,7 @@ def _loop(run: RunView) -> Iterator[Finding]:
 
 
 def function_findings(function: Mapping[str, Any] | None, units: Units) -> Iterator[Finding]:
-    """Yield findings on a user's pair function that is not finite, or whose value or derivatives jump."""
+    """Yield findings on a user's pair function that is not finite, or has jumps in value or derivatives."""
     function = function or {}
     if function.get("single"):
         yield TEXTS.finding("SINGLE_INSIDE", "pair")
@@ -460,7 +460,7 @@ def function_findings(function: Mapping[str, Any] | None, units: Units) -> Itera
 
 
 def _potential(run: RunView) -> Iterator[Finding]:
-    """Yield findings from test calls of a user's energy function."""
+    """Yield findings from trial calls of a user's energy function."""
     units: dict[str, Any] = {"energy_unit": run.units.energy, "length_unit": run.units.length}
     for code, values in ((run.system.get("potential") or {}).get("notes") or {}).items():
         # of a range that has an end

@@ -73,12 +73,12 @@ class RunView(View):
 
     @property
     def cutoff(self) -> Mapping[str, Any]:
-        """Kind, radius, comparison and jumps of the cutoff; empty if the run has no cutoff."""
+        """Kind and radius of the cutoff, comparison, and jumps at the cutoff; empty if there is no cutoff."""
         return self.summary.get("cutoff") or {}
 
     @property
     def cutoff_key(self) -> str:
-        """Key of the system file that sets the cutoff; empty if the potential sets it."""
+        """Key of the system file that sets the cutoff; empty if the potential sets the cutoff."""
         given = self.system.get("cutoff") or {}
         return next((f"cutoff.{key}" for key in ("radius", "in_sigma", "pairs") if key in given), "")
 
@@ -109,7 +109,7 @@ class RunView(View):
 
     @cached_property
     def expected_ambiguous(self) -> float:
-        """Expected number of flips whose margin is within its rounding bound."""
+        """Expected number of flips whose margin is at most the rounding bound of the margin."""
         return analysis.expected_ambiguous(self.flips.ratios)
 
     @cached_property
@@ -121,7 +121,7 @@ class RunView(View):
 
     @cached_property
     def time_step(self) -> dict[str, float | None]:
-        """Indicators of whether the time step is small enough; an indicator that is unknown is None.
+        """Indicators of whether the time step is small enough; unknown indicators are None.
 
         `per_period`: number of steps per period of the fastest vibration in the first and the last frame;
         `fluctuation`: fluctuation of the conserved energy (without the jumps of flips) over the fluctuation
@@ -152,7 +152,7 @@ class RunView(View):
         return Measured(left, self.units.energy, self.summary.get("energy_budget_tolerance"))
 
     def total(self, key: str, column: str | None = None) -> int:
-        """Return a count from the summary, or from the table of neighbor lists if there is no summary."""
+        """Return a count, from the summary or, if there is no summary, from the table of neighbor lists."""
         return int(self.summary.get(key) or self.epochs[column or key].sum())
 
     def step(self, row: int | np.integer) -> int:
@@ -185,7 +185,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
 
 
 def draw_first(run: RunView) -> None:
-    """Draw the figures that need no table of flips, in parallel with other work."""
+    """Draw, in parallel with other work, the figures for which the table of flips is not needed."""
     from mdnum.report import drawing
 
     for part in (*_energy(run), next(_flips_per_step(run)), *_lists(run)):
@@ -443,7 +443,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
 
 
 def _ranges(run: RunView) -> Iterator[Any]:
-    """Yield a table of smallest and largest magnitudes, and of steps at which narrower formats fail."""
+    """Yield a table of extreme magnitudes, and of steps at which narrower number formats fail."""
     examined, series, units = run.table("ranges"), run.series, vars(run.units)
     sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
     sums["step"] = series["step"]

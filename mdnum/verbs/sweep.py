@@ -1,4 +1,4 @@
-"""`mdnum sweep`: sensitivity of results to numerical choices, and the cheapest setting that suffices."""
+"""`mdnum sweep`: sensitivity of results to numerical choices, and the cheapest sufficient settings."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
 def _compute(
     place: Workspace, plan: Plan, log: Any, on: Any, workers: int | None, keep: bool, code: bool
 ) -> dict[str, Any]:
-    """Compute the missing points, wait for points that another sweep is computing, and return counts."""
+    """Compute missing points, wait for points that another sweep computes, and return numbers of points."""
     wanted = {one.address: one for one in plan.points if not one.wrong}
     missing = [a for a in wanted if not enough(place.result(a), plan.wanted)]
     missed = place.nearest(wanted[missing[0]].state) if missing else None
@@ -247,7 +247,7 @@ def _compute(
 def _after_a_loss(
     place: Workspace, one: Task, wanted: Mapping[str, Planned], error: BaseException, counts: dict[str, Any]
 ) -> list[list[Planned]]:
-    """Handle a task whose process died repeatedly: mark its current point as failed, return other points."""
+    """Handle a task whose process died repeatedly: mark the current point as failed; return the others."""
     from mdnum.sweeps.points import write_result
 
     again = []

@@ -24,7 +24,7 @@ def _twin(simulation: Any, steps: int, argument: str) -> Any:
 
 
 def _pair(run: Sample, argument: str) -> Any:
-    """Run a system twice until the runs diverge; by default one initial coordinate differs by one ulp."""
+    """Run a system twice until the runs diverge; by default, one initial coordinate differs by one ulp."""
     from mdnum.forks import fork
 
     if ("fork", argument) not in run.made:
@@ -43,12 +43,12 @@ def _date(run: Sample, argument: str, name: str) -> Value:
 
 
 def fork(run: Sample, argument: str) -> Value:
-    """Time at which two runs first make different decisions; its error is the scatter between seeds."""
+    """Time at which two runs first make different decisions; the error is the scatter between seeds."""
     return _date(run, argument, "fork")
 
 
 def split(run: Sample, argument: str) -> Value:
-    """Time until two runs are separated by 0.01 of the cutoff; its error is the scatter between seeds."""
+    """Time until two runs are separated by 0.01 cutoff radii; the error is the scatter between seeds."""
     return _date(run, argument, "split")
 
 
@@ -62,7 +62,7 @@ def separation(run: Sample, argument: str) -> Value:
 
 
 def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
-    """Return the loss and the full name of the parameter in a text LOSS/PARAMETER."""
+    """Return the loss and the full name of the parameter from a text of the form LOSS/PARAMETER."""
     from mdnum.gradients import parameters
     from mdnum.gradients.losses import parse
 
@@ -77,7 +77,7 @@ def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
 
 
 def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
-    """Return the gradient and its trust horizon, as in `mdnum grad`, and the parameter's full name."""
+    """Return the gradient, up to which step to trust it (as in `mdnum grad`), and the parameter's name."""
     from mdnum.gradients import Problem
     from mdnum.gradients.diagnose import diagnose
 
@@ -100,7 +100,7 @@ def gradient(run: Sample, argument: str) -> Value:
 
 
 def horizon(run: Sample, argument: str) -> Value:
-    """Time up to which the derivative of a loss can be trusted; its error is the scatter between seeds."""
+    """Time up to which a derivative of a loss can be trusted; the error is the scatter between seeds."""
     found, _ = _diagnosis(run, argument)
     if found.trust is None:
         raise InputError(found.failed["trust"])

@@ -25,7 +25,7 @@ _INSIDE = {True: "yes", False: "no", None: "not decided"}
 
 
 def _shown(view: View, name: str) -> str:
-    """Shorten the path in the name of a measure as far as the name remains unique."""
+    """Shorten the path in the name of a measure as much as possible, with a name that remains unique."""
     parts, others = Path(name).parts, [one["name"] for one in view.summary["measures"] if one["name"] != name]
     ends = ["/".join(parts[-k:]) for k in range(1, len(parts))] if ".py:" in name else []
     return next((end for end in ends if not any(one.endswith(f"/{end}") for one in others)), name)
@@ -37,7 +37,7 @@ def _unit(view: View, name: str) -> str:
 
 
 def _moved(view: View) -> dict[str, list[str]]:
-    """Return the names of the physical measures that each choice changes significantly, by choice."""
+    """Return, for each choice, the names of the physical measures that the choice changes significantly."""
     found: dict[str, list[str]] = {axis["key"]: [] for axis in view.summary["axes"]}
     physical = {one["name"] for one in view.summary["measures"] if one["physical"]}
     for row in view.summary["differences"]:
@@ -122,12 +122,12 @@ def _advised(view: View, advice: Mapping[str, Any]) -> str:
 
 
 def _further_seeds(view: View, factor: float) -> int:
-    """Return how many random seeds to add so that their number grows by the given factor."""
+    """Return how many random seeds to add to multiply the number of seeds by the given factor."""
     return int(np.ceil(len(view.summary["seeds"]) * (factor - 1)))
 
 
 def _together(view: View) -> list[str]:
-    """Return a sentence on the runs with all recommended values combined."""
+    """Return a sentence on the runs that use all recommended values together."""
     joint = view.summary["joint"]
     if joint is None or joint["inside"] is False:
         return []
@@ -179,7 +179,7 @@ def _sections(view: View) -> Iterator[Section]:
 def _most(
     rows: Sequence[Any], columns: Mapping[str, str], stored: str, bad: Callable[[Any], Any] | None = None
 ) -> list[Any]:
-    """Return a table of the first rows, preceded by a note on the file with all rows if there are more."""
+    """Return a table of the first rows; if there are more, a note on the file with all rows comes first."""
     more = [TEXTS("more_rows", shown=_ROWS, all=len(rows), stored=stored)] if len(rows) > _ROWS else []
     return [*more, table_of(rows[:_ROWS], columns, bad=bad)]
 
@@ -208,7 +208,7 @@ def _differences(view: View) -> list[Any]:
 
 
 def _with_error(row: Mapping[str, Any]) -> str:
-    """Format a value and its error; the value is rounded to the digits that are valid given the error."""
+    """Format a value and its error, with the value rounded to the digits that the error leaves valid."""
     value, error = row["value"], row["error"]
     if not error:
         return number(value, 5)

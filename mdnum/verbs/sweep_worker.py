@@ -35,7 +35,7 @@ class Task:
 
 
 def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> bool:
-    """True if a stored result is complete, or if its computation failed for a permanent reason."""
+    """True if a stored result is complete, or if the computation failed for a reason that will persist."""
     if result is None:
         return False
     if result["status"] == "failed":
@@ -45,7 +45,7 @@ def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> boo
 
 
 def _missing(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> list[str]:
-    """Return the requested measures that a stored result lacks or that other source code computed."""
+    """Return the requested measures that a stored result lacks or that different source code computed."""
     stored = {} if result is None else result["measures"]
     return [name for name, at in measures.items() if stored.get(name, {}).get("digest") != at]
 
@@ -53,8 +53,8 @@ def _missing(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> l
 def work(task: Task) -> list[dict[str, Any]]:
     """Compute the missing points of a task; return the address and the status of each point.
 
-    The status of a point is "computed", "there" (already stored), "busy" (being computed by another process),
-    or "full" (its folder cannot be written), with the reason.
+    The status of a point is "computed" (now), "there" (already stored), "busy" (being computed by another
+    process), or "full" (its folder cannot be written), with the reason.
     """
     place, told = Workspace(Path(task.workspace)), []
     for point in task.points:
@@ -140,7 +140,7 @@ def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
 
 
 def _bounced(system: Any, steps: int, task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
-    """Run a ball without its variants and gradients, and return the data for measures."""
+    """Simulate a ball without its variants and gradients, and return the data for measures."""
     import pyarrow
     import pyarrow.parquet as parquet
 
