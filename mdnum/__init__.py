@@ -1,4 +1,4 @@
-"""Molecular dynamics with a cutoff: changes of neighbor sets, divergence of runs, and gradients.
+"""Molecular dynamics with a cutoff: pairs that cross the cutoff, runs that diverge, and gradients.
 
 A simulation is created from Python objects, or from a system file, as follows:
 

@@ -14,7 +14,7 @@ if __name__ == "__main__" and not sys.flags.safe_path and sys.path[:1] == [os.ge
 def main() -> None:
     """Run the command line and exit.
 
-    Before there are results to be saved, and again at the end, control-C ends the process at once, because an
+    Before results exist, and after they are saved, control-C ends the process at once, because an
     interrupted import of a package fails in unpredictable ways.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):

@@ -74,7 +74,7 @@ def changes_in_time(
 def set_bits(
     packed: UInt8[np.ndarray, "words columns"],
 ) -> tuple[Int[np.ndarray, "set"], Int[np.ndarray, "set"]]:
-    """Return the slot and the column of every set bit in an array of packed bits."""
+    """Return the row and the column of every set bit in an array of packed bits."""
     _, slots, columns, _ = changes_in_time(np.zeros_like(packed), packed[None])
     return slots, columns
 

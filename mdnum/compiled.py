@@ -1,4 +1,4 @@
-"""Decorators of numba with caching: compiled functions are stored on disk if possible."""
+"""Decorators that compile functions with numba, and store the compiled functions on disk if possible."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ class TimeUp(Exception):
 class Deadline:
     """A deadline, after which a command does not start further work.
 
-    The evidence for a verdict is the number of calls, which does not depend on the speed of the machine. A
-    deadline can only reduce the number of calls; the command then reports the reduced number.
+    The evidence for a verdict is counted in function calls, not in time that depends on the machine. A
+    deadline can only reduce the number of function calls; the command then reports the reduced number.
 
     Args:
         minutes: time from now in minutes; None for no limit.
@@ -50,7 +50,7 @@ class Deadline:
         return max(0.0, self._end - time.monotonic())
 
     def part(self, share: float) -> Deadline:
-        """Return an earlier deadline, after a fraction of the remaining time."""
+        """Return an earlier deadline, at which only a fraction of the remaining time has passed."""
         sooner = Deadline()
         sooner._end = time.monotonic() + share * self.left
         return sooner
@@ -65,7 +65,7 @@ class Deadline:
 def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
     """Raise `TimeUp` in the main thread if the block is still running `grace` seconds after the deadline.
 
-    The exception is raised repeatedly, in case the block catches it. Compiled code is not interrupted.
+    The exception is raised repeatedly, in case the block catches `TimeUp`. Compiled code is not interrupted.
     """
     if math.isinf(deadline.left) or threading.current_thread() is not threading.main_thread():
         yield

@@ -3,10 +3,10 @@
 All tests are computations on the current machine. Versions that are known to be faulty are also reported, but
 no version is assumed to be correct.
 
-Error bounds require that +, -, *, / and sqrt are each correctly rounded, and that sums are not reordered. XLA
-satisfies these conditions on CPUs, but contracts a*b+c and rewrites divisions by constants. Such changes
-affect last bits. Therefore two builds may disagree on whether a pair is inside the cutoff, if its distance
-from the cutoff is below the error bound.
+Error bounds require that +, -, *, / and sqrt are each correctly rounded, and that sums are not reordered. On
+CPUs, XLA rounds correctly and does not reorder sums, but contracts a*b+c and rewrites divisions by constants.
+Contractions and rewritten divisions change the last bits of results. Therefore two builds of a program may
+disagree on whether a pair is inside the cutoff, if its distance from the cutoff is below the error bound.
 """
 
 from __future__ import annotations
@@ -273,9 +273,9 @@ def constant_division() -> DoctorRow:
 def subnormals() -> DoctorRow:
     """Test whether numpy and jax keep numbers below 2.2e-308, or flush them to zero.
 
-    XLA flushes subnormal numbers to zero on CPUs, and a loaded library can make the processor flush all of
-    them. The test also uses arrays that are large enough for XLA's own threads. Results are compared as
-    integers, because a processor that treats subnormals as zero considers these numbers equal to zero.
+    XLA flushes subnormal numbers to zero on CPUs, and a loaded library can make the processor flush all
+    subnormal numbers. The test also uses arrays that are large enough for XLA's own threads. Results are
+    compared as integers, because a processor that treats subnormals as zero considers them zero.
     """
 
     def power(exponent: int, count: int) -> np.ndarray:
@@ -326,7 +326,7 @@ def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) -> jax.Array:
-    """Compute r² of every listed pair by one matrix-vector product, like jax-md; 0 for padding."""
+    """Compute r² of every listed pair by one matrix-vector product, as in jax-md; r² is 0 for padding."""
     used = slots[:, 0] < fractional.shape[0]
     index = jnp.where(used[:, None], slots, 0)
     separation = fractional[index[:, 0]] - fractional[index[:, 1]]
@@ -348,7 +348,7 @@ def crystal() -> DoctorRow:
 
     On CPUs, jax 0.10.2 compiles a vmapped matrix-vector product that is followed by a reduction incorrectly
     (jax-ml/jax#39103), without a warning: one coordinate of every displacement in a tilted box is wrong. The
-    bug affects only arrays with more than 16,384 rows, so small tests pass.
+    bug affects only arrays with more than 16,384 rows, so tests of smaller arrays pass.
     """
     cell, fractional, slots = tilted_crystal()
     used = slots[:, 0] < len(fractional)
@@ -488,7 +488,7 @@ def imports(child: Child, seconds: float) -> DoctorRow:
 
 
 def second_process(child: Child, here: str, seconds: float) -> DoctorRow:
-    """Test that a jitted simulation has the same bits in another process, which resuming a run requires."""
+    """Test that a jitted simulation has the same bits in another process, as is required to resume a run."""
     answer, why = child.answer(seconds)
     status = "info" if why == _LATE else answer == here
     return _row("second_process", status, here=here[:12], there=answer[:12] if answer else why)

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 @functools.cache
 def beside(module: str) -> dict[str, Any]:
-    """Return the tables of the TOML file next to a module (`__file__`); do not change the tables."""
+    """Return the tables of the TOML file next to a module (`__file__`), which callers must not change."""
     return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
 
 

@@ -2,9 +2,9 @@
 
 Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. An
 object with this interface (a program) determines all bits of a run, including the initial state. Analyses
-such as forks and parameter maps use only this interface. Decisions, such as whether a pair is inside the
-cutoff, are an input of each time step. Therefore the decisions of one program can be recorded and imposed on
-another program. The implementations are `mdnum.rollout.program.MdProgram` and
+such as forks and parameter maps use only the interface `Program`. Decisions, such as whether a pair is inside
+the cutoff, are an input of each time step. Therefore the decisions of one program can be recorded and imposed
+on another program. The implementations are `mdnum.rollout.program.MdProgram` and
 `mdnum.ball.program.BallProgram`.
 """
 
@@ -84,7 +84,7 @@ class Program(Protocol):
         ...
 
     def nudged(self, size: float, count: int, seed: int) -> list[Any]:
-        """Return programs with random displacements of the start, which are at most about `size`."""
+        """Return programs whose initial states are randomly displaced, by at most about `size`."""
         ...
 
     def decision(self, other: Any, flips: Sequence[Any], separation: float) -> Decision:
@@ -263,7 +263,7 @@ class DecisionHistory:
     first: int = 0  # step of the first row
 
     def first_difference(self, other: DecisionHistory) -> int | None:
-        """Return the first step at which the decisions of two runs differ; None if they never differ."""
+        """Return the first step at which the decisions of two runs differ, or None if they never differ."""
         common = min(len(self.marks), len(other.marks))
         differ = np.flatnonzero(self.marks[:common] != other.marks[:common])
         if len(differ):

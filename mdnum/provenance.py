@@ -103,12 +103,12 @@ def fingerprint(parts: Mapping[str, Any]) -> str:
 
 
 def package_versions() -> dict[str, str | None]:
-    """Return the versions of packages on which results can depend; None for packages not installed."""
+    """Return the versions of packages on which results can depend, or None for packages not installed."""
     return {package: version(package) for package in _RECORDED["packages"]}
 
 
 def version(package: str) -> str | None:
-    """Return the installed version of a package; None if the package is not installed."""
+    """Return the installed version of a package, or None if the package is not installed."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -178,7 +178,7 @@ def hashes(system: _System) -> dict[str, str | None]:
 def commit(package: Path) -> str | None:
     """Return the git commit of a package's source, with "+" if source files were changed since the commit.
 
-    Programs that a repository can configure (monitors, hooks, filters, transports) are not run.
+    Programs that a git repository can configure (monitors, hooks, filters, transports) are not run.
 
     Returns:
         None for an installed wheel, without git, or if the folder belongs to another repository.

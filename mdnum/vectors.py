@@ -79,7 +79,7 @@ class _Vectors:
         return self.spread(self.builder.load(address, align=self.size))
 
     def larger(self, a: Any, b: Any) -> Any:
-        """Return the elementwise maximum of two vectors; if either element is NaN, the element of b."""
+        """Return the elementwise maximum of two vectors; where either element is NaN, return that of b."""
         return self.builder.select(self.builder.fcmp_ordered(">", a, b), a, b)
 
     def squares(self, parts: list[Any]) -> Any:

@@ -93,12 +93,12 @@ class _Motion:
         return self.state(t)[0]
 
     def velocity(self, t: Times) -> Known:
-        """Return the velocity (m/s) at time t (s); at the time of an impact, the value after the impact."""
+        """Return the velocity (m/s) at time t (s), or just after the impact if an impact is at time t."""
         return self.state(t)[1]
 
 
 def _down(p: Parameters) -> tuple[complex, complex]:
-    """Return time (s) and speed (m/s) of the first contact, without cancellation for a downward start."""
+    """Return time (s) and speed (m/s) of the first contact, without cancellation for any initial velocity."""
     y0, v0, g = p["y0"], p["v0"], p["gravity"]
     speed = np.sqrt(v0 * v0 + 2 * g * y0)
     return (v0 + speed) / g if v0.real >= 0 else 2 * y0 / (speed - v0), speed
@@ -116,7 +116,7 @@ def _impact(p: Parameters, n: Any) -> tuple[Any, Any]:
 class ExactImpact(_Motion):
     """The exact motion of a ball that bounces with a coefficient of restitution.
 
-    Impacts are numbered from 1. At the time of an impact, the state is the state after the impact.
+    Impacts are numbered from 1. At the time of an impact, height and velocity are those after the impact.
 
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.
@@ -191,7 +191,7 @@ class ExactImpact(_Motion):
         return np.where(finite & (np.real(_impact(at, now)[0]) > t) & (n > 1), n - 1, n)
 
     def state(self, t: Times) -> tuple[Known, Known]:
-        """Return height and velocity at time t (s); zero with zero derivatives once the ball is at rest."""
+        """Return height and velocity at time t (s), which are zero, with zero derivatives, at rest."""
         t = _later(t)
         n = self.bounces(t)
         still = np.isinf(n) | ((n > 0) & (self.restitution == 0))
@@ -212,10 +212,10 @@ class ExactImpact(_Motion):
 class ExactPenalty(_Motion):
     """The exact motion of a ball on a penalty contact, with or without damping.
 
-    The equation y'' = -g - k y - c y' holds as long as the ball is below the floor, so the damper may pull at
-    the end of a contact. Without damping, the end time of a contact has a closed form. With damping, the end
-    time is the root of an equation between the lowest point and the next maximum of the height. A ball whose
-    next maximum is below the floor comes to rest at depth g / k.
+    The equation y'' = -g - k y - c y' holds as long as the ball is below the floor, so the damper may pull
+    the ball down at the end of a contact. Without damping, the end time of a contact has a closed form. With
+    damping, the end time is the root of an equation between the lowest point and the next maximum of the
+    height. A ball whose next maximum is below the floor comes to rest at depth g / k.
 
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.
@@ -248,7 +248,7 @@ class ExactPenalty(_Motion):
 
 
 def _bounced(p: Parameters, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute height and velocity on a penalty contact, for complex parameters and real times."""
+    """Compute height and velocity of a ball on a penalty contact, for complex parameters and real times."""
     y, v = np.zeros(t.shape, complex), np.zeros(t.shape, complex)
     g = p["gravity"]
     # where the current flight began, and how

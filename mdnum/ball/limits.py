@@ -1,4 +1,4 @@
-"""Ranges of floating-point formats, and the smallest tolerance of a bouncing ball's contact solver."""
+"""Ranges of floating-point formats, and the smallest usable tolerance of a bouncing ball's contact solver."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") ->
     """Return the smallest tolerance (m) of an iterative solver that each role's floating-point format allows.
 
     A penetration no longer decreases when `gain` times the penetration rounds to zero, and a tolerance below
-    the smallest number of a format rounds to zero. The largest returned value is the smallest usable
-    tolerance.
+    the smallest number of a format rounds to zero. A tolerance is usable if it is not below any returned
+    value.
 
     Args:
         precision: names of formats by role, as attributes.

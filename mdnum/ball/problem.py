@@ -24,16 +24,16 @@ class BallLoss(Protocol):
     """Protocol of a loss of a bouncing-ball simulation: a sum over time steps and a final term."""
 
     def step(self, state: BallState, record: BallRecord, dtype: Any) -> Float[Array, ""]:
-        """Return the contribution to the loss from the time step that led to this state."""
+        """Return the contribution to the loss of the time step that ended in the given state."""
         ...
 
     def end(self, state: BallState, steps: int, total: Float[Array, ""]) -> Float[Array, ""]:
-        """Compute the loss from the sum over steps and the last state."""
+        """Compute the loss from the sum over time steps and the final state."""
         ...
 
 
 class FinalHeight(eqx.Module):
-    """Loss: the mean final height, m, or with a target the mean squared distance from the target, m²."""
+    """Loss: the mean final height (m), or the mean squared distance from a target height (m²)."""
 
     target: float | None = eqx.field(static=True, default=None)
 
@@ -42,7 +42,7 @@ class FinalHeight(eqx.Module):
         return jnp.zeros((), dtype)
 
     def end(self, state, steps, total):
-        """Return the mean final height, or the mean squared distance from the target."""
+        """Return the mean final height, or the mean squared distance from the target height."""
         y = state.y.astype(total.dtype)
         if self.target is None:
             return jnp.mean(y, dtype=total.dtype)
@@ -57,7 +57,7 @@ class MeanHeight(eqx.Module):
         return jnp.mean(state.y.astype(dtype), dtype=dtype)
 
     def end(self, state, steps, total):
-        """Return the sum over time steps, divided by the number of steps."""
+        """Return the loss: the sum over time steps divided by the number of steps."""
         return total / max(steps, 1)
 
 
@@ -168,7 +168,7 @@ def loss_of(
     loss: BallLoss,
     imposed: BallDecisions | None = None,
 ) -> Float[Array, ""]:
-    """Compute the loss of a simulation; differentiable with respect to all arguments except steps and loss.
+    """Compute the loss of a simulation, differentiable in all arguments except the steps and the loss.
 
     Args:
         imposed: decisions of every step (first axis: steps) to impose; None for the model's own decisions.
@@ -214,7 +214,7 @@ def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
-    """Compute final heights and their derivatives with respect to one parameter, by forward mode.
+    """Compute final heights and their derivatives in one parameter, by forward-mode differentiation.
 
     The function is compiled only once, because the time step and the number of steps are arguments.
     """

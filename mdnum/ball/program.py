@@ -49,7 +49,7 @@ class BallProgram:
 
     @property
     def steps(self) -> int:
-        """Number of steps in the system file."""
+        """Number of time steps that the system file gives."""
         return self.problem.steps
 
     @property
@@ -59,7 +59,7 @@ class BallProgram:
 
     @property
     def scale(self) -> float:
-        """Largest initial height, m; if all balls start on the floor, the largest height in the run, m."""
+        """Largest initial height (m), or the largest height in the run if all balls start on the floor."""
         start = self.problem.world.start(self.problem.y0, self.problem.v0)
         height = float(np.abs(np.asarray(start.y, np.float64)).max())
         if height:
@@ -74,12 +74,12 @@ class BallProgram:
 
     @property
     def streams(self) -> bool:
-        """Always False, because a run has exactly the requested number of steps."""
+        """Whether runs can be continued: always False, because the number of steps of a run is fixed."""
         return False
 
     @property
     def imposable(self) -> None:
-        """Always None, because every decision of a ball can be imposed."""
+        """Reason why decisions cannot be imposed: always None, because every decision can be imposed."""
         return None
 
     def check(self, other: BallProgram) -> None:
@@ -101,7 +101,7 @@ class BallProgram:
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
-        """Run the simulation; the result has the balls in the order of the other run of a comparison.
+        """Run the simulation; return the balls in the order of the run with which this run is compared.
 
         Args:
             decisions: decisions imposed on the balls in that order; None for the program's own decisions and
@@ -125,7 +125,7 @@ class BallProgram:
         return run
 
     def _pinned(self, steps: int) -> BallDecisions | None:
-        """Return the decisions to impose as arrays, with -1 for other decisions; None if there are none."""
+        """Return imposed decisions as arrays (-1 for decisions not imposed), or None if none is imposed."""
         if not self.pins:
             return None
         world = self.problem.world
@@ -179,7 +179,7 @@ class BallProgram:
     def repeats(
         self, others: Sequence[BallProgram], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Compute the separations of pairs of runs with perturbed starts (see `Program.repeats`)."""
+        """Compute the separations of pairs of runs with perturbed initial states (see `Program.repeats`)."""
         # of the number of steps that was run before: another one would be another compiled program
         steps = min((known for known in self._runs if known >= last), default=last)
         a = self.run(steps)
@@ -191,7 +191,7 @@ class BallProgram:
         return found
 
     def nudged(self, size: float, count: int, seed: int) -> list[BallProgram]:
-        """Return programs with random displacements of initial heights, up to `size` but at least an ulp."""
+        """Return programs with initial heights displaced at random, by at most `size` or `ulp` if larger."""
         rng = np.random.default_rng(seed)
         y = np.asarray(np.atleast_1d(self.problem.y0), np.float64)
         size = max(size, self.ulp)
@@ -199,7 +199,7 @@ class BallProgram:
         return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
 
     def decision(self, other: BallProgram, flips: Sequence[CrossDecision], separation: float) -> Decision:
-        """Return the first decision that differs between two runs: contacts first, then lowest ball index."""
+        """Return the first decision that differs between two runs: contacts before stops, by ball index."""
         first = flips[0]
         return Decision(
             channel=first.channel,
@@ -261,7 +261,7 @@ class BallProgram:
         return DecisionHistory(every, digest, x, value, float("nan"), "", first=1)
 
     def differing(self, other: BallProgram, steps: int, step: int, key: str) -> Differing:
-        """Return the first decision that differs between two runs at a step, and both loss gradients."""
+        """Return the first decision that differs between two runs at a step, and the two loss gradients."""
         problems = [replace(one.problem, steps=steps) for one in (self, other)]
         runs = [problem.run(history=True) for problem in problems]
         flips = [flip for flip in cross_decisions(runs[0], runs[1], step) if flip.step == step]
@@ -281,7 +281,7 @@ class BallProgram:
 
 
 def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float:
-    """Return threshold minus recorded residual at one iteration of a solver that all balls share."""
+    """Return the threshold minus the recorded residual at one iteration of a solver that all balls share."""
     if run.history is None or not isinstance(run.world.contact, Projection):
         return margin
     rule = run.world.contact.stop
@@ -290,7 +290,7 @@ def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float
 
 
 def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
-    """Return a run with its balls reordered like the balls in the other run of a comparison."""
+    """Return a run with its balls in the order of the run with which this run is compared."""
     place = np.argsort(order)
     columns = ("y", "v", "height", "contact", "iterations", "reason", "residual", "margin", "before")
     arrays = {name: getattr(run, name) for name in columns}

@@ -28,7 +28,7 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """Record of a finished run. In arrays with one row per step, row s is the step that ends in state s + 1.
+    """Record of a finished run. In arrays of steps, row s describes the step that ends in state s + 1.
 
     Attributes:
         world: the bouncing-ball model that was simulated.
@@ -77,7 +77,7 @@ class BallRun:
 
     @cached_property
     def first_contact(self) -> Int[np.ndarray, "balls"]:
-        """Step (from 1) at which each ball first touches the floor; -1 if it never does."""
+        """Step (from 1) at which each ball first touches the floor, or -1 if the ball never does."""
         touched = self.contact.any(axis=0)
         return np.where(touched, self.contact.argmax(axis=0) + 1, -1)
 
@@ -97,9 +97,9 @@ class BallRun:
 
 
 def energy(world: World, y: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "..."]:
-    """Compute the mechanical energy per mass, (m/s)²: kinetic, gravitational, and that of a penalty spring.
+    """Compute the mechanical energy per mass, (m/s)²: the sum of kinetic, gravitational and spring energy.
 
-    Error: evaluated in float64; a softplus contact is treated as a linear spring without smoothing.
+    Error: the energy is evaluated in float64, with a softplus contact treated as a linear spring.
     """
     y, v = np.asarray(y, np.float64), np.asarray(v, np.float64)
     total = float(world.gravity) * y + 0.5 * v * v
@@ -427,7 +427,7 @@ def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
 
 
 def _counted(run: BallRun) -> str:
-    """Return the meaning of a run's iteration counts, such as "impacts"."""
+    """Return the name of what is counted as an iteration in a run, such as "impacts"."""
     contact, scheme = run.world.contact, run.world.integrator
     if isinstance(scheme, EventLocated):
         return "impacts"

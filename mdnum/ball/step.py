@@ -1,6 +1,6 @@
 """A time step of the bouncing ball: integration schemes and contact models.
 
-Each integration scheme specifies the height at which contact is decided; this height is recorded. Products
+Each integration scheme specifies the height from which contact is decided, and records this height. Products
 are rounded before they are added (no fused multiply-add), so numpy gives the same bits.
 """
 
@@ -36,7 +36,7 @@ class BallState(NamedTuple):
 
 
 class BallDecisions(NamedTuple):
-    """All decisions of a time step; the same format is used to impose decisions on a step."""
+    """All decisions of a time step, in a format that is also used to impose decisions on a step."""
 
     # whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1, and a negative
     # number where the step is to decide by itself
@@ -139,14 +139,14 @@ class _Euler(eqx.Module):
 
 
 class ExplicitEuler(_Euler):
-    """Explicit Euler: y += h v; v += h a(y). Order 1; a stiff contact gains energy at any time step."""
+    """Explicit Euler: y += h v; v += h a(y). Order 1; at any time step, a stiff contact adds energy."""
 
     def fly(self, y, v, a, r):
         return r(y + r(self.h * v)), r(v + r(self.h * a))
 
 
 class SemiImplicitEuler(_Euler):
-    """Semi-implicit Euler: v += h a(y); y += h v. Order 1, symplectic; stable for h sqrt(k) < 2."""
+    """Semi-implicit Euler: v += h a(y); y += h v. Symplectic, order 1, stable for h sqrt(k) < 2."""
 
     def fly(self, y, v, a, r):
         v = r(v + r(self.h * a))
@@ -154,7 +154,7 @@ class SemiImplicitEuler(_Euler):
 
 
 class BallVerlet(eqx.Module):
-    """Velocity Verlet: kick, drift, kick. Order 2 between events, symplectic; stable for h sqrt(k) < 2."""
+    """Velocity Verlet: kick, drift, kick. Symplectic, order 2 between events, stable for h sqrt(k) < 2."""
 
     h: Any
 
@@ -177,7 +177,7 @@ class BallVerlet(eqx.Module):
 
 
 class ImplicitMidpoint(eqx.Module):
-    """Implicit midpoint scheme, solved by Newton's method. Order 2, stable for any time step.
+    """Implicit midpoint scheme, solved by Newton's method. Order 2, and stable for any time step.
 
     The acceleration is evaluated in the middle of the step. Derivatives are implicit derivatives of the
     solved equation, not derivatives of the iterations.
@@ -274,12 +274,12 @@ class _Forceless(eqx.Module):
     """A contact model that resets the state and does not exert a force."""
 
     def acceleration(self, y, v, free, contact, r):
-        """Return the acceleration in flight, because this contact model has no contact force."""
+        """Return the acceleration of free flight, because this contact model has no contact force."""
         return free
 
 
 class Penalty(eqx.Module):
-    """Force k p - damping v on a ball in contact, with p = -y; a smooth contact has a softplus p.
+    """Force k p - damping v on a ball in contact; p is -y, or a softplus function of -y if smooth.
 
     If contact is imposed, the force is -k y for either sign of y, so that the contact force continues
     smoothly above the floor, like an imposed pair force beyond its cutoff.
@@ -317,7 +317,7 @@ class Penalty(eqx.Module):
 
 
 class Projection(_Forceless):
-    """Iteration y ← y + alpha k max(0, -y) until the stopping rule holds; then clamping and restitution.
+    """Iterate y ← y + alpha k max(0, -y) until the stopping rule holds; then clamp y and apply restitution.
 
     Each iteration multiplies the penetration by 1 - alpha k, so tol is reached from p0 after ceil(log(tol /
     p0) / log(1 - alpha k)) iterations. With alpha k between 1 and 2, iterations overshoot; with alpha k = 2,
@@ -455,7 +455,7 @@ class Impact(_Forceless):
 
 
 def lowest(y, v, a, time, r):
-    """Return the lowest height of the parabola in the given time, which is at the end or at the vertex."""
+    """Return the lowest height of a parabolic flight of given duration, at the end or at the vertex."""
     end = r(y + r(time * r(v + r(r(0.5 * time) * a))))
     up = (a > 0) & (v < 0) & (r(-v) < r(a * time))
     safe = jnp.where(up, a, jnp.ones_like(a))
@@ -463,7 +463,7 @@ def lowest(y, v, a, time, r):
 
 
 def time_of_impact(y, v, a, r):
-    """Return the first time (s) at which the parabola meets the floor; infinite if there is no such time.
+    """Return the first time (s) at which a parabolic flight meets the floor, or infinity if it never does.
 
     The relative error is a few units of roundoff, because the formula avoids cancellation.
     """

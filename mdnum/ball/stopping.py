@@ -2,7 +2,7 @@
 
 A stopping rule computes, from the residual of each ball, the quantity that is compared with a threshold. A
 sum over all balls couples independent balls, and its last bits depend on the order of summation. A separate
-rule for each ball avoids both problems.
+stopping rule for each ball involves no sum over balls.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Reason(IntEnum):
 
     @property
     def word(self) -> str:
-        """Name of the reason for display."""
+        """Name of the reason for stopping, as displayed."""
         return self.name.lower().replace("_", " ")
 
 
@@ -116,7 +116,7 @@ class Relative(GlobalSum):
     """Stopping rule that compares the sum of residuals with the tolerance times the initial sum."""
 
     def threshold(self, first, iteration):
-        """Return tol times the initial residual, or the smallest normal number if this residual is zero."""
+        """Return tol times the initial residual, or the smallest normal number if the residual is 0."""
         scaled = jnp.asarray(self.tol).astype(first.dtype) * first
         # float32's smallest would be 0 in float16, and no residual is below that
         least = jnp.finfo(first.dtype).tiny
@@ -150,14 +150,14 @@ class FixedCount(eqx.Module):
 
     @property
     def max_iter(self) -> int:
-        """Number of iterations, which is fixed."""
+        """Fixed number of iterations."""
         return self.count
 
     # for the record only
     measure = Maximum.measure
 
     def threshold(self, first, iteration):
-        """Return a threshold at which the solver stops exactly after the fixed number of iterations."""
+        """Return a threshold that stops the solver exactly after the fixed number of iterations."""
         reached = jnp.broadcast_to(iteration >= self.count, first.shape)
         return jnp.where(reached, np.inf, -np.inf).astype(first.dtype)
 
@@ -173,7 +173,7 @@ def iterate(
     imposed: Int[Array, "..."] | None = None,
     history: bool = False,
 ) -> tuple[Any, Solve]:
-    """Iterate until the rule stops, or the largest or an imposed number of iterations is reached.
+    """Iterate until the rule stops the solver, or until a maximum or imposed number of iterations is reached.
 
     Args:
         rule: stopping rule.
@@ -248,10 +248,10 @@ def no_solve(dtype: Any) -> Solve:
 def elementwise(function: Map) -> Map:
     """Return a version of a function with a `while_loop` that is differentiable in forward and reverse mode.
 
-    JAX has no reverse mode for a `while_loop`, because the required memory is not known in advance. However,
-    a function that treats each ball separately has a diagonal Jacobian. All entries of this Jacobian follow
-    from a few tangents that are propagated in the loop, and no iteration is stored. The result is the
-    derivative of the iterations with fixed decisions. The record and the inputs in `rest` have no derivative.
+    JAX has no reverse mode for a `while_loop`, because the required memory is not known in advance. A
+    function that treats each ball separately has a diagonal Jacobian. All entries of a diagonal Jacobian
+    follow from a few tangents that are propagated in the loop, so no iteration is stored. The result is the
+    derivative at fixed decisions. The record and the inputs in `rest` have no derivative.
 
     Args:
         function: a function whose outputs for ball b depend only on the inputs for ball b (and on `rest`).

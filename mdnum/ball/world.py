@@ -146,7 +146,7 @@ class World(eqx.Module):
     # -- decide ----------------------------------------------------------------------------------------
 
     def touches(self, height: Balls, before: Bool[Array, "balls"]) -> Bool[Array, "balls"]:
-        """Return whether a ball is in contact: height < 0; with hysteresis, until height > lift."""
+        """Return whether a ball is in contact: height < 0 or, with hysteresis, not yet height > lift."""
         height = height.astype(self.policy.dtype("decision"))
         enter = Threshold(jnp.zeros((), height.dtype), "<", "height")
         if self.lift is None:

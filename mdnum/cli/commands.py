@@ -94,7 +94,7 @@ def _top(
 
 
 class _Questions(TyperGroup):
-    """Group of subcommands; if the first argument is not a subcommand, the usual subcommand is called."""
+    """Group of subcommands; if the first argument is not a subcommand, the default subcommand is called."""
 
     group: Mapping[str, Any]
 

@@ -1,4 +1,4 @@
-"""Elementary functions made of IEEE 754 operations, with the same bits unless operations are fused.
+"""Elementary functions made of IEEE 754 operations; results have the same bits unless operations are fused.
 
 Elementary functions differ between libraries, and between the instruction sets for which a compiler generates
 code. The functions here have no branch, no table and no fused multiply-add. Each function consists of sums,
@@ -6,10 +6,10 @@ products, quotients, roots, comparisons, selections and bit operations. Every in
 operation by operation, such as the compiled loop, obtains the same number.
 
 Arguments and results are float64. Subnormal arguments are treated as 0. Results below 2.2261e-308 are 0, and
-results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps, the spacing of the
-floats at the result. The error bound of the exponential was derived by counting roundings. The other bounds
-are at least 1.3 times the largest error measured for 100,000 (error functions) or ten million arguments
-(docs/compiled-loop.md).
+results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps; an ulp is the spacing of
+the floats at the result. The error bound of the exponential was derived by counting roundings. Every other
+bound is at least 1.3 times the largest error measured, for 100,000 arguments of error functions and for ten
+million arguments of other functions (docs/compiled-loop.md).
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ _EXP = (
 
 
 def _reduced(x: Any, low: Any = None) -> tuple[Any, Any]:
-    """Return p and n such that exp(x + low) = (1 + p) 2^n; the integer n is in the last bits of a float."""
+    """Return p and n such that exp(x + low) = (1 + p) 2^n; n is stored in the last bits of a float."""
     shifted = x * (1 / math.log(2)) + _ROUND
     n = shifted - _ROUND
     r = (x - n * _LN2[0]) - n * _LN2[1]
@@ -184,7 +184,7 @@ _SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1)]
 
 
 def cos_sin(x: Any) -> tuple[Any, Any]:
-    """Return cosine and sine of x; NaN if |x| exceeds 8e5. Absolute error: below 2.5e-16."""
+    """Return cosine and sine of x, or NaN if |x| exceeds 8e5. Absolute error: below 2.5e-16."""
     n = jnp.round(x * (2 / math.pi))
     r = (x - n * _HALF_PI[0]) - n * _HALF_PI[1]
     square = r * r

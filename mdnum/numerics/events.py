@@ -49,8 +49,8 @@ class Hysteresis:
     """A decision with hysteresis (a Schmitt trigger), which turns on at one threshold and off at another.
 
     With one threshold, a quantity that fluctuates about the threshold flips the decision at each crossing.
-    With a gap between two thresholds that is wider than the noise, the decision flips once. The skin of a
-    Verlet list has the same purpose: lists are rebuilt when the skin is used up, not at every move.
+    With a gap between two thresholds that is wider than the noise, the decision flips once. Similarly, a
+    Verlet list with a skin is rebuilt only when the skin is used up, not at every move.
     """
 
     enter: Threshold  # where a no turns yes

@@ -1,10 +1,10 @@
 """Floating-point arithmetic inside jit whose results have the same bits on every processor.
 
-XLA on a CPU contracts a*b + c into a fused multiply-add. Therefore the bits of an expression depend on fusion
-and on the instruction set, and differ from those of numpy. The decision whether a pair is inside the cutoff
-must not depend on the compiler. Therefore `fence` prevents the contraction, and numpy reproduces the decision
-bit for bit. Formulas can also be evaluated operation by operation: with every result rounded, in interval
-arithmetic, or with the same bits on every processor.
+XLA on a CPU contracts a*b + c into a fused multiply-add. With such fusion, the bits of an expression depend
+on the instruction set, and differ from those of numpy. The decision whether a pair is inside the cutoff must
+not depend on the compiler. The function `fence` prevents fused multiply-add, so numpy reproduces cutoff
+decisions bit for bit. Formulas can also be evaluated operation by operation: with every result rounded, in
+interval arithmetic, or with the same bits on every processor.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def _through_integers(x, zero):
 def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
     """Return x, and prevent XLA from contracting the operation that computes x with the next operation.
 
-    The fence is an exclusive-or of the bits of x with a zero that XLA does not know. The fence also forces
-    rounding to float16 and bfloat16, which XLA on a CPU may omit.
+    The fence is an exclusive-or of the bits of x with a zero whose value XLA does not know when it compiles.
+    The fence also forces rounding to float16 and bfloat16, which XLA on a CPU may omit.
 
     Source: optimization_barrier and reduce_precision do not prevent contraction (openxla/xla#41579).
     """
@@ -96,7 +96,7 @@ def stepwise(
     enter: Callable[[Any], Any] = _same,
     leave: Callable[[Any], jax.Array] = _same,
 ) -> Callable[..., Any]:
-    """Return a version of a function of arrays in which a given rule computes each operation.
+    """Return a version of an array function in which a given rule computes the result of each operation.
 
     Args:
         function: function of arrays, which may close over other arrays.
@@ -162,7 +162,7 @@ def rounded(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]
     XLA on a CPU computes float16 and bfloat16 expressions in float32, and may omit the rounding between two
     operations. In the returned function, a fence after each operation forces the rounding. For + - * / and
     sqrt, the results have the same bits as numpy with ml_dtypes; exp and cos are computed in float32 and may
-    differ between libraries. Results of other dtypes do not change.
+    differ between libraries. Results that are not 16-bit floats do not change.
 
     Args:
         function: function of arrays; it may close over others.
@@ -183,8 +183,8 @@ def _is_short(dtype: Any) -> bool:
 def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list[Any]]:
     """Return a version of a float64 function in interval arithmetic; each interval contains the exact value.
 
-    Constants of the formula are exact float64 numbers. If an interval contains values on both sides of the
-    condition of a `where`, the result is the union of the intervals of both branches.
+    Constants of the formula are treated as exact float64 numbers. If an interval contains values on both
+    sides of the condition of a `where`, the result is the union of the intervals of both branches.
 
     Args:
         function: function of scalars; jax traces it once.
@@ -322,7 +322,7 @@ _SAFE = (
 
 @dataclass
 class _Held:
-    """A number during interpretation of a jaxpr, with flags that decide whether the number needs a fence."""
+    """A number in a jaxpr that is being interpreted, with flags for whether the number needs a fence."""
 
     value: Any
     safe: bool = True

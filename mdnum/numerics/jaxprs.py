@@ -50,7 +50,7 @@ def held_numbers(closed: Any, least: int = 10) -> int:
 def single_numbers(closed: Any) -> list[str]:
     """Return the constants of a jaxpr that were rounded to float32, each as a short decimal number.
 
-    A float64 constant that was rounded to float32 can be written with fewer decimal digits.
+    A constant that was rounded to float32 can be written with fewer digits than other float64 numbers.
     """
     numbers: dict[str, None] = {}
     for program in _programs(closed):

@@ -1,8 +1,8 @@
-"""Sums that do not depend on the order of the terms, and all summation orders by name.
+"""Sums that do not depend on the order of the terms, and the registry of all summation orders.
 
-A finite float is an integer multiple of its format's smallest subnormal number. The exact sum adds these
-integers in a long accumulator (Kulisch & Miranker 1986), stored as 32-bit limbs in int64, and rounds once.
-The fixed-point sum rounds every term to a coarser unit, so that one int64 can hold the sum.
+A finite float is an integer multiple of its format's smallest subnormal number. The exact sum adds the
+integers of all terms in a long accumulator (Kulisch & Miranker 1986), stored as 32-bit limbs in int64, and
+rounds once. The fixed-point sum rounds every term to a coarser unit, so that one int64 can hold the sum.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MASK = 2**_LIMB - 1
 
 
 def _parts(terms: Float[Array, "n columns"], form: FloatFormat) -> tuple[jax.Array, list[jax.Array]]:
-    """Split each term into signed 32-bit pieces; return the limb index of the lowest one, and the pieces."""
+    """Split each term into signed 32-bit pieces; return the lowest piece's limb index, and all pieces."""
     bits = lax.bitcast_convert_type(terms, integer_of(terms.dtype)).astype(jnp.int64)
     magnitude = bits & ((1 << (8 * terms.dtype.itemsize - 1)) - 1)
     exponent, fraction = magnitude >> (form.significand - 1), magnitude & ((1 << (form.significand - 1)) - 1)

@@ -2,7 +2,7 @@
 
 A displacement is x_j - x_i minus at most one lattice vector for each periodic axis, rounded after every
 subtraction. The squared components of the displacement are added in the order x, y, z. The error of each
-rounding is proportional to the magnitude of the rounded result; `Reach` bounds these magnitudes.
+rounding is proportional to the magnitude of the rounded result; a `Reach` contains bounds on such magnitudes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def _signed(dtype: np.dtype) -> np.dtype:
 def ordinal(x: ArrayLike) -> Int[np.ndarray, "..."]:
     """Return the index of x among all floats of the same dtype, as a signed integer; ±0 has index 0.
 
-    Adjacent finite floats have adjacent indices: differences count ulps. The index of NaN has no meaning.
+    Adjacent finite floats have adjacent indices, so differences count ulps. The index of NaN has no meaning.
     """
     x = np.asarray(x)
     integer = _signed(x.dtype)
@@ -76,7 +76,7 @@ class Reach:
         return cls(tuple(_three(row) for row in lattice), _three(coordinate))
 
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
-        """Return the sum of |lattice components| in all rounded results, and the number of roundings.
+        """Return the sum of |lattice-vector components| in all rounded results, and the number of roundings.
 
         After the first subtraction, a component is d + n_1 a_1 + n_2 a_2 + n_3 a_3, where d is the final
         displacement and each n is -1, 0 or 1. Each following subtraction of a lattice vector removes one of
@@ -91,7 +91,7 @@ class Reach:
         return sizes, most
 
     def narrowed(self, dtype: DTypeLike) -> Float[np.ndarray, "3"]:
-        """Return the rounding error of lattice vectors in dtype per axis (sum over all vectors), length."""
+        """Return, for each axis, the sum of the rounding errors of all lattice vectors in a dtype, length."""
         lattice = np.array(self.lattice, np.float64).reshape(-1, 3)
         return np.abs(lattice.astype(dtype).astype(np.float64) - lattice).sum(axis=0)
 
@@ -107,10 +107,10 @@ def displacement_bound(
     """Return a bound on the error (length of the error vector) of a computed displacement.
 
     Each rounded result contributes at most u times its magnitude. If the dtype of the state has more digits
-    than `dtype`, both positions are rounded first. If float64 has more digits than `dtype`, the box is also
-    rounded. The exact displacement is defined by the positions of the state and the box of the system file.
-    The nearest image in dtype must be the true nearest image: r_cut is below half the box width by more than
-    rounding.
+    than `dtype`, the positions of both atoms are first rounded. If float64 has more digits than `dtype`, the
+    lattice vectors of the box are also rounded. The exact displacement is defined by the positions of the
+    state and the box of the system file. The nearest image found in `dtype` must be the true nearest image,
+    so r_cut must be below half the box width by more than the rounding error.
 
     Args:
         r: length(s) of the displacement.

@@ -1,9 +1,9 @@
 """Saltation: the change of a tangent vector (a perturbation) when the trajectory passes an event.
 
-A perturbed trajectory reaches a threshold at a different time; between both times, only one of the
-trajectories follows the new equation of motion. To first order, this difference changes the tangent by a
-rank-one term. Derivatives of a time-stepping program lack this term, because time steps do not move with the
-event.
+A perturbed trajectory reaches a threshold at another time than the unperturbed trajectory; between the two
+times, only one trajectory follows the new equation of motion. To first order, the difference between the two
+times changes the tangent by a rank-one term. Derivatives of a time-stepping program lack the rank-one term,
+because time steps do not move with the event.
 
 The functions accept numpy and jax arrays with any number of leading batch axes, also inside jit.
 """
@@ -67,10 +67,10 @@ def carry(
 ) -> Float[Any, "*batch state"]:
     """Return the tangent after an event, DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
 
-    The result is the product of the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-) and dx. The matrix
-    is never formed, so the function can be used for many atoms. For a ball with coefficient of restitution e
-    that hits the floor at velocity v, Xi is [[-e, 0], [-(1 + e) g / v, -e]]. For a force that jumps from a to
-    b at a distance that is crossed at speed v, Xi is [[1, 0], [(b - a) / v, 1]].
+    The result is the product of the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-) and dx. The
+    saltation matrix is never formed, so the function can be used for many atoms. For a ball with coefficient
+    of restitution e that hits the floor at velocity v, Xi is [[-e, 0], [-(1 + e) g / v, -e]]. For a force
+    that jumps from a to b at a distance that is crossed at speed v, Xi is [[1, 0], [(b - a) / v, 1]].
 
     Args:
         reset: DR, Jacobian of the reset (state after with respect to state before); None for the identity.

@@ -2,10 +2,10 @@
 
 A summation order is used in two ways. The force loop of molecular dynamics passes blocks of terms, and a
 partial sum is carried from block to block, so that the terms of a whole neighbor list are never stored at
-once. A summation order that needs all terms stores the terms and adds them at the end. All other callers pass
-a whole array and get the sum over the first axis, which is rounded after every addition and has the same bits
-as a numpy loop in the dtype of the terms. `jnp.sum` differs from all of these summation orders: it adds
-16-bit terms in float32, which hides the effect of a 16-bit accumulator.
+once. A summation order that needs all terms stores the terms and adds them at the end. Code outside of the
+force loop passes a whole array and gets the sum over the first axis, which is rounded after every addition
+and has the same bits as a numpy loop in the dtype of the terms. `jnp.sum` differs from every summation order
+in this module: `jnp.sum` adds 16-bit terms in float32, which hides the effect of a 16-bit accumulator.
 
 The derivative of every sum is that of the exact sum, because rounding and order have no derivative.
 """
@@ -165,7 +165,7 @@ def _levels(terms, add, width: int):
 
 @dataclass(frozen=True)
 class Blocked(Reduction):
-    """A summation tree: each node adds `width` adjacent terms from left to right, as thread blocks do.
+    """A summation tree: each node adds `width` adjacent terms from left to right, like GPU thread blocks.
 
     Error: at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 gives the balanced tree; a width not
     below the number of terms gives a sequential loop.
@@ -219,8 +219,8 @@ class Permuted(Reduction):
 class Halves(Reduction):
     """The sum of the first half of the terms plus the sum of the second half, each added sequentially.
 
-    Two scatter operations over pairs, one for each atom of a pair, add in this order. Error: at most
-    gamma_{n/2} * sum |terms|.
+    Two scatter operations over pairs, one for each atom of a pair, add the two halves one after the other.
+    Error: at most gamma_{n/2} * sum |terms|.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -237,10 +237,10 @@ class Halves(Reduction):
 
 @dataclass(frozen=True)
 class Twice(Reduction):
-    """A sequential sum of all halved terms, followed by the same halved terms again.
+    """A sequential sum of all terms divided by 2, in which the halved terms are added twice, pass by pass.
 
-    A scatter operation over a list that stores each pair for both atoms adds in this order. Error: at most
-    gamma_{2n} * sum |terms|, if no halved term is subnormal.
+    A scatter operation over a list that stores each pair for both atoms adds each halved term twice. Error:
+    at most gamma_{2n} * sum |terms|, if no halved term is subnormal.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:

@@ -1,13 +1,13 @@
 """Divergence of two runs that differ in one setting: start, growth rate, and whether flips are the cause.
 
-A flip is a cutoff decision that differs between the runs. The verdict compares the second run with a
+A flip is a cutoff decision that differs between two runs. The verdict compares the second run with a
 counterfactual run, which has the arithmetic of the second run but the cutoff decisions of the first run. If
 the counterfactual run stays close to the first run, the flips caused the split. If the counterfactual run
 also splits from the first run, repeats of the pair of runs decide whether the flips accelerated the split or
-are bystanders. Repeats are evaluated by a sequential sign test. If a pair is delayed with probability at most
-1/2, the probability of k or more delays in n pairs is at most that of k or more heads in n coin tosses, for
-any distribution of the delays. All repeats have the same initial displacement. If the majority differs at
-another displacement, the verdict is left open. Error rates are given in docs/verdict-calibration.md.
+are bystanders. Repeats are evaluated by a sequential sign test. If a pair of runs is delayed with probability
+at most 1/2, the probability of k or more delays in n pairs of runs is at most that of k or more heads in n
+coin tosses, for any distribution of the delays. All repeats have the same initial displacement. If the
+majority differs at another displacement, the verdict is left open. Error rates: docs/verdict-calibration.md.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _ALIKE = 4
 
 @dataclass(frozen=True)
 class Delay:
-    """The steps at which two runs split: free, and with the first run's decisions imposed on the second."""
+    """The steps at which two runs split, without and with run A's decisions imposed on run B."""
 
     # free, imposed: steps of the two splits; None for one that was not seen
     free: int | None
@@ -44,12 +44,12 @@ class Delay:
 
     @classmethod
     def of(cls, free: Float[np.ndarray, "steps"], imposed: Float[np.ndarray, "steps"], tolerance: float):
-        """Create a `Delay` from the free and the imposed separations at each step, length (or NaN)."""
+        """Create a `Delay` from separations (length or NaN) by step, without and with imposed decisions."""
         splits = (split_of(run, tolerance) for run in (free, imposed))
         return cls(*splits, free_until=_last_seen(free), imposed_until=_last_seen(imposed))
 
     def beyond(self, steps: float) -> bool | None:
-        """Return whether the runs split more than `steps` later without the flips; None if unknown."""
+        """Return whether the runs split more than `steps` steps later without the flips; None if unknown."""
         if self.free is not None and self.imposed is not None:
             return self.imposed - self.free > steps
         if self.free is not None:
@@ -61,7 +61,7 @@ class Delay:
 
 @cache
 def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
-    """Return, for each stage of the sequential sign test, the number of pairs and how many must agree.
+    """Return, for each stage of the sequential sign test, the number of run pairs and how many must agree.
 
     The error probability is spent in proportion to the number of pairs (Lan and DeMets, Biometrika 70, 659,
     1983). For fair coin tosses, the probability that the test has stopped with a given result by some stage
@@ -99,7 +99,7 @@ FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
 
 @dataclass(frozen=True)
 class Count:
-    """Numbers of pairs of runs that split later without the flips, and that do not."""
+    """Numbers of pairs of runs that split later without the flips, and of pairs of runs that do not."""
 
     pairs: int  # that were run, the pair itself among them
     later: int  # that were delayed by more than asked for
@@ -108,12 +108,12 @@ class Count:
 
     @property
     def needed(self) -> tuple[int, int] | None:
-        """Current or next stage of the sign test: number of pairs, and how many must agree, or None."""
+        """Current or next stage of the sign test: number of run pairs, and how many must agree; or None."""
         return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
 
     @property
     def delayed(self) -> bool | None:
-        """Whether most pairs of runs are delayed; None if the sign test has no result at this stage."""
+        """Whether most run pairs split later without flips, or None if the sign test has no result yet."""
         need = dict(looks(self.most)).get(self.pairs)
         if need is None:
             return None
@@ -121,14 +121,14 @@ class Count:
 
     @property
     def majority(self) -> bool | None:
-        """Whether the majority of pairs is delayed; None if too few pairs were run to decide this."""
+        """Whether most run pairs split later without flips, or None if too few pairs were run to decide."""
         if self.later > self.most / 2 or self.later == self.pairs >= _ALIKE:
             return True
         return False if self.not_later > self.most / 2 or self.not_later == self.pairs >= _ALIKE else None
 
     @property
     def wanted_for_majority(self) -> int:
-        """Number of further pairs that decide the majority if all agree; 0 if not needed or impossible."""
+        """Number of further run pairs that decide the majority if all agree; 0 if unneeded or impossible."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -136,7 +136,7 @@ class Count:
 
     @property
     def wanted(self) -> int:
-        """Number of pairs to run before the next stage of the test; 0 if the test has ended."""
+        """Number of pairs to run before the next stage of the test, or 0 if the test has ended."""
         if self.delayed is not None:
             return 0
         return next((end - self.pairs for end, _ in looks(self.most) if end > self.pairs), 0)
@@ -211,8 +211,8 @@ class Growth:
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
     """Return the mean slope of a logarithm, its standard error, and whether growth is faster than linear.
 
-    Slope and standard error, per row, are estimated from blocks of later rows. The result is NaN, NaN, False
-    if there are too few rows, or if numbers are not finite.
+    The slope per row and its standard error are estimated from blocks of the later rows. The result is NaN,
+    NaN, False if there are too few rows, or if numbers are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
@@ -230,13 +230,13 @@ def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
 
 
 def split_of(separation: Float[np.ndarray, "steps"], tolerance: float) -> int | None:
-    """Return the first step at which a separation exceeds the tolerance; None if there is no such step."""
+    """Return the first step at which a separation exceeds the tolerance, or None if there is no such step."""
     beyond = separation > tolerance
     return int(beyond.argmax()) if beyond.any() else None
 
 
 def _last_seen(separation: Float[np.ndarray, "steps"]) -> int:
-    """Return the last step at which a separation is known; -1 if there is no such step."""
+    """Return the last step at which a separation is known, or -1 if there is no such step."""
     seen = np.flatnonzero(np.isfinite(separation))
     return int(seen[-1]) if len(seen) else -1
 
@@ -433,7 +433,7 @@ def _kept(
     most: int,
     rate: float | None,
 ) -> ForkVerdict:
-    """Return the verdict on runs that do not split when the first run's decisions are imposed."""
+    """Return the verdict on runs that do not split if run A's decisions are imposed on run B."""
     seen = max(0, _last_seen(imposed))
     reach = float(np.nanmax(imposed, initial=0.0))
     below = float(np.log(tolerance / reach)) if reach > 0 else float("inf")
@@ -506,7 +506,7 @@ class SplitCell:
 
 @dataclass(frozen=True)
 class Share:
-    """Contribution of one difference (decisions or arithmetic) to a split: delay of the split without it."""
+    """Contribution of a difference (of decisions or arithmetic) to a split: how much earlier runs split."""
 
     what: What  # the difference that is taken away; the other one stays
     reference: Name  # the run that is compared with

@@ -39,7 +39,7 @@ class Stays:
 
 
 def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
-    """Return the median residence time, given the numbers of stays of 0, 1, 2, ... steps; or None."""
+    """Return the median residence time, given the numbers of stays of 0, 1, 2, ... steps, or None."""
     total = int(counts.sum())
     if not total:
         return None
@@ -58,7 +58,7 @@ class PairCounts:
     terms: np.ndarray  # names of the terms whose decisions they are; "" where there are none
 
     def rows(self, most: int) -> list[dict[str, Any]]:
-        """Return the first pairs and their numbers of flips as plain values."""
+        """Return the pairs with the most flips, and their numbers of flips, as plain values."""
         columns = {name: values[:most].tolist() for name, values in vars(self).items()}
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
@@ -164,7 +164,7 @@ class Scan:
         )
 
     def matches(self, series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
-        """Return, for each step, whether the table has as many flips as were counted during the run."""
+        """Return, for each step, whether the table has as many flips as the run counted."""
         return (self.entered == series["entered"]) & (self.left == series["left"])
 
     def _follow(self) -> None:
@@ -228,7 +228,7 @@ def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
 
 
 def algebra_holds(series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
-    """Return, for each step, True if pairs inside = pairs inside at the start + entered - left."""
+    """Return, for each step, True if pairs inside = initial pairs inside + pairs entered - pairs left."""
     pairs = series["pairs"]
     net = np.cumsum(series["entered"].astype(np.int64) - series["left"])
     return pairs == pairs[0] + net - net[0]
@@ -249,7 +249,7 @@ class Conservation:
         kinetic: Float[np.ndarray, "rows"],
         least: float,
     ) -> Conservation | None:
-        """Compute energy conservation from one value per step; None for few values or atoms at rest.
+        """Compute the energy conservation from one energy per step, or None for few steps or atoms at rest.
 
         The linear trend is removed before the fluctuation is computed, since the drift is reported
         separately. The first half of the run is omitted, because a run that starts from a lattice turns half

@@ -180,7 +180,7 @@ def _plot(plot: Plot, figure: Canvas) -> None:
 
 
 def _high(curves: list[Line2D], axes: Axes, x: float) -> bool:
-    """Return True if curves pass through the upper part of the axes near x, and none through the lower."""
+    """Return True if curves pass through the upper but not through the lower part of the axes near x."""
     to_axes = axes.transData + axes.transAxes.inverted()
     points = [to_axes.transform(np.asarray(one.get_xydata(), float)) for one in curves]
     at = np.concatenate(points or [np.zeros((0, 2))])

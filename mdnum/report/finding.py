@@ -1,6 +1,6 @@
 """Findings of all commands, the sentences of findings, and the verdict that summarizes findings.
 
-A command's module determines code and values of a finding; a text file next to it has the sentences.
+A command's module determines code and values of a finding; a text file next to the module has the sentences.
 `mdnum/verbs/__init__.toml` explains the content of the text files, and the formats of the fields.
 """
 
@@ -138,7 +138,7 @@ class Texts:
         return Plot(name, series=tuple(series), **marks, **told)
 
     def rows(self, table: str, /, **values: Any) -> list[tuple[str, str]]:
-        """Return names and texts of a table, with values inserted, except rows that have a missing value."""
+        """Return names and texts of a table, with values inserted, without rows that have a missing value."""
         rows = ((_first(name, values), _first(text, values)) for name, text in self.entries[table].items())
         return [(name, text) for name, text in rows if name is not None and text is not None]
 
@@ -183,7 +183,7 @@ def _plain(value: Any) -> Any:
 
 
 def _first(texts: str | Sequence[str], values: Mapping[str, Any]) -> str | None:
-    """Return the first text for which all fields have values, with the values inserted; or None."""
+    """Return the first text whose fields all have values, with the values inserted, or None if none has."""
     several = [texts] if isinstance(texts, str) else texts
     return next((fill(text, values) for text in several if _known(text, values)), None)
 
@@ -221,7 +221,7 @@ class Verdict:
         return " ".join((self.headline, *self.evidence))
 
     def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a summary with headline, findings and verdict; an empty one for an unfinished folder."""
+        """Return a summary with headline, findings and verdict, or an empty one for an unfinished folder."""
         usual = {"status": "complete" if summary else "unfinished", "seconds": None}
         found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
         return headed(kind, {**usual, **summary, **found})

@@ -1,6 +1,6 @@
 """Building blocks of all pages and terminal output: sections with text, tables and figures.
 
-This module only defines data: `page` renders sections as HTML, and `cli.output` prints them.
+This module only defines data: `page` renders sections as HTML, and `cli.output` prints sections.
 """
 
 from __future__ import annotations

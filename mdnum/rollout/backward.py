@@ -1,8 +1,8 @@
 """Exact time reversal of a run with a fixed-point (integer) state, from the last step to the first.
 
 Every step is reversed by subtracting the integers that were added in this step, so all states of the forward
-run are recovered bit for bit. The reversed run can use other neighbor lists, because sums of integers do not
-depend on the order of pairs.
+run are recovered bit for bit. The reversed run can use other neighbor lists than the forward run, because
+sums of integers do not depend on the order of pairs.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _before(program: EpochProgram, masses, order, back: Back) -> Back:
 
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
 def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord):
-    """Reverse time steps until the skin is used up, the record is full, or the bath must be restored."""
+    """Reverse time steps until the skin is used up, the record is full, or the bath is to be restored."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
 

@@ -102,7 +102,7 @@ class ReferenceFrame:
 
 @dataclass(frozen=True)
 class CrossFlip:
-    """A pair of atoms for which two runs begin or cease to disagree about the cutoff at a step."""
+    """A pair of atoms on whose cutoff decision two runs begin or cease to disagree at a step."""
 
     step: int  # of the flip
     # i, j: the pair, labels of the first run, i < j

@@ -365,7 +365,7 @@ class Engine:
         return segment, last
 
     def _with_rows(self, start: Start, last: int) -> EpochRecord:
-        """Recompute the steps from a state to a last step with the same list, and record every step."""
+        """Recompute the steps from a state to a last step with the same neighbor list; record every step."""
         engine = Engine(self.simulation, last, start=start, pins=self.pins)
         parts: list[list[Any]] = [
             [np.array(segment.rows_of(name)) for name in EpochRecord._fields[:-2]]
@@ -381,7 +381,7 @@ class Engine:
         return self.pins.rows(table, first, self._room(words), self.simulation.channels)
 
     def failure(self, outcome: EpochOutcome) -> str:
-        """Return the name of the failure in which the time steps ended, else an empty string."""
+        """Return the name of the failure that ended the time steps, or an empty string if there was none."""
         _, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
         if not finite:
             return "blow-up"

@@ -149,7 +149,7 @@ class EpochRecord(NamedTuple):
     inputs: Any = ()  # `StepInputs` of each row, where they were asked for
 
     def boxes(self, rows: int, pbc: tuple[bool, bool, bool]) -> tuple[Cell, ...]:
-        """Return the simulation boxes of the first steps; empty if the box is constant."""
+        """Return the simulation boxes of the first steps; the result is empty if the box is constant."""
         if not self.cell.size:
             return ()
         return tuple(Cell.create(one, pbc) for one in np.asarray(self.cell)[:rows])

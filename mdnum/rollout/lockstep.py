@@ -1,8 +1,8 @@
-"""Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other imposed.
+"""Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other run imposed.
 
 Each free run has the same bits as a single run, because neighbor lists and compiled loops are separate.
-Cutoff decisions are compared by means of their changes in both runs. Therefore the cost does not depend on
-the number of pairs, and only pairs with different decisions are stored.
+Cutoff decisions are compared by means of their changes in both runs. Therefore the cost of the comparison
+does not depend on the number of pairs, and only pairs with different decisions are stored.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
 
 
 def strain_of(a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Return the strain between the boxes of two runs at each step; NaN after run b has ended."""
+    """Return the strain between the boxes of two runs at each step, or NaN after run b has ended."""
     out = np.full(len(a), np.nan)
     if b is not None:
         rows = min(len(a), len(b))

@@ -28,8 +28,8 @@ class PressureParts:
     """Components of the pressure: kinetic, virial (total and per term) and impulsive.
 
     The impulsive component is due to the jump of the energy at a cutoff: 2/3 π ρ² g(r_cut) r_cut³ u(r_cut)
-    for one type of pair (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). Forces and barostats do
-    not contain this component, but it contributes to the pressure of the truncated potential.
+    for one type of pair (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). Forces and barostats
+    lack the impulsive component, which contributes to the pressure of the truncated potential.
 
     Args:
         samples: for each sampled step, the volume, length³, and the components, energy/length³.
@@ -77,7 +77,7 @@ class PressureParts:
         self.samples.append(parts)
 
     def summary(self) -> dict[str, Any] | None:
-        """Return means and standard errors in user units, and cutoff corrections; None without samples.
+        """Return pressures with standard errors, in user units, and cutoff corrections; None without samples.
 
         Standard errors assume independent samples; the correction for pairs beyond the cutoff is evaluated at
         the mean volume.

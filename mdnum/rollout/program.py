@@ -70,12 +70,12 @@ class MdProgram:
 
     @property
     def streams(self) -> bool:
-        """Always True, because a run can be continued for any number of steps."""
+        """Whether runs can be continued: always True, for any number of steps."""
         return True
 
     @property
     def imposable(self) -> str | None:
-        """Reason why decisions cannot be imposed on this simulation; None if imposing is possible."""
+        """Reason why decisions cannot be imposed on this simulation, or None if imposing is possible."""
         if self.simulation.imposable:
             return None
         return "a many-body potential decides inside its energy function"
@@ -100,7 +100,7 @@ class MdProgram:
     def lockstep(
         self, other: MdProgram, last: int, *, forward: bool, back: bool, guard: float | None
     ) -> Iterator[PairRows]:
-        """Advance two runs and their counterfactuals, one segment at a time (see `Program.lockstep`)."""
+        """Advance two runs and their counterfactual runs, one segment at a time (see `Program.lockstep`)."""
         a, b = self.simulation, other.simulation
         frame, imposed = other.frame or ReferenceFrame.same(a.atoms), {}
         if forward:
@@ -113,7 +113,7 @@ class MdProgram:
     def repeats(
         self, others: Sequence[MdProgram], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Return separations of runs with perturbed starts from one run (see `Program.repeats`)."""
+        """Return separations of runs with perturbed initial states from one run (see `Program.repeats`)."""
         a = self.simulation
         frame = others[0].frame or ReferenceFrame.same(a.atoms)
         imposed = [Counterfactual(b.simulation, a, b.begin, frame, guard) for b in others]
@@ -228,7 +228,7 @@ class MdProgram:
         raise IndexError(f"the run has no step {step}")
 
     def state_at(self, step: int, last: int) -> tuple[Simulation, Float[np.ndarray, "atoms 3"]] | None:
-        """Return the simulation with the box of a step, and wrapped positions; None after the run."""
+        """Return the simulation with the box of a step, and wrapped positions; None after the run's end."""
         track = Track(self.simulation, last, self.begin, self.frame, flips=False)
         while track.segment() is not None:
             rows = track.until(track.ready)

@@ -46,7 +46,7 @@ class LineFit:
 
     @property
     def slope(self) -> float | None:
-        """Slope dy/dx of the line; None for fewer than three points, or if squares under- or overflow."""
+        """Slope dy/dx of the line, or None for fewer than 3 points or if squares underflow or overflow."""
         spread = self.count * self.xx - self.x * self.x
         if self.count < 3 or not 1e-280 < spread < np.inf:
             return None
@@ -334,7 +334,7 @@ class EnergyBudget:
 
     @property
     def tolerance(self) -> float:
-        """Largest allowed deviation of the energy: a tenth of the smallest jump, or the rounding error."""
+        """Largest allowed deviation of the energy: a tenth of the smallest jump, or a rounding error."""
         if self._reference is not self.simulation:
             jumps = np.abs(self.simulation.jumps()[0])
             return _SHARE_OF_A_JUMP * float(jumps[jumps > 0].min())
@@ -392,7 +392,7 @@ class ListHealth:
     """Monitor of a run's neighbor lists, which counts missed pairs and dangerous rebuilds.
 
     A list can miss a pair only if the displacements of two atoms add up to more than the skin. A safe rebuild
-    rule prevents such displacements; with any other rule, a new neighbor search checks such steps.
+    rule prevents such displacements; with any other rule, a new search checks for missed pairs.
     """
 
     simulation: Simulation  # the system as objects

@@ -86,7 +86,7 @@ _COLUMNS = ("x", "v", "energy", "nearest", "overridden", "furthest")
 
 
 def taken(ahead: list[Rows], last: int) -> Rows | None:
-    """Remove all time steps up to a given step from a list, and return them; None if there are none."""
+    """Remove all time steps up to a given step from a list, and return them, or None if there are none."""
     parts: list[Rows] = []
     while ahead and ahead[0].first <= last:
         rows = ahead.pop(0)
@@ -158,7 +158,7 @@ class Track:
         return self._ahead[-1].last
 
     def until(self, last: int) -> Rows | None:
-        """Return the time steps up to `last` that were not returned yet; None if there are none."""
+        """Return the time steps up to `last` that were not returned yet, or None if there are none."""
         while not self._ahead or self.ready < last:
             if self.segment() is None:
                 break

@@ -146,7 +146,7 @@ class FrameFile:
                 raise
 
     def mark(self) -> tuple[int, int, int]:
-        """Return number of frames, position of the offset table, and file size; 0 before the first frame."""
+        """Return number of frames, position of the offset table, and file size (all 0 before frame 0)."""
         if not self.path.exists() or self.path.stat().st_size < _FRAMES_AT + _HEADER.size:
             return (0, 0, 0)
         with opened(self.path) as file:

@@ -212,7 +212,7 @@ def digest_of(data: bytes | memoryview) -> str:
 
 
 def digest(path: Path) -> str:
-    """Return the current digest of a file; ABSENT if the file does not exist."""
+    """Return the current digest of a file, or ABSENT if the file does not exist."""
     try:
         with opened(path) as file:
             return digest_of_file(file)
@@ -333,7 +333,7 @@ def resumable(root: Path) -> bool:
 
 
 def listed_files(root: Path, names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the current digests of files, without missing files."""
+    """Return the current digests of files, except for missing files."""
     return {name: [digest(root / name)] for name in names if os.path.lexists(root / name)}
 
 

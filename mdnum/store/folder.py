@@ -191,7 +191,7 @@ class RunFolder:
         return self._layout
 
     def read_as(self, layout: Layout) -> None:
-        """Read a folder that an earlier version wrote with the current layout of the command."""
+        """Read a folder from an earlier version of mdnum, in the present layout of the command."""
         self._layout = layout
 
     @property
@@ -480,7 +480,7 @@ class RunFolder:
     def about(self) -> dict[str, Any]:
         """Metadata of the tables: version, kind, system, digest of the run, and units by quantity.
 
-        The metadata do not depend on the time of writing, so a resumed run has the same bytes as any other.
+        The metadata do not depend on the time of writing, so resumed and unbroken runs write equal bytes.
         """
         made, system = self._read_json("provenance.json"), self.system
         named = system.get("units") or system.get("world")

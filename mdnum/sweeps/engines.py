@@ -225,7 +225,7 @@ def _ends_with(parent: int) -> dict[str, Any]:
 def opened(on: str | Executor | Engine | None, workers: int | None) -> Iterator[Engine]:
     """Context manager: make an engine from None (local processes), a dask address, a file or an executor.
 
-    An engine that is passed on remains open.
+    An executor that the caller passes remains open.
 
     Raises:
         InputError: the engine is unknown, or its package is not installed.
@@ -330,7 +330,7 @@ def computed(
 
 @contextmanager
 def requested(on: str | Executor | None, workers: int | None) -> Iterator[Engine | None]:
-    """Context manager of the engine that was requested; None, which stands for this process, if none was."""
+    """Context manager that yields the requested engine, or None (this process) if none was requested."""
     if on is None and workers is None:
         yield None
         return
@@ -371,7 +371,7 @@ def _numbered(work: Callable[[Any], Any], task: tuple[int, Any]) -> Any:
 
 
 def _error(future: Future[Any]) -> BaseException | None:
-    """Return the exception of a finished future; None if the future has a result."""
+    """Return the exception of a finished future, or None if the future has a result."""
     try:
         return future.exception()
     except CancelledError as cancelled:

@@ -76,7 +76,7 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
 
 
 class _Runs(NamedTuple):
-    """Variance of a mean over runs, from the errors of the runs and from their scatter; nan if unknown."""
+    """Variance of a mean over runs, from the errors of the runs and from their scatter, or nan if unknown."""
 
     runs: int
     within: float
@@ -113,7 +113,7 @@ class Difference:
 
     @property
     def moves(self) -> bool | None:
-        """True if the choice changes the measure significantly; None if the error is unknown."""
+        """True if the choice changes the measure significantly, or None if the error is unknown."""
         return None if np.isnan(self.chance) else bool(self.chance < ALPHA)
 
     @property

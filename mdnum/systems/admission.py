@@ -1,8 +1,8 @@
 """Classification and validation of a user's energy function by trial calls before the simulation.
 
 The signature of a function does not reveal whether positions are fractional, whether lattice vectors are rows
-or columns, or whether the box is used. Wrong assumptions give plausible energies. Therefore the function is
-tested at the first configuration, with equivalent neighbor lists and slightly different boxes.
+or columns, or whether the box is used. Energies computed with wrong assumptions look plausible. Therefore the
+function is tested at the first configuration, with equivalent neighbor lists and slightly different boxes.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class _Moved:
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 
     def takes_images(self) -> bool:
-        """Return True if moving an atom by a lattice vector in this convention keeps the energy."""
+        """Return True if moving an atom by a lattice vector in this convention does not change the energy."""
         if not self.unchanged(self.trial.cell):
             return False
         # of a fractional function units are lattice vectors, and perhaps these are whole numbers of units

@@ -120,7 +120,7 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
 
 
 def _control(table: ball.Control, h: float, steps: int) -> Float[np.ndarray, "steps"] | None:
-    """Return the additional acceleration in each time step, m/s²; None if gravity acts alone."""
+    """Return the additional acceleration in each time step, m/s², or None if gravity acts alone."""
     match table:
         case ball.ConstantControl():
             return np.full(steps, table.value)

@@ -91,7 +91,7 @@ def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any
 
 
 def reduction_word(reduction: Any) -> str:
-    """Return the name of a summation order in system files, or its Python representation without a name."""
+    """Return the name of a summation order in system files, or its Python representation if unnamed."""
     return next((word for word, known in BY_NAME.items() if known == reduction), repr(reduction))
 
 

@@ -97,7 +97,7 @@ class PairPotentialTable(TomlTable):
 
 
 def _pair_table(name: str, kind: str, row: type[TomlTable], description: str) -> Any:
-    """Create the table model of a pair potential, with constants given once or for each pair of species."""
+    """Create the schema of a pair potential with one set of constants, or one set per pair of species."""
     columns: dict[str, Any] = {"kind": (Literal[kind], ...)}
     for key, field in row.model_fields.items():
         value: Any = Annotated[field.annotation, *field.metadata]
@@ -283,7 +283,7 @@ class CutoffTable(TomlTable):
         if self.onset is None:
             return self
         if not self.switches:
-            raise ValueError(f"an onset is given, but {self.kind} cutoffs have no switching range; remove it")
+            raise ValueError(f"onset is given, but {self.kind} cutoffs have no switching range; remove onset")
         if self.base is None:
             raise ValueError(
                 "onset is given without radius or in_sigma, relative to which onsets of pairs are scaled"
@@ -582,7 +582,7 @@ def _with_onset(cutoff: CutoffTable | None) -> CutoffTable | None:
 
 
 def _one_of(made: dict[str, Any]) -> None:
-    """In the JSON schema, replace the type "table or null" by the table, which editors handle better."""
+    """In the JSON schema, replace the type "table or null" by "table", which editors handle better."""
     made |= made.pop("anyOf")[0]
 
 

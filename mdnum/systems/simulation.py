@@ -123,7 +123,7 @@ class Simulation:
 
     @property
     def file(self) -> System | None:
-        """System file that describes the simulation; None if it was changed or made from objects."""
+        """System file that describes the simulation, or None if it was changed or made from objects."""
         its = self.origin.parts
         same = bool(its) and all(getattr(self, name) is part for name, part in its.items())
         return self.origin.system if same else None
@@ -148,7 +148,7 @@ class Simulation:
 
     @property
     def imposable(self) -> bool:
-        """True if cutoff decisions can be imposed; not if the energy function itself applies a cutoff."""
+        """True if cutoff decisions can be imposed, False if the energy function itself applies a cutoff."""
         return self.pairwise or self.model.trusts_list
 
     @property
@@ -163,7 +163,7 @@ class Simulation:
 
     @property
     def cutoff(self) -> Any:
-        """Cutoff of a pair potential; None if the potential contains its own cutoff."""
+        """Cutoff of a pair potential, or None if the potential contains its own cutoff."""
         return self.model.cutoff if self.pairwise else None
 
     @property
@@ -202,7 +202,7 @@ class Simulation:
 
     @property
     def path(self) -> Path | None:
-        """Path of the system file; None for a simulation made from objects."""
+        """Path of the system file, or None for a simulation made from objects."""
         return None if self.file is None else self.file.path
 
     @property
@@ -279,14 +279,14 @@ class Simulation:
 
     @property
     def _weights(self) -> Float[np.ndarray, "terms atoms"] | None:
-        """Weight of each atom in each term of the potential; None if no term has weights."""
+        """Weight of each atom in each term of the potential, or None if no term has weights."""
         if not self.pairwise or not self.model.weights:
             return None
         each = (term.weights for term in self.model.terms.values())
         return np.stack([np.asarray(own[0]) if own else np.ones(self.atoms) for own in each])
 
     def jumps_of(self, i, j) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """Return the jumps of energy and radial force when given pairs enter; for i see `type_of`."""
+        """Return the jumps of energy and radial force when pairs enter the cutoff; for i see `type_of`."""
         kind, weights = self.type_of(i, j), self._weights
         if weights is None:
             energy, force = (jump[kind] for jump in self.jumps())

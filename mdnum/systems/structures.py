@@ -47,7 +47,7 @@ class Draw:
     def velocities(
         self, masses: Float64[np.ndarray, " atoms"], units: Units, own: Float64[np.ndarray, "atoms 3"] | None
     ) -> Float64[np.ndarray, "atoms 3"]:
-        """Return the velocities of step 0, length per internal time.
+        """Return the velocities of step 0, in units of length per internal time.
 
         Args:
             own: velocities of the structure, or None to draw velocities.

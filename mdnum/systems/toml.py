@@ -1,9 +1,9 @@
 """Reading and writing system files in TOML format, error messages with line numbers, and overrides.
 
-The standard library reads TOML, but does not write TOML and does not record the line of a key. This module
-adds both functions for system files. A table whose keys depend on its kind is a union of pydantic models,
-selected by a key such as `kind` or `rule`; `models` finds the model of a key in such unions. Each error
-message is one line with the value found, the expected value and the line of the file.
+The standard library reads TOML, but does not write TOML and does not record the line of a key. For system
+files, this module writes TOML and finds the line of a key. A table whose keys depend on its kind is a union
+of pydantic models, selected by a key such as `kind` or `rule`; `models` finds the model of a key in such
+unions. Each error message is one line with the value found, the expected value and the line of the file.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def _dotted_prefix(text: str) -> tuple[Key, int]:
 
 
 def line_of(text: str, key: Key) -> int | None:
-    """Return the line (from 1) that sets a key or starts its table; None if there is no such line."""
+    """Return the line (from 1) that sets a key or starts its table, or None if there is no such line."""
     best: tuple[int, int] | None = None
     table: Key = ()
     for number, line in enumerate(text.splitlines(), start=1):

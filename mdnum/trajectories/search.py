@@ -159,8 +159,8 @@ def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float)
     if images > _MOST_IMAGES_EACH and pairs > _MOST_REPEATED:
         raise InputError(
             f"about {pairs:,.0f} pairs lie within {radius:.6g}: in a box of widths "
-            f"{np.round(lattice.widths, 3).tolist()}, each atom has about {images:,.0f} periodic images "
-            "within this distance of another atom",
+            f"{np.round(lattice.widths, 3).tolist()}, about {images:,.0f} periodic images of each atom "
+            f"lie within {radius:.6g} of any other atom",
             remedy="Check the length unit of the cutoff and of the box, or select fewer atoms",
             where="cutoff",
         )

@@ -90,8 +90,8 @@ class Recorder:
             if len(self._rules) > 1 or (radius := getattr(rule, "radius", None)) is None or rule.directed:
                 names = ", ".join(one.name for one in self._rules)
                 raise InputError(
-                    f"the argument pair_energy cannot be combined with the rule {names}",
-                    remedy="Give pair_energy with a single r_cut only",
+                    f"the argument pair_energy cannot be used with the selection of pairs by {names}",
+                    remedy="Omit pair_energy, or select pairs by a single cutoff r_cut",
                 )
             self._jump = float(pair_energy(radius))
         self._check = ListCheck(rule)
