@@ -198,7 +198,7 @@ class MTK(Barostat):
         return (self.freedom(masses) + 3) / share * self.kT * self.pressure_relaxation**2
 
     def _held(self, v, motion, extra, masses, time):
-        """Advance the independent thermostat chains of box and atoms; scale `motion` with the velocities."""
+        """Advance the separate thermostat chains of box and atoms; scale velocities and kinetic tensor."""
         freedom, kT = self.freedom(masses), self.kT
         own, of_box = self._own(extra, masses)
         scale, atoms = extra.atoms.act(0.5 * trace(motion), freedom, kT, self.relaxation, time)
@@ -274,9 +274,9 @@ class CellRescaling(Barostat):
     forces. The noise added to the square root of the volume does not depend on the volume. Velocities are
     scaled inversely to the box (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section II C). In a full
     box, the traceless strain is also propagated by an Euler step, with noise computed from the geometric mean
-    of the volumes before and after the step (del Tatto, Raiteri, Bernetti, Bussi, Appl. Sci. 12, 1139, 2022).
-    From the probabilities of each step and its reverse, an effective energy (total energy minus heat and
-    work) is computed, which is conserved within the time-step error.
+    of the volumes before and after the step (del Tatto, Raiteri, Bernetti, Bussi, Applied Sciences 12, 1139,
+    2022). From the probabilities of each step and its reverse, an effective energy (total energy minus heat
+    and work) is computed, which is conserved within the time-step error.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,

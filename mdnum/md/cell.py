@@ -99,7 +99,7 @@ class Cell(eqx.Module):
         """Return the largest coordinates and lattice vectors, from which rounding bounds are computed.
 
         The magnitudes of coordinates along periodic axes follow from the box. Along nonperiodic axes, the
-        magnitudes allow for motion of the atoms to twice their present distances.
+        magnitudes allow every atom to move by the present extent of all atoms.
 
         Args:
             positions: initial positions of the atoms, length.
@@ -151,7 +151,7 @@ class Cell(eqx.Module):
         return self.spanned(self.matrix @ by)
 
     def spanned(self, matrix) -> Cell:
-        """Return a box with new lattice vectors (rows) and the same periodic axes (inside jit)."""
+        """Return a box with new lattice vectors (rows) and the same periodic axes (for use inside jit)."""
         flags = np.array(self.pbc)
         rows = jnp.where(flags[:, None], matrix, 0.0)
         # of the products of rows: a free axis, which has none, keeps an inverse of 0

@@ -104,7 +104,7 @@ class Cutoff(ABC):
     def enclose(
         self, pull: Callable[[Any], Any], energy: Callable[[Any], Any], at: AtCutoff
     ) -> Callable[[Any], Any]:
-        """Return twice the derivative of the cut potential by r², in ball arithmetic, for an interval of r².
+        """Return 2 du/d(r²) of the potential u with its cutoff, in ball arithmetic, for an interval of r².
 
         The default method executes the operations of `cut` one by one in ball arithmetic.
 

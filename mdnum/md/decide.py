@@ -58,7 +58,7 @@ class PairDecider:
 
     @property
     def convention(self) -> PairDecider:
-        """The decision rule without radii and error-bound data, as static data for compiled programs."""
+        """The decision rule without cutoff radii and error bounds, as static data for compiled programs."""
         return replace(self, r_cut=(), reach=_NO_REACH, state="float64")
 
     @property
@@ -138,7 +138,7 @@ class PairDecider:
         return np.sqrt(r2) if self.space == "r" else r2
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
-        """Return margins (threshold minus r or r²; positive inside) on the host, with the decision's bits.
+        """Return margins (threshold minus r or r²; positive inside) on the host, bitwise as in decisions.
 
         Args:
             displacement: three components, in the dtype of the decision. kind: pair type of each pair.

@@ -90,7 +90,7 @@ def _binned(x, cell: Cell, low, span, bins: _Whole):
 def _searched(
     x, places, cell: Cell, start, r2_list, bins: _Whole, reach: _Whole, room: int, slots: int, blocks: int
 ):
-    """Return the neighbors of sorted atoms, and the largest neighbor count; if > slots, some are missing."""
+    """Return neighbors of sorted atoms and the largest count; if count > slots, neighbors are missing."""
     atoms = x.shape[1]
     matrix = cell.matrix
     # layer after layer along the third axis, as the host goes

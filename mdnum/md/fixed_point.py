@@ -244,7 +244,7 @@ class FixedPointStep(Integrator):
         return jnp.where(jnp.abs(p) < _LARGEST, p * (self.impulse / masses), jnp.nan)
 
     def kick(self, v, time, acceleration, masses):
-        """Return velocities after an acceleration for a given time, with momenta rounded to integers."""
+        """Return velocities after an acceleration acted for a time, with momenta rounded to integers."""
         push = jnp.round(time * acceleration * (masses / self.impulse))
         return self.velocity(self.momentum(v, masses) + push, masses)
 

@@ -150,7 +150,7 @@ class Integrator(eqx.Module):
 
     @property
     def noise_belongs_to(self) -> tuple[str, ...]:
-        """Permutation symmetries ("atoms", "axes") broken by noise that is tied to atom or axis indices."""
+        """Permutation symmetries ("atoms", "axes") that noise breaks by depending on atom or axis indices."""
         return () if self.random is None else ("atoms", "axes")
 
     def number(self, key: str, units: Units) -> float:
@@ -363,7 +363,7 @@ def check_one_box(integrator: Integrator, what: str) -> None:
 
 
 def _is_linear(integrator: KickDrift) -> bool:
-    """Return True if the drift has the same derivatives by positions and velocities at two states."""
+    """Return True if the drift has equal derivatives with respect to position and velocity at two states."""
     x, v, dx, dv = jax.random.normal(jax.random.key(0), (4, 3, 4), jnp.float64)
     zero, order = jnp.zeros((), jnp.int64), jnp.arange(4)
 

@@ -266,7 +266,7 @@ class PairSearch:
         self._update = jax.jit(lambda folded, previous: previous.update(folded))
 
     def _frame(self, fractional: np.ndarray) -> None:
-        """Set the interval [0, 1) around the atoms along nonperiodic axes, with a margin for their motion."""
+        """Place the interval [0, 1) around the atoms on nonperiodic axes, with a margin for their motion."""
         low, high = fractional.min(axis=0), fractional.max(axis=0)
         self._low = np.where(self.pbc, 0.0, low - self.r_list)
         self._span = np.where(self.pbc, 1.0, high - low + 2 * self.r_list)

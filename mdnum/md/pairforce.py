@@ -86,7 +86,7 @@ class PairForce(eqx.Module):
 
     @property
     def law(self) -> CutPotential | Guarded:
-        """The potential in the precision policy's arithmetic, rounded at every operation for 16-bit types."""
+        """The potential in the precision policy's arithmetic; 16-bit types are rounded at every operation."""
         model = self.model.typed
         return Guarded(model, self.zero, rounded) if self._short else model
 
@@ -376,7 +376,7 @@ def _in_one_loop_jvp(primals, tangents, *, decisions: bool, tensor: bool):
 def imposed(
     inside: Bool[Array, "4 atoms"], given: UInt8[Array, "atoms"], where: UInt8[Array, "atoms"] | None
 ) -> Bool[Array, "4 atoms"]:
-    """Return the decisions used in a group of slots: imposed decisions if given, else the own `inside`.
+    """Return the decisions for a group of slots: imposed decisions if there are any, otherwise `inside`.
 
     A simple mask makes the compiler compute distances twice: a step of 864 atoms takes 2.2 times as long as a
     normal step, 1.3 times with a mask per slot (`unpacked`), and 1.2 times with this code.
@@ -409,7 +409,7 @@ VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
 def products(a: Float[Array, "_ atoms"], b: Float[Array, "_ atoms"]) -> Float[Array, "6"]:
-    """Return the sums over atoms of a_i b_j in Voigt order, of the first three rows of a and b.
+    """Return, in Voigt order, the sums over atoms of a_i b_j, for rows i and j (the first three) of a and b.
 
     Eight partial sums are added at a time, which XLA does in vectors; for 4,000 atoms, this takes a third of
     the time of sequential sums.
@@ -552,8 +552,8 @@ class MdState(NamedTuple):
 class PairDynamics(eqx.Module):
     """Dynamics on a fixed neighbor list with imposed decisions.
 
-    The class is used to replay the decisions of another run, and for gradients at fixed decisions. A normal
-    simulation makes the same steps in compiled epochs, with decisions from its own positions.
+    The class is used to replay the decisions of another run, and to compute gradients at fixed decisions. A
+    normal simulation makes the same steps in compiled epochs, with decisions from its own positions.
     """
 
     force: PairForce  # the pair force

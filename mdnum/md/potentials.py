@@ -421,7 +421,7 @@ class CutPotential(eqx.Module):
         return self.cutoff.cut(r2, u, w, here, *weights)
 
     def jumps(self) -> Float[np.ndarray, "2 terms types"]:
-        """Return energy and radial force jumps when a pair of weight 1 enters, by term and pair type."""
+        """Return jumps of energy and radial force when a pair of weight 1 enters, by term and pair type."""
         # in numpy: to jax each operation on these few numbers is a program to compile
         made = self.cutoff.jumps(jax.tree.map(np.asarray, self).at_cutoff())
         return np.array(made).swapaxes(0, 1)
@@ -482,7 +482,7 @@ class Channels(eqx.Module):
         return jnp.concatenate([part.r_cut for part in self.parts])
 
     def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
-        """Return energy and radial force jumps when a pair enters, by term, channel and pair type."""
+        """Return jumps of energy and radial force when a pair enters, by term, channel and pair type."""
         sides = zip(*(part.jumps() for part in self.parts), strict=True)
         return np.stack([np.asarray(block_diag(*one)) for one in sides])
 

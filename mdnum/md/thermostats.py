@@ -29,13 +29,13 @@ class Chain(NamedTuple):
 
     @classmethod
     def at_rest(cls, links: int) -> Chain:
-        """Return the initial state of a chain, at rest."""
+        """Return the initial state of a thermostat chain, at rest."""
         return cls(jnp.zeros(links), jnp.zeros(links))
 
     def act(
         self, kinetic: Number, freedom: int | Number, kT: Number, relaxation: Number, time: Number
     ) -> tuple[Number, Chain]:
-        """Advance the chain by a time; return the scale factor of the velocities, and the chain.
+        """Advance the chain by a given time; return the scale factor of the velocities, and the new chain.
 
         Each of three substeps updates the links from last to first, scales the velocities, and updates the
         links in reverse order (Tuckerman et al., J. Phys. A 39, 5629, 2006, the operator L_NHC). The error is

@@ -1,7 +1,7 @@
 """Analysis of flips as an MDAnalysis class, `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
 
-Frames may be distributed over processes. A flip is found by comparing two successive frames, so that each
-process also reads the frame before its first frame. No flip is lost at a process boundary, and the results
+Frames may be distributed over processes. A flip is found by comparing two successive frames; each process
+therefore reads also the frame before its first frame. No flip is lost at a process boundary, and the results
 are bitwise identical to those of a single process. If two processes find different pairs at a shared frame,
 an error is raised.
 """

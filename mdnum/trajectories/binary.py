@@ -7,7 +7,7 @@ atoms, the bit counts and the length can be verified without decoding. File dama
 is not detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
 
 MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. MDAnalysis writes the index
-through symbolic links, and use an index file even if it belongs to another trajectory; this module uses no
+through symbolic links, and uses an index file even if it belongs to another trajectory; this module uses no
 index file. Source of the trr format: GROMACS, trrio.
 """
 

@@ -49,7 +49,7 @@ class Box:
 
     @cached_property
     def longest(self) -> float:
-        """Length of the longest lattice vector; 0 for a box not finite, or not periodic on all axes."""
+        """Length of the longest lattice vector; 0 if the box is not finite or not fully periodic."""
         if not np.all(self.pbc) or not np.isfinite(self.matrix).all():
             return 0.0
         return float(np.linalg.norm(self.matrix, axis=1).max())

@@ -105,7 +105,7 @@ class ResidueTracker:
     """Tracker of contacts between residues, with the same interface as `Tracker` for pairs of atoms.
 
     Pairs of atoms within one residue are ignored. `near` counts pairs of atoms, at least one for each pair of
-    residues within the error bound of the cutoff. The attribute `min_margin` is not computed (inf).
+    residues within the error bound of the cutoff. The attribute `min_margin` is always inf.
 
     Args:
         rule: membership rule for atoms.

@@ -3,9 +3,9 @@
 Three quantities describe the durations of contacts:
 
 - The **lifetime** is estimated from contacts whose beginning was observed, with contacts that continue after
-  the last frame as right-censored data (Kaplan and Meier, J. Am. Stat. Assoc. 53, 457, 1958).
-- The **mean by rate** is the total contact time divided by the number of departures. This mean includes
-  partly observed contacts, and equals the mean lifetime if pairs leave at a constant rate.
+  the last frame as right-censored data (Kaplan and Meier, J. American Statistical Association 53, 457, 1958).
+- The **mean by rate** is the total contact time divided by the number of departures. The mean by rate
+includes partly observed contacts, and equals the mean lifetime if pairs leave at a constant rate.
 - The **residence** is the fraction of the pairs in contact at a frame that stay in contact, without a break,
   for a given lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more
   often, so the residence differs from the lifetime.

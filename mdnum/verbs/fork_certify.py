@@ -135,7 +135,7 @@ def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
 
 
 def judge_certify(view: View) -> Verdict:
-    """Return the verdict: at which precisions, and how long, decisions agree with exact arithmetic."""
+    """Return the verdict: for each precision, the steps in which decisions agree with exact arithmetic."""
     s = view.summary
     rows = [row for row in s["policies"] if row["reason_unavailable"] is None]
     left = [row for row in rows if row["horizon"] is not None]

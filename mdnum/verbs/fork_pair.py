@@ -204,7 +204,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
 
 
 def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
-    """Return the strain between the boxes of A and B at the end, the largest, and at the divergence."""
+    """Return the strain between the boxes of A and B: at the end, at the divergence, and the largest."""
     if "strain" not in made.series:
         return {}
     strain, free = made.series["strain"], made.series["B"]

@@ -36,7 +36,7 @@ def subject(s: Mapping[str, Any]) -> str:
 
 
 def of_pair(flip: Mapping[str, Any]) -> str:
-    """Return the label of a flip's pair (with the energy term, if there are several terms) or ball."""
+    """Return the label of a flip: its ball, or its pair and (if there are several) its energy term."""
     i, *j = flip["subject"]
     return pair_name({"i": i, "j": j[0], "terms": flip["terms"]}) if j else str(i)
 

@@ -6,7 +6,7 @@ in a text file named after the module. A module declares its verb in one line:
 
     KINDS = {"flips": Verb(judge, page)}
 
-where "flips" is the kind of output folder, declared in the text file under [kinds.flips]. The functions
+The key "flips" is the kind of output folder, which the text file declares under [kinds.flips]. The functions
 `judge` and `page` read only the folder, so a page can be written again later.
 """
 

@@ -138,7 +138,7 @@ def _assignments(name: str, texts: Sequence[str]) -> Any:
 
 
 def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
-    """Return the plan of a sweep without a run: points, missing points, estimated time and disk space."""
+    """Return the plan of a sweep, without a run: points, missing points, estimated time and disk space."""
     from mdnum.verbs import Reply
 
     where = given.pop("points_in", None) or Path(given.get("out") or "runs/x").parent / "sweep-points"
@@ -169,7 +169,7 @@ def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
 def _compute(
     place: Workspace, plan: Plan, log: Any, on: Any, workers: int | None, keep: bool, code: bool
 ) -> dict[str, Any]:
-    """Compute missing points, wait for points that another sweep computes, and return numbers of points."""
+    """Compute missing points, wait for points that another sweep computes, and return the counts."""
     wanted = {one.address: one for one in plan.points if not one.wrong}
     missing = [a for a in wanted if not enough(place.result(a), plan.wanted)]
     missed = place.nearest(wanted[missing[0]].state) if missing else None

@@ -77,7 +77,7 @@ def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
 
 
 def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
-    """Return the gradient, up to which step to trust it (as in `mdnum grad`), and the parameter's name."""
+    """Return the gradient and its trust horizon, as in `mdnum grad`, and the parameter's full name."""
     from mdnum.gradients import Problem
     from mdnum.gradients.diagnose import diagnose
 
