@@ -106,7 +106,7 @@ class Meter:
 
 @dataclass(frozen=True)
 class Observed:
-    """One finding of a check: a code, and the values inserted into the text for this code in audit.toml."""
+    """One finding of a check: a code, and the values inserted into this code's text in audit.toml."""
 
     code: str  # short stable name
     severity: Severity  # info (nothing to do), warning (look at it), error (the numbers are wrong)

@@ -51,7 +51,7 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
     """Return a test structure for a calculator: the calculator's own structure, a crystal, or rigid water.
 
     The crystal consists of an element for which the calculator is intended; if the calculator distinguishes a
-    second element, half of the atoms are of that element. The lattice constant is the one at which the
+    second element, half of the atoms are of the second element. The lattice constant is the one at which the
     calculator's energy is lowest. The crystal is repeated until the cell is two cutoffs wide (at most 500
     atoms, fewer for a slow calculator), and its atoms are displaced slightly. `info["origin"]` describes the
     structure. If the calculator fails on atoms without neighbors, a denser crystal is built; the failure is
@@ -207,7 +207,7 @@ def meant_for(calculator: Any, words: str) -> list[str]:
 
 
 def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]:
-    """Yield element symbols in a value or its attributes; of dictionary keys, only if all are symbols."""
+    """Yield element symbols in a value or its attributes; use dictionary keys only if all are symbols."""
     from ase.data import chemical_symbols
 
     value = value.tolist() if hasattr(value, "tolist") else value

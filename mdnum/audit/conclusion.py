@@ -68,7 +68,7 @@ def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
     """Return the text variants of findings that depend on the results of more than one check.
 
     Incorrect forces that do no work around closed loops are the gradient of another energy; forces that do
-    work around loops are not the gradient of any energy.
+    work around closed loops are not the gradient of any energy.
     """
     numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
     curl, forces = numbers.get("curl"), numbers.get("forces")

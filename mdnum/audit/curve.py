@@ -99,7 +99,7 @@ def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndar
 
 
 def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> tuple[float, float]:
-    """Return the one-sided derivative dF/dx of the force at `start` and its error, for the best spacing."""
+    """Return the one-sided derivative dF/dx of the force at `start`, and its error, for the best spacing."""
     best = (0.0, np.inf)
     for relative in _WIDTHS:
         width = max(abs(start), 1.0) * relative
@@ -163,8 +163,8 @@ def find_jumps(
 
     The smallest detectable jump depends on the curvature of the curve; for jumps of the force,
     `smallest_steps` returns it. At a spacing of 0.025 Å, 199 of 200 force jumps of 1e-6 eV/Å at random
-    distances in five potentials are found, and all larger jumps. Energy jumps are found down to 3e-6 eV on a
-    repulsive wall of ε = 1 eV, and down to 1e-8 eV on a soft one.
+    distances in five potentials are found, and all larger jumps. The smallest energy jumps found are 3e-6 eV
+    on a repulsive wall of ε = 1 eV, and 1e-8 eV on a soft wall.
 
     Args:
         curve: energy and force, which must be defined slightly beyond both ends.

@@ -1,10 +1,10 @@
 """Energy balance of a run: jumps of the energy at thresholds and elsewhere, work of the forces, drift.
 
 If the force is minus the gradient of the energy, a step's energy change plus the work of the forces along the
-straight line is zero for every integrator. An energy change not explained by the work of the forces is, at a
-distance threshold, the energy jump of a flip. An unexplained change at another single point is due to a limit
-on the number of neighbors or a selection of nearest neighbors. A distributed unexplained change means that
-the force is not minus the gradient of the energy.
+straight line is zero for every integrator. If an energy change at a distance threshold is not explained by
+the work of the forces, it is the energy jump of a flip. An unexplained change at another single point is due
+to a limit on the number of neighbors or a selection of nearest neighbors. A distributed unexplained change
+means that the force is not minus the gradient of the energy.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy and force along the straight line between two steps; `ends` takes end values from the run."""
+    """Energy and force along the line between two steps; if `ends`, end values are those of the run."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:
@@ -228,7 +228,7 @@ class HiddenJumps:
         return sum(jump.energy for jump in self.jumps if jump.step == step)
 
     def energies(self, rest: Steps) -> Steps:
-        """Energy change by hidden jumps at each step, eV; estimated from `share` at steps not searched."""
+        """Energy change (eV) due to hidden jumps at each step; at unsearched steps, `share` is used."""
         found = np.zeros(len(rest))
         for step in self.candidates:
             found[step] = self.brought(step) if step in self.steps else self.share * rest[step]

@@ -129,9 +129,9 @@ class CalculatorSubject:
 
     ASE returns its cached energy if no coordinate moved by more than 1e-15 Å, although such a move changes
     bits near the origin; so the cache is cleared if any bit differs. If no bit differs, the cache is used, so
-    energy and forces cost one calculation; `forget` forces another. The calculator is attached to the atoms,
-    as in a run, since some calculators require this. An evaluation may raise a `CalculatorError`: the
-    calculator raised an exception or returned nan. The structure is then saved.
+    energy and forces require only one calculation; `forget` forces another calculation. The calculator is
+    attached to the atoms, as in a run, since some calculators require this. An evaluation may raise a
+    `CalculatorError`: the calculator raised an exception or returned nan. The structure is then saved.
 
     Args:
         name: the calculator as the user named it.

@@ -249,8 +249,8 @@ def _seen(
 ) -> tuple[float, float, float, float] | None:
     """Return (first distance, last distance, median and largest of the detectable force steps).
 
-    Distances close to a known threshold (which would hide another threshold) and distances beyond the end of
-    the interaction are not counted.
+    Distances close to a known threshold (which would hide another threshold), or beyond the end of the
+    interaction, are not counted.
     """
     felt = places < end
     for radius in known:

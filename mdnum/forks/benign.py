@@ -8,9 +8,9 @@ changes are distinguishable from rounding.
 
 The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
 Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
-run is an outlier if at least two of its principal components exceed the limit; a program fails the test if
-two of its three runs are outliers. In other words, a program fails if the median over its three runs of the
-second-largest component exceeds the limit.
+run is an outlier if at least two of its principal components exceed the limit; a program fails the test if at
+least two of its three runs are outliers. In other words, a program fails if the median over its three runs of
+the second-largest component exceeds the limit.
 """
 
 from __future__ import annotations
@@ -111,8 +111,8 @@ class Space:
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations above which a principal component counts as an outlier.
 
-    The limit is two; it is raised if more than a tenth of the ensemble's own runs would be outliers. Each
-    run is judged by components of other runs: a run stands out less in components that it influenced.
+    The limit is two; it is raised if more than a tenth of the ensemble's own runs would be outliers. Each run
+    is judged by components of other runs, since a run deviates less in components that it influenced.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -128,7 +128,7 @@ def triples(seconds: Float[np.ndarray, "runs"]) -> Float[np.ndarray, "tries"]:
 
 
 def two_of_three(rate: float) -> float:
-    """Return the probability that at least two of three runs are outliers, given the rate for one run."""
+    """From the outlier rate of one run, compute the probability that at least two of three are outliers."""
     return 3 * rate**2 - 2 * rate**3
 
 
@@ -156,7 +156,7 @@ class Planted:
 
     @property
     def ok(self) -> bool:
-        """True if the test detected a change that it must detect, or rejected another only by chance."""
+        """True if the test detected a change to be detected, or rejected a harmless one only by chance."""
         if self.must_fail:
             return self.failures == self.tries
         return bounds(self.failures, self.tries)[0] <= ACCEPTED
@@ -173,7 +173,7 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest score (in limits) of the deliberate changes that must be detected; infinity if none."""
+        """Smallest score, in multiples of the limit, of changes that must be detected; infinity if none."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property
@@ -356,7 +356,7 @@ def benign(
     """Compare three runs of program B with an ensemble of runs of program A.
 
     B fails if at least two principal components of the features exceed the limit in two of three runs. If B
-    passes, the difference between A and B had no larger effect than the smallest perturbation of a start.
+    passes, the difference between A and B had no larger effect than the smallest perturbation of the start.
 
     Args:
         twin: the programs. Atom labels and axes of B do not matter, because no feature depends on them.

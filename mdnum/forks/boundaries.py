@@ -226,11 +226,11 @@ def boundaries(
     """Find the values of a parameter at which the decisions of a run change, within the resolution of a grid.
 
     The system is run at every grid value of the parameter. If the histories at the ends of a grid cell
-    differ, the cell is bisected until its ends are adjacent floats. If the other half of the cell contains a
-    change too, it is searched later. Boundaries are searched from the lowest parameter value upward; if more
-    exist than were requested, the highest are missing. All runs use the program of a normal run; for the
-    cutoff radius, it takes the radius as an argument. The runs on both sides of every boundary are repeated
-    in a new process.
+    differ, the cell is bisected until its ends are adjacent floats. If the other half of the cell also
+    contains a change of decisions, this half is searched later. Boundaries are searched from the lowest
+    parameter value upward; if more exist than were requested, the highest are missing. All runs use the
+    program of a normal run; to vary the cutoff radius, the program takes it as an argument. The runs on both
+    sides of every boundary are repeated in a new process.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.
@@ -298,7 +298,7 @@ def _run(task: tuple[NumberLine | bytes, int]) -> DecisionHistory:
 def _searched(
     task: tuple[NumberLine | bytes, dict[int, DecisionHistory], int],
 ) -> list[tuple[Boundary | None, dict[int, DecisionHistory]]]:
-    """Return the lowest boundaries in a cell with two known ends, and the runs made to find each."""
+    """Return the lowest boundaries in a cell with known runs at its ends, and the runs made for each."""
     own, ends, most = task
     line = _line_of(own)
     line.known |= ends

@@ -1,13 +1,13 @@
 """Certify the decisions of one run, and the agreement of its decisions with those of another run.
 
 Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound: exact arithmetic
-would give the same decisions for the same states. Up to the end of *protection*, the pair of atoms closest to
-its cutoff was further from the cutoff than the separation of two runs can have moved the pair. As long as the
-certified horizon and the protection last, the decisions of the two runs agree. If one of two programs is at
-least as precise in every role, the other makes the same decisions up to the *shadow horizon*.
+would give the same decisions for the same states. Up to the end of *protection*, the distance of the pair
+closest to its cutoff differed from the cutoff by more than this distance can differ between two runs. As long
+as the certified horizon and the protection last, the decisions of the two runs agree. If one of two programs
+is at least as precise as the other in every role, both make the same decisions up to the *shadow horizon*.
 
-Decisions are certified only for the actual states of the run. A run with correct decisions for its states may
-have left the exact history long before (`forks.exact.certify` finds the step).
+Decisions are certified only for the actual states of the run. A run whose decisions are correct for its
+states may have left the exact history long ago (`forks.exact.certify` finds the step).
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 
 
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """Return, per step, the distance of the nearest pair from its cutoff and the required distance (lengths).
+    """For each step, return how far the pair closest to its cutoff is from it, and the required length.
 
     Each atom may be displaced by the separation of the runs, so the distance of two atoms may change by twice
     the separation. The margins are taken from the run with the smaller rounding error, which is added to the

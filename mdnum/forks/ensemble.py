@@ -202,9 +202,9 @@ class Change:
 def planted(a: Simulation) -> tuple[Change, ...]:
     """Create the programs with deliberate changes that are possible for a simulation.
 
-    The test must detect programs with a longer time step or a shorter cutoff. Forces in another precision,
-    pairs in another order and the other neighbor search must pass. The cutoff and the precision of a
-    many-body potential cannot be changed, so these two changes are omitted for it.
+    The test must detect programs with a longer time step or a shorter cutoff. Programs with forces in another
+    precision, pairs in another order or the other neighbor search must pass. The cutoff and the precision of
+    a many-body potential cannot be changed, so these two changes are omitted for it.
     """
     longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
     search = next(name for name in BUILDERS if name != a.builder)

@@ -147,7 +147,7 @@ def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bo
 
 
 def twin_of(found: FolderFork, objects: Sequence[Simulation] = ()) -> Twin:
-    """Rebuild the programs of two molecular-dynamics folders to repeat the runs (`objects`: see
+    """Rebuild the programs of two molecular-dynamics runs from their folders (`objects`: see
     `simulation_in`).
 
     A replay agrees bit for bit with the stored run if versions and processor are the same.
@@ -194,7 +194,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
-    """Find where the decisions for the positions of two trajectories or simulation loops diverge."""
+    """Find the step at which decisions for positions of two trajectories or simulation loops differ."""
     summaries, names = (first.summary, second.summary), ("rule", "i", "j", "rank")
     rules, between = ([each[name] for each in summaries] for name in ("rules", "between"))
     names_of = [", ".join(one["rule"] for one in each) for each in rules]
@@ -225,8 +225,8 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """Return the choices to which differing keys belong: the dtypes of all roles are one choice; a cutoff
-    with its parameters is another.
+    """Return the choices to which differing keys belong: the dtypes of all roles are one choice, and a cutoff
+    with its parameters is another choice.
     """
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}

@@ -1,4 +1,4 @@
-"""The linearized run: how a small perturbation of the start grows, and which decisions it changes.
+"""The linearized run: how a small perturbation of the start grows, and which decisions this growth changes.
 
 The tangent (the derivative of the state) is propagated along the recorded states with the same neighbor
 lists, so that the reference is the recorded run, bit for bit. The exponential growth rate of the tangent is
@@ -9,8 +9,8 @@ Each decision has a margin m and a tangent dm/da, where a is the amplitude of th
 the decision flips at a = -m / (dm/da). The smallest amplitude that flips a decision at a step is a lower
 limit for all perturbations, as long as the perturbed run remains close to the reference run and makes the
 same decisions. If the force jumps at the cutoff, the first flip kicks the two atoms, and the forecast ends
-because the linearization then describes another run. If the force is continuous at the cutoff, a flip changes
-nothing to first order.
+because the linearization then describes another run. If the force is continuous at the cutoff, a flip does
+not change the motion to first order.
 """
 
 from __future__ import annotations
@@ -242,7 +242,7 @@ class Lyapunov:
         return seen.rate / self.rate if self.chaotic else float("nan")
 
     def steps_to(self, start: float, end: float) -> float | None:
-        """Return the step at which an initial displacement has grown from one length to another.
+        """Return the step at which a displacement has grown from an initial length to a given length.
 
         The growth is that of the run; beyond the end of the run, the growth is extrapolated exponentially.
         The result is None if the run is not chaotic and the displacement does not reach the final size.

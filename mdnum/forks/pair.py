@@ -173,7 +173,7 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Return whether to impose decisions of run A on run B, and of B on A, and the number of repeats.
+    """Return whether to impose A's decisions on B, whether to impose B's on A, and the number of repeats.
 
     Raises:
         InputError: a requested counterfactual run or repeat is not possible.

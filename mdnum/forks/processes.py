@@ -131,8 +131,8 @@ def variants(
 ) -> Variants:
     """Run a system in several variants of its program, two processes at a time, and find which results agree.
 
-    All variants use a single neighbor list, with twice the skin if the box is large enough, and stop before
-    motion exceeds this skin. Other machines may give other groups: some processors lack fused multiply-add.
+    All variants use one neighbor list, with a doubled skin if the box is large enough, and stop before motion
+    exceeds this skin. Other machines may give other groups: some processors lack fused multiply-add.
 
     Args:
         system: a system that was loaded from a file and has a pair potential.

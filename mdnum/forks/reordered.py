@@ -8,8 +8,8 @@ neighbors' halves are added one by one to the sum of an atom's own halves. An or
 each pair once: the terms of an atom with later atoms form one sum, those with earlier atoms another sum.
 
 Source: jax_md.smap.pair_neighbor_list and the transpose of its gathers, whose forces have these orders bit
-for bit (tests/forks/test_choices.py, jax-md 0.2.29). One detail of XLA is not reproduced: rows with more than
-32 slots are summed in blocks of 32.
+for bit (tests/forks/test_choices.py, jax-md 0.2.29). One detail of XLA is not reproduced: XLA sums rows with
+more than 32 slots in blocks of 32.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class ReorderedSimulation(Simulation):
 
     @classmethod
     def of(cls, simulation: Simulation, order: str | int) -> ReorderedSimulation:
-        """Create a simulation with reordered lists and, if sums depend on order, a list format's sums."""
+        """Create a simulation with reordered lists, and with a list format's sums if sums depend on order."""
         same = _fields(Simulation, simulation)
         if isinstance(order, str) and simulation.reduction == Sequential():
             same["reduction"] = _SUMS[order]

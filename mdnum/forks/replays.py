@@ -1,4 +1,4 @@
-"""Molecular-dynamics runs repeated around a fork: nearby atoms, overridden decisions, and minimal causes.
+"""Repeat molecular-dynamics runs around a fork: find nearby atoms, override decisions, find minimal causes.
 
 To override a decision of run B, the decision of run A is imposed; run B makes all other decisions itself. The
 smallest set of overridden pairs that keeps run B close to run A is found by bisection and delta debugging,

@@ -1,7 +1,7 @@
 """Programs and parameters of systems, for molecular dynamics and for the bouncing ball.
 
-Modules of molecular dynamics are imported inside functions, because these modules import jax_md, which a ball
-does not need.
+Modules of molecular dynamics are imported inside functions, because they import jax_md, which is not required
+for a ball.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def packed(system: Simulation | BallSystem, *more: Any) -> bytes:
 
 @lru_cache(1)
 def unpacked(data: bytes) -> tuple[Any, ...]:
-    """Restore what `packed` pickled; the last one is kept, so that its programs are compiled once."""
+    """Restore objects pickled by `packed`; keep the last one, so that its programs are compiled once."""
     import cloudpickle
 
     allowed, own, *more = cloudpickle.loads(data)

@@ -227,8 +227,8 @@ def _differences(cell, own, other):
 
 
 def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
-    """Sum contributions of all neighbor slots to the cotangents, which depend on differences between the
-    atoms of a pair, for each atom; sum contributions to shared parameters over all atoms.
+    """For each atom, sum the contributions of all neighbor slots to the cotangents; for shared parameters,
+    sum the contributions over all atoms.
     """
 
     def pair(own, other, types, inside):

@@ -210,8 +210,8 @@ def density(
 
     The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
     of the width; extrapolation from three widths, each half of the previous width, removes the second and
-    fourth powers. The result is the extrapolation from the widest kernels that agrees with all extrapolations
-    from narrower kernels within twice the standard error of the difference.
+    fourth powers. Extrapolations from kernels of different widths are compared; the result is the widest that
+    agrees with all narrower ones within twice the standard error of the difference.
 
     Args:
         weights: one per frame and pair type. reach: the largest width, length.

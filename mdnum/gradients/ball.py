@@ -1,6 +1,6 @@
 """Gradient methods for a simulated bouncing ball; the methods treat contact decisions differently.
 
-The methods in this module differentiate the operations that ran (unrolled), the program with all decisions
+The methods in this module differentiate the executed operations (unrolled), the program with all decisions
 fixed (frozen), or the loss averaged over random parameters (randomized). Methods that replace the contact by
 another model are in `ball_contacts`.
 
@@ -120,7 +120,7 @@ def dependence(
     """Determine on which parameters a scalar loss depends, in the branches and iterations that ran.
 
     The test sets the tangent of a parameter to NaN. This NaN propagates through every operation that has a
-    derivative, even a derivative of zero, and through no other operation.
+    derivative (even a zero derivative), but through no other operation.
 
     Args:
         function: maps a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as
@@ -282,8 +282,8 @@ class ThroughIterations(BallMethod):
 class Frozen(BallMethod):
     """Gradient method: derivative of the program with decisions and iteration counts fixed to a recorded run.
 
-    The program with fixed decisions has no branches. Finite differences therefore converge, and are computed
-    in float64 as a check.
+    The program with fixed decisions has no branches. Finite differences of this program therefore converge;
+    they are computed in float64 as a check.
     """
 
     name = "frozen"
@@ -321,7 +321,7 @@ class RandomizedSmoothing(BallMethod):
     """Gradient method: derivative of E[loss(parameters + width * noise)], estimated from values of the loss.
 
     The estimate includes the effect of jumps of the loss, where iteration counts or contacts change. Each
-    noise sample is used with both signs, so that a constant in the loss does not add to the variance. The
+    noise sample is used with both signs, so that a constant in the loss does not increase the variance. The
     same random seed gives the same result, bit for bit.
     """
 

@@ -258,11 +258,11 @@ def _suitable(problem: BallProblem) -> float:
 class ThroughContacts(BallMethod):
     """Gradient method: derivative of the ball's motion in continuous time, including the times of contacts.
 
-    Contact is decided at the end of a step. The derivative of the discrete steps therefore lacks the effect
-    that a ball that starts higher arrives later. The saltation matrix of every contact adds this effect. If
-    impacts are located within a step, the program's own derivative already contains the saltation matrix. The
-    method treats a contact by projection like an impact. The force of a spring without a damper does not
-    jump; for such a spring the result is the same as from the method `unrolled`.
+    Contact is decided at the end of a step. A ball that starts higher arrives later; the derivative of the
+    discrete steps lacks this effect. The saltation matrix of every contact adds this effect. If impacts are
+    located within a step, the program's own derivative already contains the saltation matrix. The method
+    treats a contact by projection like an impact. The force of a spring without a damper does not jump; for a
+    spring without a damper, the result is the same as from the method `unrolled`.
     """
 
     name = "event-aware"

@@ -1,10 +1,10 @@
 """Contributions to a gradient from changes of the times at which pairs cross their cutoff (saltation).
 
-A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the momentum of the
-pair differs after the crossing. Derivatives of a program's steps lack the effect of crossing times, even for
-short time steps. In reverse mode, the saltation matrix of mdnum.numerics gives this effect, with the cutoff
-sphere as threshold. A loss that contains the potential energy or the virial also jumps at a crossing: if its
-frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
+A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the perturbation then
+changes the pair's momentum after the crossing. Derivatives of a program's steps lack the effect of crossing
+times, even for short time steps. In reverse mode, the saltation matrix of mdnum.numerics gives this effect,
+with the cutoff sphere as threshold. A loss that contains the potential energy or the virial also jumps at a
+crossing: if its frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
 
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
 dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.

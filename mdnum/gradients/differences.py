@@ -434,9 +434,9 @@ class SmoothedDifferences(Method):
     """Gradient method: mean over replicas of central differences with steps that span many flips.
 
     The two runs of a difference use the same random numbers. Differences with steps h and h/2 are
-    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with
-    extrapolations from all narrower steps within twice the standard error, because narrower steps have more
-    noise from single flips.
+    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees, within twice the
+    standard error, with the extrapolations from all narrower steps: narrower steps have more noise from
+    single flips.
     """
 
     relative: float = 0.002  # the widest step as a share of the parameter

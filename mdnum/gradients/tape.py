@@ -2,8 +2,8 @@
 
 Recorded stretches of steps are kept in memory as long as there is room. Other stretches are run again from
 their first states: the same compiled program with the same state and neighbor list gives the same bits. A run
-with a fixed-point integer state need not be stored: its steps are reversed, and must return to the start bit
-for bit.
+with a fixed-point integer state need not be stored: its steps are reversed, and the reversed steps must lead
+back to the start bit for bit.
 """
 
 from __future__ import annotations
@@ -126,8 +126,8 @@ class Pace(NamedTuple):
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the number of frames per unit of time around a step: if a jump just before the step occurs
-        earlier by dt, this number times dt frames change on average.
+        """Return the number of frames per unit of time near a step: if a jump just before the step occurs
+        earlier by dt, then on average dt times this number of frames change.
         """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
@@ -222,9 +222,9 @@ class RunTape:
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
-        """Derivatives of the loss with respect to energy and virial of a frame, if gradients do not include
-        the jumps of energy and virial at flips, as for losses of a single frame. For equally spaced frames,
-        whose gradients include the jumps, both derivatives are set to 0.
+        """Derivatives of the loss with respect to the energy and virial of a frame, for gradients that do not
+        include jumps of energy and virial at flips (as for losses of a single frame). For equally spaced
+        frames, whose gradients include the jumps, both derivatives are set to 0.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0

@@ -56,8 +56,8 @@ class Inputs(NamedTuple):
 
 
 class StepEnds(NamedTuple):
-    """Differentiable state between two steps, atoms in the user's order: wrapped positions, half-kicked
-    velocities, sums of the loss, floating-point part of the extra state, and the box.
+    """Differentiable state between two steps: wrapped positions and half-kicked velocities of the atoms in
+    the user's order, sums of the loss, floating-point part of the extra state, and the box.
     """
 
     x: Float[Array, "3 atoms"]

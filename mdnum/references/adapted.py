@@ -122,7 +122,7 @@ def morse(form: PairForm, begin: float, end: float) -> Calculator:
 
 
 def short_listed_eam(file: Path) -> Calculator:
-    """Return ASE's EAM with a shorter neighbor list; its own list reaches 2 (cutoff + skin), and is slow."""
+    """Return ASE's EAM with a shorter neighbor list (its own list is slow: it reaches 2 (cutoff + skin))."""
     from ase.calculators.eam import EAM
     from ase.neighborlist import NeighborList
 

@@ -122,8 +122,8 @@ def check_energy(
     judge: Reference | None = None,
     lammps: bool = False,
 ) -> EnergyReport:
-    """Compare energies, forces and stresses with those of an ASE calculator (or of plain numpy if ASE has no
-    calculator for the potential).
+    """Compare energies, forces and stresses with those of an ASE calculator or, if ASE has no calculator for
+    the potential, of plain numpy.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
@@ -212,7 +212,7 @@ def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Eval
 
 
 def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:
-    """Return mdnum's results for the first atoms of a cluster, as part of the whole system."""
+    """Return what the first atoms of a cluster contribute to mdnum's results for the whole system."""
     edges = edges_of(cluster, r_cut)
     once = edges.i < edges.j
     pairs = edges.i[once], edges.j[once], edges.r[once]
@@ -275,7 +275,7 @@ class _Scales:
     """Scales by which differences of energy, force and stress are divided.
 
     energy: sum of |energies|; force: largest force on an atom or along a pair; stress: sum of absolute virial
-    terms over the volume; *_expected: differences expected from rounding.
+    terms, divided by the volume; *_expected: differences expected from rounding.
     """
 
     energy: float
@@ -287,7 +287,7 @@ class _Scales:
 
     @classmethod
     def of(cls, simulation: Simulation, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]) -> _Scales:
-        """Return the scales of a frame, from sums over pairs for a pair potential, else from the totals."""
+        """Return the scales of a frame: for a pair potential from sums over pairs, otherwise from totals."""
         unit, places = unit_roundoff(narrowest(simulation)), unit_roundoff(_places(simulation))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")

@@ -48,7 +48,7 @@ def edges_of(atoms: Atoms, reach: float) -> Edges:
 
     ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster at 500 atoms than ASE's
     neighbor_list. ASE lists only pairs with r < reach, while the model decides whether r = reach is inside;
-    so the list reaches slightly farther, by SLACK.
+    the list therefore extends farther, by SLACK.
     """
     arrays = (atoms.positions, atoms.numbers, atoms.cell.array, atoms.pbc)
     key = (*(array.tobytes() for array in arrays), reach)

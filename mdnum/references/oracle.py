@@ -95,8 +95,8 @@ def all_pairs(
 
     All pairs are tested with every lattice vector that could bring the atoms together, without cell list or
     skin. The result is therefore valid for triclinic cells, periodicity along some axes, atoms outside the
-    cell, and cells smaller than the cutoff (a pair then appears once per image). The cost is proportional to
-    the square of the number of atoms, by design.
+    cell, and cells smaller than the cutoff (a pair then appears once per image). The computing time is
+    proportional to the square of the number of atoms, by design.
 
     Args:
         positions: coordinates, wrapped or not.

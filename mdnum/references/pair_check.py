@@ -1,4 +1,4 @@
-"""Compare neighbor searches with brute force, and find their effective cutoffs (`mdnum check pairs`)."""
+"""Compare neighbor searches with an exact search, and find their effective cutoffs (`mdnum check pairs`)."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Search:
 
 
 def all_searches(system: Simulation) -> tuple[Search, ...]:
-    """Return the neighbor searches of mdnum, with the comparison (< or <=) of a system, and of libraries."""
+    """Return neighbor searches of libraries, and those of mdnum with the comparison (< or <=) of a system."""
     own = own_searches(system)
     return (*own, *(Search(one) for one in known() if not one.kept and one.package != "mdnum"))
 
@@ -346,8 +346,8 @@ def effective_cutoff(
 ) -> EffectiveCutoff:
     """Find the largest distance (double) of two atoms that a neighbor search counts as inside r_cut.
 
-    The two atoms differ only in x and the first has x = 0, so that their distance is exactly the coordinate
-    of the second atom; in a periodic box (5 r_cut wide) the result includes wrapping by the search.
+    The two atoms differ only in x, and the first has x = 0: their distance is exactly the x coordinate of the
+    second atom. In a periodic box (5 r_cut wide), the result includes wrapping by the search.
 
     Args:
         periodic: use a periodic box, as in a simulation; otherwise atoms without a box.
@@ -387,7 +387,7 @@ def effective_cutoff(
 
 
 def borderline_pairs(r_cut: float, count: int) -> ndarray:
-    """Return randomly oriented pairs within 3 ulps of r_cut: (count, 2, 3); the first atom at the origin."""
+    """Return randomly oriented pairs, (count, 2, 3), with distances within 3 ulps of r_cut."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]

@@ -80,8 +80,8 @@ class ForcesCheck(AuditCheck):
     """Are the forces minus the gradient of the energy, and of which energy?
 
     The error of a finite difference is |D(h) - D(h/4)| after extrapolation, plus the measured noise divided
-    by the step; of nine steps h, the step with the smallest error is used. If a finite difference deviates
-    from the force by an amount that grows like 1/h, a jump of the energy is reported and not a wrong force.
+    by the step; of nine steps h, the step with the smallest error is used. If the deviation of a finite
+    difference from the force grows like 1/h, the check reports a jump of the energy and not a wrong force.
     """
 
     name, title, order, basic, calls = "forces", "Forces", 10, True, 500
@@ -259,8 +259,8 @@ def _best(
 ) -> tuple[int, float]:
     """Return index and error of the most accurate finite-difference step, if other steps agree with it.
 
-    If the energy jumps at flips, two finite-difference steps may include the same jumps by chance, and agree
-    on a wrong slope. A wrong force, in contrast, causes equal deviations for all sufficiently accurate
+    If the energy jumps at flips, two finite-difference steps may include the same jumps by chance and give
+    the same wrong slope. A wrong force, in contrast, causes equal deviations for all sufficiently accurate
     finite-difference steps.
 
     Args:

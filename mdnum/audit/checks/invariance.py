@@ -88,8 +88,8 @@ class _Difference:
 class InvarianceCheck(AuditCheck):
     """Do energy and forces of a structure depend on its representation?
 
-    The allowed differences are measured: the calculator's noise along a line, and the largest change under
-    random displacements of the size of coordinate rounding. A transformation that the calculator does not
+    The allowed differences are measured: they are the calculator's noise along a line, and the largest change
+    under random displacements as large as coordinate rounding. A transformation that the calculator does not
     support is skipped. `structures` contains both representations if their energies or forces differ.
     """
 

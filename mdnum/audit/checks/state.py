@@ -170,7 +170,7 @@ class Comparison:
 
 
 def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
-    """Return sequences in which two atoms approach each other at the cutoff, and sequences to skip."""
+    """Return sequences in which two atoms approach each other at the cutoff, and sequences to be skipped."""
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)

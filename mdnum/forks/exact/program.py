@@ -52,7 +52,7 @@ def pull_of(
     """Return a function that computes 2 du/d(r²) for a pair inside the cutoff from an interval of r².
 
     The factor 2 du/d(r²) multiplies the displacement x_j - x_i in the force on i. Constants are exactly the
-    given doubles; derived values are intervals of the precision set at the time of the call.
+    given doubles; values derived from these are intervals in the precision set at the time of the call.
 
     Raises:
         TypeError: the potential uses an operation that ball arithmetic does not support.
@@ -120,7 +120,7 @@ class ExactHistory:
 
     @property
     def bits_per_step(self) -> float:
-        """Bits by which the largest interval grows per step in the second half of a run; NaN if too short."""
+        """Growth of the largest interval in the second half of a run, in bits per step; NaN if too short."""
         rows = np.flatnonzero(np.isfinite(self.radius))
         if len(rows) < 4:
             return float("nan")

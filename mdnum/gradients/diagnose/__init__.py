@@ -1,8 +1,8 @@
 """Diagnose a simulation's gradient: up to which step it can be trusted, and what contributes to it.
 
 Gradient methods compute different quantities: the derivative of the steps, the derivative of the flow with
-the times of flips, the slope of the loss between shifted runs, the slope of an average, or the derivative of
-another program. The function `agreement` gives the reason for each difference between two gradients.
+changes of flip times, the slope of the loss between shifted runs, the slope of an average, or the derivative
+of another program. The function `agreement` gives the reason for each difference between two gradients.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 For example, a force can be finite while its derivative is not, a loss can contain a square root at zero, or a
 sum can overflow in the reverse pass. The reverse pass is repeated up to the first step that gives a number
 that is not finite, and this step is run operation by operation. An operation is the cause if its inputs are
-finite, its result is not, and a finite result in its place makes the program's result finite; the last
-condition excludes numbers that are masked out later.
+finite, its result is not finite, and replacing its result by a finite number makes the program's result
+finite; the last condition excludes numbers that are masked out later.
 """
 
 from __future__ import annotations

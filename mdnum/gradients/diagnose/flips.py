@@ -2,8 +2,8 @@
 
 The contribution of a crossing is a product of two factors. The first factor, from a reverse pass, is the
 derivative of the loss with respect to the cutoff of one crossing alone, including the effect of all later
-flips. The second factor, from tangents without flips, is the distance by which the cutoff moves ahead of the
-pair. The contributions of single flips therefore sum exactly to the total contribution of all flips.
+flips. The second factor, from tangents without flips, is the change of the cutoff minus the change of the
+pair distance. The contributions of single flips therefore sum exactly to the total contribution of all flips.
 
 A decision boundary is a value of a parameter at which the decision on a pair changes, between two adjacent
 floats. Between two boundaries all runs make the same decisions, and loss and gradient are smooth functions of

@@ -1,8 +1,8 @@
 """Growth of a gradient and of perturbations with the number of steps, and overflow in narrow formats.
 
 The cotangent of the state h steps before the end is the gradient of a run of h steps (horizon h) from this
-state. One reverse pass over T steps therefore gives a gradient for every horizon up to T, each with a
-different start on the same trajectory. Cotangents of a chaotic run span many powers of two: a loss scale
+state. One reverse pass over T steps therefore gives gradients for all horizons up to T; each gradient belongs
+to a different start on the same trajectory. Cotangents of a chaotic run span many powers of two: a loss scale
 helps if all cotangents are small, but not if their range exceeds that of the narrow format.
 
 The largest singular value of a run's Jacobian bounds the gradient of any loss of the last state. Singular

@@ -2,9 +2,9 @@
 
 A pair that turns back just outside its cutoff causes no flip. If the pair came slightly closer, it would
 enter and leave at a radial speed near zero, and the contribution of each crossing to the gradient would be
-proportional to the inverse of this speed. Conversely, if a pair passes the cutoff by little, a small
-perturbation can remove its contribution. All turning points near the cutoff are therefore examined, on either
-side and also between two steps.
+proportional to the inverse of this speed. Conversely, if a pair comes inside the cutoff by only a small
+distance, a small perturbation can remove its contribution. Therefore, all turning points near the cutoff are
+examined: on both sides of the cutoff, and also between two steps.
 
 Near the turning point the distance is r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth
 d crosses the cutoff twice at speed sqrt(2 a d), and the two crossings contribute 2 w / sqrt(2 a d), where w
@@ -99,9 +99,9 @@ class Turns:
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """Magnitude of the possible contribution of the two crossings at each turning point. If the distance
-        is within its uncertainty of the cutoff, the pair is assumed to pass the cutoff by 1 % of the
-        uncertainty; otherwise the value is the change of the contribution with shorter time steps.
+        """Magnitude of the possible contribution of the two crossings at each turning point. If distance and
+        cutoff agree within the uncertainty, the pair is assumed to pass the cutoff by 1 % of the uncertainty;
+        otherwise the value is the change of the contribution in a run with shorter time steps.
         """
         bend, reach = self.table["bend"], self.reach
 

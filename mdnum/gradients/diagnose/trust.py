@@ -547,8 +547,8 @@ def last_agreeing(
     """Return the longest horizon at which all values are below a limit, and whether a longer horizon exists.
 
     Disagreement at shorter horizons is ignored: the relative error due to the time step may decrease again,
-    and for few flips a change of a single flip is a large part of the gradient. Agreement at one horizon with
-    disagreement at adjacent horizons is regarded as chance.
+    and if there are few flips, a single flip may contribute a large part of the gradient. Agreement at one
+    horizon with disagreement at adjacent horizons is regarded as chance.
     """
     within = np.max(np.stack(list(values.values())), axis=0) <= limit
     if len(within) > 1:

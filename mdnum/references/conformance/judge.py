@@ -33,7 +33,7 @@ SILENT = ("CRASHED", "NO_ANSWER", "RAISED")  # those of cases in which nothing c
 
 @dataclass(frozen=True)
 class Truth(PairSet):
-    """Exact pairs at one call of a test case, inside the cutoff and out to a larger distance."""
+    """Exact pairs at one call of a test case: those inside the cutoff, and those up to a larger distance."""
 
     # positions, cell: as the list was given them; rows of axes that do not repeat are zero
     positions: ndarray
@@ -46,11 +46,11 @@ class Truth(PairSet):
     reach: float  # pairs as far as this may be listed, length; the cutoff unless a list holds a skin
 
     def needed(self, unit: float) -> ndarray:
-        """Return a mask of the exact pairs that a list must contain if computed with this unit roundoff."""
+        """Return a mask of the exact pairs that a list computed with a given roundoff must contain."""
         return self.distance < self.r_cut - unit * self.scale
 
     def allowed(self, unit: float) -> ndarray:
-        """Return a mask of the exact pairs that a list may contain if computed with this unit roundoff."""
+        """Return a mask of the exact pairs that a list computed with a given roundoff may contain."""
         return self.distance <= self.reach + unit * self.scale
 
 
@@ -309,7 +309,7 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """Return the rounding error of a result that is correct for float32 or better; None for wrong results."""
+    """Return the rounding error of a result that is correct at least for float32; None for wrong results."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))
@@ -391,7 +391,7 @@ class CaseAnswers:
     shrunk: dict[str, Failed] = field(default_factory=dict)
 
     def of(self, number: int, case: Case) -> CaseResult | None:
-        """Return the stored result of a test case or None; raise InputError if the stored case differs."""
+        """Return the stored result of a test case, if any; raise InputError if the stored case differs."""
         result = self.cases.get(str(number))
         if result is None:
             return None

@@ -35,7 +35,7 @@ class KeptList(Protocol):
     def update(self, positions: ndarray, cell: ndarray) -> Any:
         """Update the neighbor list to new positions and return its pairs.
 
-        The arguments may be the arrays of the previous call with new contents, so store copies.
+        The arguments may be the arrays of the previous call with new contents; therefore, store copies.
         """
         ...
 

@@ -47,7 +47,7 @@ def movers() -> Iterator[Case]:
 
 
 def sequences() -> Iterator[Case]:
-    """Yield sequences for a neighbor list that is built at each call, to test that no state is kept."""
+    """Yield sequences for a neighbor list that is built at each call, to test that it keeps no state."""
     for case in _reuse():
         yield replace(case, skin=0.0)
 
@@ -280,7 +280,7 @@ def _closing(room: float) -> float:
 
 
 def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
-    """Return pairs of atoms just beyond r_cut + padding; the first atoms of all pairs come first."""
+    """Return pairs just beyond r_cut + padding: the first atoms of all pairs, then their partners."""
     half = (_R + (1 + HAIR) * room) / 2 * way
     return np.vstack([middle - half, middle + half])
 
@@ -308,8 +308,8 @@ def _squeezed(room: float, way: ndarray, edge: float, n: int, along: bool) -> li
 def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
     """Return a path on which two of many atoms approach each other; the others rest or move slightly.
 
-    The fraction of the motion that each of the two atoms makes depends on `n`. The index of the atom that
-    moves most varies evenly over all indices; its partner's index is random.
+    The fraction of the motion that each of the two atoms makes depends on `n`. The atom that moves most has
+    each index equally often; the index of its partner is random.
     """
     rng = np.random.default_rng(170 + n)
     most = int(count * (1.0 - (n + 1) * _GOLDEN % 1.0))
@@ -364,7 +364,7 @@ def _in_turn(room: float, ways: list[ndarray]) -> Case:
 
 
 def _ladder(room: float, way: ndarray, n: int) -> Case:
-    """Return a test case in which pairs at different distances approach until each is inside the cutoff."""
+    """Return a test case in which pairs of atoms approach each other until each pair is inside the cutoff."""
     start = _around(_places(len(_RUNGS), 12.0, n), room * _RUNGS[:, None], way)
     inward = np.repeat([0.5 * way, -0.5 * way], len(_RUNGS), axis=0)
     path = [start + _closing(room) * closed * inward for closed in (0.0, *_RUNGS)]

@@ -118,7 +118,7 @@ _SECONDS = 60.0  # seconds that a script may take
 
 
 def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | None:
-    """Run the script of a failure; return whether the failure appears, or None if the time runs out."""
+    """Run the script of a failure; return whether the failure appears, or None if a time limit is reached."""
     tested, code, text = report.tested, failed.code, failed.worst.text
     if not tested.source.strip() or deadline.passed:
         return None
