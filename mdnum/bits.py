@@ -1,6 +1,6 @@
 """Operations on packed bits (one bit per cutoff decision), and sorting of integers.
 
-This module is not in `mdnum.numerics`, because trajectories use it without jax.
+This module is not in `mdnum.numerics`, because the analysis of trajectories uses it without jax.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """`mdnum doctor`: tests of whether this installation computes correct numbers.
 
-All tests are computations on the current machine. Versions that are known to be faulty are also reported, but
-no version is assumed to be correct.
+All tests of `mdnum doctor` are computations on the current machine. Versions that are known to be faulty are
+also reported, but no version is assumed to be correct.
 
 Error bounds require that +, -, *, / and sqrt are each correctly rounded, and that sums are not reordered. On
 CPUs, XLA rounds correctly and does not reorder sums, but contracts a*b+c and rewrites divisions by constants.
@@ -374,7 +374,7 @@ def crystal() -> DoctorRow:
 
 
 def digest(steps: int = 50) -> str:
-    """Return the SHA-256 digest of a short jitted simulation, which must be the same in all processes.
+    """Return the SHA-256 digest of a short jitted simulation; the digest must be the same in all processes.
 
     Args:
         steps: number of velocity Verlet steps of 32 argon atoms.

@@ -131,7 +131,7 @@ def expect_at_least(least: int, **numbers: int) -> None:
 
 
 def expect_path(given: object, remedy: str) -> None:
-    """Raise an error if an object that is not a path is given instead of a path.
+    """Raise an error if an argument that must be a path is an object of another type.
 
     Raises:
         InputError: the object is not a path; the message contains its type and shape, but not its contents.

@@ -1,4 +1,4 @@
-"""Interface of simulations to analyses such as forks and parameter maps, and results of comparisons.
+"""Interface between simulations and analyses such as forks and parameter maps, and results of comparisons.
 
 Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. An
 object with this interface (a program) determines all bits of a run, including the initial state. Analyses
@@ -105,7 +105,7 @@ class Program(Protocol):
         ...
 
     def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
-        """Return the decisions of a run with a given number of steps, and the final state."""
+        """Return the decisions and the final state of a run with a given number of steps."""
         ...
 
     def differing(self, other: Any, steps: int, step: int, key: str) -> Differing:

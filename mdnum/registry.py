@@ -29,7 +29,7 @@ _LONGEST_WORD = 100
 
 
 def meant(word: str, known: Iterable[str]) -> str:
-    """Return "Did you mean ...? " with the most similar known name; empty if no name is similar."""
+    """Return "Did you mean ...? " with the most similar known name, or "" if no name is similar."""
     folded = {option.lower(): option for option in known if len(word) <= _LONGEST_WORD}
     close = difflib.get_close_matches(word.lower(), folded, n=1)
     return f"Did you mean {folded[close[0]]}? " if close else ""

@@ -7,8 +7,8 @@ has speed e^(n-1) s, and the time between impacts n and n + 1 is 2 e^n s / g. Th
     t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e),
 
 so infinitely many impacts take place before the finite time t_rest (Zeno behavior). With a spring and a
-damper, y'' = -g - k y - c y' below the floor, and each contact is a damped cosine. Penalty contacts are time
-discretizations of this differential equation. A ball with a coefficient of restitution moves differently,
+damper, y'' = -g - k y - c y' below the floor, and each contact is a damped cosine. Penalty contacts
+discretize this differential equation in time. A ball with a coefficient of restitution moves differently,
 even in the limit of stiff springs, unless e = 1.
 
 All computations use numpy in float64. The exact solution shares no code with the simulations of this package,
@@ -46,7 +46,7 @@ Parameters = Mapping[str, complex]
 
 
 class _Motion:
-    """Base class of both exact motions: validation of the start, derivatives, height and velocity.
+    """Base class of the exact motions of a ball: validation of the start, derivatives, height and velocity.
 
     Complex-step derivatives have no cancellation (Squire & Trapp, SIAM Review 40 (1998) 110).
     """

@@ -279,7 +279,7 @@ class _Forceless(eqx.Module):
 
 
 class Penalty(eqx.Module):
-    """Force k p - damping v on a ball in contact; p is -y, or a softplus function of -y if smooth.
+    """Force k p - damping v on a ball in contact; p is -y or, in a smooth contact, a softplus of -y.
 
     If contact is imposed, the force is -k y for either sign of y, so that the contact force continues
     smoothly above the floor, like an imposed pair force beyond its cutoff.
@@ -373,8 +373,8 @@ class Impact(_Forceless):
     """Instantaneous impact: v ← -restitution v at the floor.
 
     With `EventLocated`, the impact takes place at its exact time, and the flight continues for the rest of
-    the step. With any other scheme, a ball below the floor is put on the floor at the end of the step, and
-    its velocity is reset. The resulting error is of order h in the state and of order 1 in the derivative.
+    the step. With another scheme, a ball below the floor is put on the floor at the end of the step, and its
+    velocity is reset. The resulting error is of order h in the state and of order 1 in the derivative.
     """
 
     restitution: Any = 0.8  # speed after over speed before

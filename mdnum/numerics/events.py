@@ -32,7 +32,7 @@ class Threshold:
             raise InputError(f"the comparison is {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
 
     def margin(self, quantity):
-        """Return threshold minus quantity, which is positive if the decision is "yes".
+        """Return the threshold minus the compared quantity, which is positive if the decision is "yes".
 
         Error: the difference is exact if the quantity is within a factor of 2 of the threshold (Sterbenz
         lemma). The sign is always correct, because an IEEE difference of unequal numbers is never zero.
@@ -40,7 +40,7 @@ class Threshold:
         return self.value - quantity
 
     def decide(self, quantity):
-        """Return the result of comparing a quantity with the threshold; NaN gives False."""
+        """Return the result of the comparison of a quantity with the threshold, which is False for NaN."""
         return quantity <= self.value if INCLUSIVE[self.comparison] else quantity < self.value
 
 

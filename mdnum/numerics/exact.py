@@ -1,10 +1,10 @@
 """Floating-point arithmetic inside jit whose results have the same bits on every processor.
 
-XLA on a CPU contracts a*b + c into a fused multiply-add. With such fusion, the bits of an expression depend
-on the instruction set, and differ from those of numpy. The decision whether a pair is inside the cutoff must
-not depend on the compiler. The function `fence` prevents fused multiply-add, so numpy reproduces cutoff
-decisions bit for bit. Formulas can also be evaluated operation by operation: with every result rounded, in
-interval arithmetic, or with the same bits on every processor.
+XLA on a CPU contracts a*b + c into a fused multiply-add. With fused operations, the bits of an expression
+depend on the instruction set, and differ from those of numpy. The decision whether a pair is inside the
+cutoff must not depend on the compiler. The function `fence` prevents fused multiply-add, so numpy reproduces
+cutoff decisions bit for bit. Formulas can also be evaluated operation by operation: with every result
+rounded, in interval arithmetic, or with the same bits on every processor.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -
 def root(x: jax.Array) -> jax.Array:
     """Return the square root, correctly rounded on every device.
 
-    On a GPU, the float32 square root has an error of one ulp for one number in six (XLA, H200). A float64
+    On an H200 GPU, XLA's float32 square root has an error of one ulp for one number in six. A float64
     square root that is rounded to float32 is correct, because 53 bits are at least 2 * 24 + 2 bits (Figueroa
     1995, "When is double rounding innocuous?").
     """

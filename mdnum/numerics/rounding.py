@@ -2,7 +2,7 @@
 
 A displacement is x_j - x_i minus at most one lattice vector for each periodic axis, rounded after every
 subtraction. The squared components of the displacement are added in the order x, y, z. The error of each
-rounding is proportional to the magnitude of the rounded result; a `Reach` contains bounds on such magnitudes.
+rounding is proportional to the magnitude of the rounded result; the class `Reach` bounds the magnitudes.
 """
 
 from __future__ import annotations

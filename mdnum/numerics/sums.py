@@ -249,7 +249,7 @@ class Twice(Reduction):
         return in_order(halves, add, in_order(halves, add))
 
     def depth(self, n: int) -> int:
-        """Return the largest number of additions that involve the same term in both passes."""
+        """Return the largest number of additions that involve the same term, over both passes of the sum."""
         return max(2 * n - 1, 0)
 
 

@@ -6,7 +6,7 @@ the counterfactual run stays close to the first run, the flips caused the split.
 also splits from the first run, repeats of the pair of runs decide whether the flips accelerated the split or
 are bystanders. Repeats are evaluated by a sequential sign test. If a pair of runs is delayed with probability
 at most 1/2, the probability of k or more delays in n pairs of runs is at most that of k or more heads in n
-coin tosses, for any distribution of the delays. All repeats have the same initial displacement. If the
+coin tosses, for any distribution of the delays. All repeats have displacements of the same size. If the
 majority differs at another displacement, the verdict is left open. Error rates: docs/verdict-calibration.md.
 """
 
@@ -274,7 +274,7 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 def expected(
     separation: Float[np.ndarray, "steps"], tolerance: float, exponent: float | None = None
 ) -> float | None:
-    """Predict the number of further steps until two runs split; None if no prediction is possible.
+    """Predict the number of further steps until two runs split, or return None if this is impossible.
 
     A prediction requires that exponential growth continues after the first steps: in the later half of the
     fitted steps, the separation must grow by several e-foldings, at a rate within a factor of 2 of the
@@ -461,7 +461,7 @@ def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason
 
 
 def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:
-    """Predict the step at which a counterfactual run splits; None if its separation does not grow."""
+    """Predict when a counterfactual run splits, or return None if its separation does not grow."""
     fit = growth(separation[: seen + 1], tolerance)
     now = float(separation[seen])
     if not (fit.plain and now > 0):

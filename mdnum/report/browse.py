@@ -42,7 +42,7 @@ class Column:
 
     @property
     def plain(self) -> list[list[Any]]:
-        """Values of the column as lists of plain values; None instead of values that are not finite."""
+        """Values of the column as lists of plain values, with None in place of values that are not finite."""
         if self.kind == "pair":
             return [np.asarray(values).astype(int).tolist() for values in self.of]
         values = np.asarray(self.of)
@@ -85,7 +85,7 @@ class Browse:
 
     @cached_property
     def rows(self) -> list[list[Any]]:
-        """Rows of the table as plain values; None instead of unknown values."""
+        """Rows of the table as plain values, with None in place of unknown values."""
         return [list(row) for row in zip(*(each for one in self.columns for each in one.plain), strict=True)]
 
     def is_ambiguous(self, row: Sequence[Any]) -> bool:

@@ -218,7 +218,7 @@ def _coincide(one: Series, other: Series) -> bool:
 def _apart(
     marks: tuple[tuple[float, str], ...], base: float, limits: tuple[float, float]
 ) -> list[tuple[float, str]]:
-    """Return marked values with labels; labels of values too close together are joined into one."""
+    """Return marked values with their labels; the labels of values that are too close are joined."""
     kept: list[tuple[float, str]] = []
     near = 0.025 * abs(limits[1] - limits[0])
     for value, word in sorted((value - base, word) for value, word in marks):
@@ -296,7 +296,7 @@ def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
 
 
 def _named(names: tuple[str, ...], value: float, _: int | None = None) -> str:
-    """Return the name of an integer position on an axis; an empty string for other positions."""
+    """Return the name of an integer position on an axis, or an empty string for any other position."""
     return names[round(value)] if value == round(value) and 0 <= value < len(names) else ""
 
 

@@ -18,7 +18,7 @@ _NODES, _FEWER, _AGREE = 200, 100, 1e-3
 
 
 def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> float | None:
-    """Period of the fastest vibration, in the user's time unit; None if there is no vibrational mode.
+    """Period of the fastest vibration, in the user's time unit, or None if there is no vibrational mode.
 
     The largest eigenvalue of the mass-weighted Hessian is found by a Lanczos iteration with finite
     differences of forces. Forces are shifted to zero at the cutoff, to avoid jumps when pairs cross the

@@ -185,7 +185,7 @@ class CrossRecorder:
     def take(
         self, first: int, rows: int, a: PairFlips, b: PairFlips
     ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
-        """Return the number of pairs with different decisions at each of the next steps, and its changes.
+        """Return the number of pairs with different decisions at each of the next steps, and all changes.
 
         Args:
             first: step of the first row.
@@ -296,7 +296,7 @@ def separations(
     b: Float[np.ndarray, "rows 3 atoms"],
     others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
-    """Return the largest distance between the same atoms of two runs at each step; NaN if a position is NaN.
+    """Return the largest distance between the same atoms of two runs at each step, NaN if a position is NaN.
 
     Args:
         cells: the box, or one box for each row; distances are minimum-image distances.

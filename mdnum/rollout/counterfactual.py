@@ -82,7 +82,7 @@ class Counterfactual:
             self._ahead.append(rows)
 
     def until(self, last: int) -> Rows | None:
-        """Return the simulated time steps up to `last` that were not returned yet; None if there are none."""
+        """Return the simulated time steps up to `last` that were not returned yet; None if none are left."""
         return taken(self._ahead, last)
 
     def follow(self, segment: Segment) -> Rows:

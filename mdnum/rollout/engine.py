@@ -91,7 +91,7 @@ class Segment:
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """The simulation box at each step; empty if the box is fixed."""
+        """The simulation box at each step, or an empty array if the box is fixed."""
         return self.record.boxes(self.rows, self.cell.pbc)
 
     def cell_of(self, row: int) -> Cell:
@@ -375,7 +375,7 @@ class Engine:
         return EpochRecord(*whole)
 
     def _pinned(self, table: PairTable, first: int, words: int) -> tuple[UInt8[np.ndarray, "..."], ...]:
-        """Return the decisions that are imposed on the next steps, with a mask; empty if there are none."""
+        """Return the decisions imposed on the next steps, and their mask (empty if there are none)."""
         if self.pins is None:
             return ()
         return self.pins.rows(table, first, self._room(words), self.simulation.channels)

@@ -49,9 +49,9 @@ class Pins:
     def rows(
         self, table: PairTable, first: int, count: int, channels: int = 1
     ) -> tuple[UInt8[np.ndarray, "rows words atoms"], UInt8[np.ndarray, "rows words atoms"]]:
-        """Return imposed decisions as packed bits, and a mask, for consecutive steps with the same list.
+        """Return imposed decisions as packed bits, and a mask, for consecutive steps with one neighbor list.
 
-        No decision can be imposed on a pair that is not in the list, because such a pair is too distant.
+        No decision can be imposed on a pair that is not in the neighbor list, because it is too distant.
 
         Args:
             table: the neighbor list.

@@ -139,7 +139,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
 
 
 def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
-    """Return the deformation from the box of each step to the previous box; empty if the box is fixed."""
+    """Return the deformation from the box of each step to the previous box (empty if the box is fixed)."""
     if not segment.cells:
         return np.empty((0, 3, 3))
     before = jax.tree.map(np.asarray, segment.start.cells[1]), *segment.cells[:-1]
@@ -338,7 +338,7 @@ class PairRecorder:
         return self._held_keys
 
     def _cannot_differ(self, segment: Segment) -> bool:
-        """Return True if the old and the new list certainly have the same pairs inside the cutoff."""
+        """Return True if old and new neighbor list certainly have the same pairs inside the cutoff."""
         rule = self.simulation.rule
         if self._held_segment is None or not rule.safe:
             return False
@@ -371,7 +371,7 @@ class PairRecorder:
 def pair_keys(
     i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], atoms: int
 ) -> Int[np.ndarray, "pairs"]:
-    """Return one integer (key) for each pair of atoms i < j, sorted; for i see `Simulation.type_of`."""
+    """Return sorted integers (keys), one for each pair of atoms i < j; for i see `Simulation.type_of`."""
     return np.sort(i.astype(np.int64) * atoms + j)
 
 

@@ -1,8 +1,8 @@
 """Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other run imposed.
 
-Each free run has the same bits as a single run, because neighbor lists and compiled loops are separate.
-Cutoff decisions are compared by means of their changes in both runs. Therefore the cost of the comparison
-does not depend on the number of pairs, and only pairs with different decisions are stored.
+Each run without imposed decisions has the same bits as a single run, because neighbor lists and compiled
+loops are separate. Cutoff decisions are compared by means of their changes in both runs. Therefore the cost
+of the comparison does not depend on the number of pairs, and only pairs with different decisions are stored.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def beside(
 
 
 def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Return the largest distance between the same atoms in two runs at each step; NaN after run b has ended.
+    """Return the largest distance between the same atoms in two runs at each step, NaN after run b has ended.
 
     Positions are scaled to the box of the first run, and distances are minimum-image distances in this box.
     """

@@ -70,7 +70,7 @@ class MdProgram:
 
     @property
     def streams(self) -> bool:
-        """Whether runs can be continued: always True, for any number of steps."""
+        """Whether runs can be continued: always True, because a run can have any number of steps."""
         return True
 
     @property

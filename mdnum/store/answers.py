@@ -1,7 +1,7 @@
 """The file answers.json, which stores intermediate results so that a killed command can be resumed.
 
 A command with many tests (`audit`, `conform`) keeps its options and results in one dataclass of plain values.
-The file is written at once if a result should not be lost, and otherwise about once per second. A resumed
+A result that should not be lost is written at once, and other results about once per second. A resumed
 command restores all values with their types, and runs the tests that have no result. Tables in the folder are
 created from the results.
 """

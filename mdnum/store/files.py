@@ -151,7 +151,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file in a run folder; empty if the file does not exist.
+    """Return the text of a file in a run folder, or an empty string if the file does not exist.
 
     Raises:
         InputError: the file is a link, is not UTF-8, or is too large.
@@ -230,7 +230,7 @@ def digest_of_file(file: BinaryIO) -> str:
 
 
 def load(root: Path) -> Manifest | None:
-    """Return the manifest of a run folder; None if there is no manifest (older versions wrote none).
+    """Return the manifest of a run folder, or None if the folder has none (older versions wrote none).
 
     Raises:
         FolderError: the manifest is damaged.
@@ -278,7 +278,7 @@ def update(
     finished: bool | None = None,
     layout: Layout | None = None,
 ) -> None:
-    """Add files to a manifest, remove others, and change the state; do nothing without a manifest."""
+    """Add files to a manifest, remove other files, and change the state; do nothing without a manifest."""
     made = load(root)
     if made is None:
         return

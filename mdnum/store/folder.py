@@ -234,7 +234,7 @@ class RunFolder:
         """Return True if the last checkpoint is so old that a new one is due.
 
         The interval between checkpoints is at least 2 s, 1 % of the run's duration, and fifty times the
-        duration of the last checkpoint. Therefore a kill loses about 1 % of a run, and a run of days has only
+        duration of the last checkpoint. A kill therefore loses about 1 % of a run, and a run of days has only
         about a thousand part files.
         """
         now = time.monotonic()
@@ -331,7 +331,7 @@ class RunFolder:
         self._log = self._lock = None
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Write summary.json; NaN and infinity are written as null, because JSON cannot represent these."""
+        """Write summary.json; NaN and infinity are written as null, because JSON cannot represent them."""
         self._write_json("summary.json", summary)
         made = manifest.load(self.path) if self._owner else None
         if made is not None and made.finished:
@@ -463,12 +463,12 @@ class RunFolder:
 
     @property
     def system_file(self) -> Path | None:
-        """File that describes the simulation: a system file, or a description of objects; None if missing."""
+        """File that describes the simulation (a system file or a description of objects); None if missing."""
         return next((self.path / name for name in _SYSTEM if (self.path / name).exists()), None)
 
     @property
     def system(self) -> dict[str, Any]:
-        """Tables of the system file of the run; empty if there is no system file.
+        """Tables of the system file of the run, or an empty dictionary if there is no system file.
 
         Raises:
             FolderError: the system file is not valid TOML or JSON.
@@ -633,7 +633,7 @@ class RunFolder:
         return self._manifest[1]
 
     def _wrong(self, name: str) -> str:
-        """Return how a file differs from the manifest; empty if the file is intact or is not listed."""
+        """Return how a file differs from the manifest, or "" if the file is intact or is not listed."""
         allowed = self._listed().get(name)
         if allowed is None:
             return ""

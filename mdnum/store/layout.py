@@ -86,7 +86,7 @@ class Layout:
         return name in fixed or any(fnmatchcase(name, pattern) for pattern in self.further.split())
 
     def columns(self, table: str) -> Mapping[str, tuple[str, bool]]:
-        """Return the type of each column of a table, and whether values can be null; empty if undeclared."""
+        """Return the type of each column of a table, and whether values can be null (empty if undeclared)."""
         return self._columns.get(table, {})
 
     @cached_property

@@ -373,7 +373,7 @@ def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _repeats(values: Any, value: Any) -> bool:
-    """Return True if a column is a single text or a broadcast array with a given value in all rows."""
+    """Return True if all rows of a column have a given value, and are stored as a text or broadcast array."""
     if isinstance(values, np.ndarray) and values.strides == (0,):
         values = values[0]
     return value is not None and np.ndim(values) == 0 and bool(values == value)

@@ -39,7 +39,7 @@ class EndComparison:
 
     @property
     def inside(self) -> bool | None:
-        """True if all measures are within their tolerances; None if errors are too large for a decision."""
+        """True if all measures are within their tolerances, or None if errors are too large to tell."""
         each = [one.inside for one in self.by_measure.values()]
         return False if False in each else None if None in each else True
 
@@ -72,7 +72,7 @@ class Advice:
 
 
 def end_of(key: str, values: Sequence[Any], given: Mapping[str, str] = {}) -> Any:
-    """Return the value of an axis (a varied choice) that is regarded as converged; None if there is none."""
+    """Return the value of an axis (a varied choice) that is regarded as converged, or None if none is."""
     word = given.get(key, _ENDS.get(key) or _ENDS.get(key.rpartition(".")[2], ""))
     if word == "largest":
         return max(values, key=_size)
@@ -92,7 +92,7 @@ def advise(
     tolerances: Mapping[str, float],
     given: Mapping[str, str] = {},
 ) -> Advice | None:
-    """Return the recommended value of an axis (a varied choice); None if nothing can be recommended.
+    """Return the recommended value of an axis (a varied choice), or None if none can be recommended.
 
     Args:
         values: values of the axis.

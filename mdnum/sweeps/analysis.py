@@ -254,7 +254,7 @@ def _advice(
 
 
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return two settings: all recommended values, and all converged values; empty if the two are equal.
+    """Return the settings of all recommended and of all converged values (none if the settings are equal).
 
     Each choice was varied alone; runs with the two settings show the combined effect of all choices.
     """

@@ -127,7 +127,7 @@ class Workspace:
         return self.place / address
 
     def result(self, address: str) -> dict[str, Any] | None:
-        """Return the stored result of a point; None if the point was not yet computed.
+        """Return the stored result of a point, or None if the point was not computed yet.
 
         Raises:
             FolderError: the file with the result is damaged.
@@ -273,7 +273,7 @@ def boot() -> str:
 
 
 def born(pid: int) -> str | None:
-    """Return the start time of a local process, in ticks; None if no such process exists, "" if unknown."""
+    """Return the start time of a local process in ticks: None if no such process exists, "" if unknown."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -47,9 +47,9 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
     """Return the mean of one measure at each setting, over runs that differ only in their random seed.
 
     The error of a mean is the error estimated from its runs, multiplied by the ratio of the scatter between
-    seeds to the estimated errors. One such ratio is used for all settings of a measure; more settings make
-    the ratio more precise. If this error has fewer degrees of freedom than the scatter between seeds of a
-    single setting, the scatter is used instead.
+    seeds to the estimated errors. One ratio is used for all settings of a measure; more settings make the
+    ratio more precise. If this error has fewer degrees of freedom than the scatter between seeds of a single
+    setting, the scatter is used instead.
 
     Args:
         found: (value, standard error, independent samples) of each run; nan if unknown.
@@ -136,7 +136,7 @@ def difference(one: SeedMean, base: SeedMean) -> tuple[float, float, float]:
 def paired(
     raw: Mapping[K, tuple[float, float, float]], by_seed: Mapping[K, Float[np.ndarray, "seeds"]]
 ) -> dict[K, tuple[float, float, float]]:
-    """Return differences from a reference setting, seed by seed if runs with the same seed are correlated.
+    """Return differences from a reference setting, taken seed by seed if runs with one seed are correlated.
 
     Runs at constant energy with the same initial velocities may remain correlated. For uncorrelated runs, the
     scatter of few differences is a poor estimate of the error. Runs are therefore compared seed by seed only

@@ -1,8 +1,8 @@
 """Classification and validation of a user's energy function by trial calls before the simulation.
 
 The signature of a function does not reveal whether positions are fractional, whether lattice vectors are rows
-or columns, or whether the box is used. Energies computed with wrong assumptions look plausible. Therefore the
-function is tested at the first configuration, with equivalent neighbor lists and slightly different boxes.
+or columns, or whether the box is used. Energies computed with wrong assumptions look plausible. The function
+is therefore tested at the first configuration, with equivalent neighbor lists and slightly different boxes.
 """
 
 from __future__ import annotations

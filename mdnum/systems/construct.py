@@ -219,7 +219,7 @@ def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -
 
 
 def _check_instance(integrator: Integrator, units: Units, where: str) -> None:
-    """Check the numbers of an integrator object in system-file units, by the rules for system files.
+    """Check that the numbers of an integrator object, in system-file units, are allowed in a system file.
 
     Raises:
         InputError: a number is not a finite float64 scalar, or is out of range.
@@ -341,7 +341,7 @@ def common(terms: Mapping[str, Term]) -> Cut:
 
 
 def weights(weight: Any, atoms: Atoms, term: str) -> tuple[Any, ...]:
-    """Return the weight of each atom as `CutPotential` expects it; empty if the term has no weights.
+    """Return the weight of each atom as `CutPotential` expects it (empty if the term has no weights).
 
     Raises:
         InputError: a species or an atom has no weight.
@@ -360,7 +360,7 @@ def weights(weight: Any, atoms: Atoms, term: str) -> tuple[Any, ...]:
 
 
 def closest(model: Any, units: str) -> float:
-    """Return the distance below which two atoms of a structure are considered an error, length."""
+    """Return the distance (a length) below which two atoms of a structure are considered an error."""
     if not isinstance(model, CutPotential | Channels):
         return smallest_distance(model.name, units)
     each = [term.potential for term in model.terms.values()]

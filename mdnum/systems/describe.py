@@ -106,7 +106,7 @@ def plain_leaf(leaf: Any) -> Any:
 
 
 def by_pair(simulation: Simulation, leaf: Any) -> Any:
-    """Return a single number if all pair types have the same value, else one value per pair of species."""
+    """Return one number if all pair types have the same value, otherwise one number per pair of species."""
     values = np.asarray(leaf, np.float64)
     if len(set(values.tolist())) == 1:
         return float(values[0])

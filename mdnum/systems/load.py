@@ -158,7 +158,7 @@ class System:
 
     @property
     def ignored(self) -> list[str]:
-        """Columns of the structure file that look like velocities; empty if the file gives velocities."""
+        """Columns of the structure file that look like velocities (none if the file gives velocities)."""
         structure = self.spec.structure
         return structures.ignored(structure, self.folder) if structure.velocities == "file" else []
 

@@ -218,7 +218,7 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
 
 
 def shared_radius(model: Any, name: str) -> tuple[str, ...]:
-    """Return all terms that share the cutoff radius to which a path refers; empty if only one term has it."""
+    """Return all terms that share the cutoff radius to which a path refers (none if only one term has it)."""
     table, term, key = (*name.split(".", 2), "", "")[:3]
     if table != "terms" or key != "cutoff.radius":
         return ()
@@ -337,7 +337,7 @@ def entry(simulation: Simulation, name: str) -> Entry:
 
 
 def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
-    """Return the paths of entries for each species or pair of species; empty if there is one species."""
+    """Return the paths of entries for each species or pair of species (none if there is one species)."""
     if not simulation.pairwise or simulation.pair_types == 1:
         return {}
     single = _by_species(simulation)

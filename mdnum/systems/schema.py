@@ -159,7 +159,7 @@ class PythonTable(PairPotentialTable):
 
     @property
     def constants(self) -> tuple[str, ...]:
-        """Always empty, because the Python function defines its own parameters."""
+        """Names of constants: always empty, because the Python function defines its own parameters."""
         return ()
 
 

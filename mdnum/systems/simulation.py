@@ -253,7 +253,7 @@ class Simulation:
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """Return a table column with the term of each decision; empty if all terms share decisions."""
+        """Return a table column with the term of each decision (empty if all terms share decisions)."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])
@@ -308,7 +308,7 @@ class Simulation:
 
     @property
     def _guard(self) -> float:
-        """Allowance for rounding errors of displacements when they are compared with the skin, length."""
+        """Allowance (a length) for rounding errors of displacements that are compared with the skin."""
         coarsest = max(unit_roundoff(self.policy.dtype(role)) for role in ("state", "decision"))
         return 16 * coarsest * float(np.linalg.norm(self.decider.reach.coordinate))
 
@@ -368,7 +368,7 @@ class Simulation:
 
     @property
     def continuous(self) -> Simulation:
-        """The system with the same forces, and with an energy that is continuous at the cutoff."""
+        """The system with unchanged forces, and with an energy that is continuous at the cutoff."""
         if not self.pairwise or self.cutoff.smoothness >= 0:
             return self
         return self._ended(lambda end: end.continuous)

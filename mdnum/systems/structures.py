@@ -276,7 +276,7 @@ def repeats(cell: Cell, r_list: float) -> str:
 
 
 def smallest_distance(kind: str, units: str, sigmas: Sequence[float] = ()) -> float:
-    """Return the distance below which two atoms with this potential are considered an error, length."""
+    """Return the distance (a length) below which two atoms with this potential are considered an error."""
     if kind == "soft-sphere":
         # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
         return 1e-9

@@ -1,4 +1,4 @@
-"""Reading and writing system files in TOML format, error messages with line numbers, and overrides.
+"""Reading and writing of system files (TOML), with line numbers in errors and with overrides of keys.
 
 The standard library reads TOML, but does not write TOML and does not record the line of a key. For system
 files, this module writes TOML and finds the line of a key. A table whose keys depend on its kind is a union
@@ -275,7 +275,7 @@ def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
 
 
 def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
-    """Return the possible pydantic models of the table at a key, best match first; empty for a value."""
+    """Return the possible pydantic models of the table at a key, best match first (none for a value)."""
     found, table = [root], data
     for part in key:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}
@@ -310,7 +310,7 @@ def _chosen(options: Sequence[type[TomlTable]], table: Any) -> type[TomlTable] |
 
 
 def _tag_of(options: Sequence[type[TomlTable]]) -> str | None:
-    """Return the key that distinguishes the models of a union ("kind" or "rule"), or None."""
+    """Return the key that distinguishes the models of a union ("kind" or "rule"), or None without one."""
     keys = {name for model in options for name in model.model_fields}
     return next((name for name in ("kind", "rule") if name in keys), None)
 

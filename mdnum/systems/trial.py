@@ -1,7 +1,7 @@
 """Trial calls of a user's energy function at one configuration, with equivalent neighbor lists.
 
 One compiled function computes energy and derivatives, and another computes only the energy, with more padding
-in the list. Both functions are compiled with few optimizations, because only a few dozen calls are needed.
+in the list. The functions are compiled with few optimizations, because only a few dozen calls are needed.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ class Trial:
         return float(energy) * call.unit, -np.asarray(slope) @ by_x * call.unit
 
     def energy(self, x=None, idx=None, cell=None) -> float:
-        """Compute only the energy, which takes a quarter of the time of energy and forces."""
+        """Compute only the energy, in a quarter of the time that energy and forces take together."""
         idx = self._padded(self.inside if idx is None else idx)
         return float(self._alone[0](*self.arguments(idx, x, cell))) * self.call.unit
 
