@@ -1,4 +1,4 @@
-"""Commands of mdnum, called verbs; each verb has a module, and a function in the package `mdnum`.
+"""Commands of mdnum, called verbs; each verb has a module here, and a function in the package `mdnum`.
 
 Each verb is declared in its module (see `mdnum.verbs.frame`) and in the text file of the same name;
 `__init__.toml` explains the tables in text files. No other file lists the commands or the kinds of output
