@@ -166,9 +166,9 @@ class MTK(Barostat):
     Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), with the operator splitting of Tuckerman et al.,
     J. Phys. A 39, 5629 (2006), eq. 38 ff. A step applies the thermostat chains of box and atoms, the kick of
     the box by its excess pressure, the kick of the atoms, the drift in the changing box, and the same
-    operators in reverse order. The inertia of the box is (N_f + 3) k_B T τ_p² (a third of this for a full
-    box). An isotropic box has one degree of freedom, a full box six. The drift over a time t is exact if the
-    box expands at a constant rate a: x(t) = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
+    operators in reverse order. The inertia of the box is (N_f + 3) k_B T τ_p² (a third of this value for a
+    full box). An isotropic box has one degree of freedom, a full box six. The drift over a time t is exact if
+    the box expands at a constant rate a: x(t) = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,

@@ -417,7 +417,7 @@ def _counted_jvp(primals, tangents):
 
 
 class FixedPointJudge(SlotJudge):
-    """Pair decisions by comparison of integers, in fixed-point units; otherwise like `SlotJudge`."""
+    """Pair decisions by comparison of integers in fixed-point units, with the interface of `SlotJudge`."""
 
     def __init__(
         self, decider: FixedPointDecider, limits, cell: Cell, zero, positions, units: FixedPointUnits

@@ -651,7 +651,7 @@ define i64 @called(i64 %frame) {{
 
 @cache
 def _registered(source: str, cpu: str = "") -> str:
-    """Compile a loop and register it with XLA, for this or a named LLVM processor; return its name in XLA."""
+    """Compile a loop, for this or a named processor, and register it with XLA; return its name in XLA."""
     name = f"mdnum_pairs_{cpu}{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     features = "" if cpu else llvm.get_host_cpu_features().flatten()
     machine = llvm.Target.from_default_triple().create_target_machine(

@@ -122,7 +122,7 @@ class PairForce(eqx.Module):
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
     def _near(self, pair: Callable[..., Any], tensor: bool) -> kernel.Shortcut | None:
-        """Return a pair function without minimum image, for near pairs; None if that would save no time."""
+        """Return a pair function without minimum image, for near pairs; None if it would save no time."""
         if not any(self.cell.pbc) or (self.cell.orthorhombic and not tensor):
             return None
 
@@ -354,7 +354,7 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
 
 
 def _virial(made: kernel.PairSums, x: Float[Array, "3 atoms"]) -> list[Float[Array, ""]]:
-    """Return force times displacement in Voigt order, summed over both atoms of all pairs.
+    """Return force times displacement, in Voigt order, summed over all pairs for each of the two atoms.
 
     A displacement is x_j - x_i minus lattice vectors. In the virial, force times position is summed over
     atoms; force times lattice vectors is added in the loop over pairs, for the few pairs across a boundary.

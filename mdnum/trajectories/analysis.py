@@ -272,7 +272,7 @@ class NeighborFlips(AnalysisBase):
 
     @property
     def library(self) -> LibraryFrames:
-        """Reader of the trajectory's frames through MDAnalysis, opened at its first use in this process."""
+        """Reader that obtains frames through MDAnalysis; it is opened when this process first uses it."""
         if self._library is None:
             self._library = LibraryFrames(self._trajectory)
             self._check.labels = self._library.labels(0)

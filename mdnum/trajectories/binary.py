@@ -1,7 +1,7 @@
 """Readers of GROMACS's xtc and trr files that check each frame before it is decoded.
 
 On damaged data, the library that decodes xtc files divides by zero or writes outside its buffers; the process
-ends, and all earlier results are lost. Each frame of a file is therefore checked before it is decoded. The
+ends, and all earlier results are lost. Each frame of a file is checked before it is decoded. The
 compressed stream contains the number of bits of each atom's coordinates, so that the header, the number of
 atoms, the bit counts and the length can be verified without decoding. File damage that leaves a valid stream
 is not detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
@@ -55,7 +55,7 @@ def opened(trajectory: Any) -> XdrFile | None:
 
 
 class XdrFile:
-    """Reader that returns frames of a GROMACS file by number, without reading or writing an index file.
+    """Reader that returns frames of a GROMACS file by number, and neither reads nor writes an index file.
 
     Raises:
         ValueError: the data are invalid or the file ends early (raised by every method).

@@ -203,7 +203,7 @@ class Strides(Sums):
 
 
 def doublings(frames: int) -> list[int]:
-    """Return the strides 1, 2, 4, ... for which the frames span at least four intervals."""
+    """Return the strides 1, 2, 4, ... at which the frames span at least four intervals."""
     strides = [1]
     while (frames - 1) // (2 * strides[-1]) >= 4:
         strides.append(2 * strides[-1])

@@ -1,4 +1,4 @@
-"""Flips of pairs identified by (i, j, shift), for boxes so narrow that several images can be neighbors.
+"""Flips of pairs identified by (i, j, shift), for narrow boxes in which several images can be neighbors.
 
 The ledger of flips identifies an image by its rank in distance, which does not change if atoms are wrapped.
 If one image of a pair leaves and another enters between two frames, the ledger contains no flip, but this

@@ -250,7 +250,7 @@ class ListCheck:
         return row, self.ended(at, tracker.bound, {key: known[key] for key in gone})
 
     def _drops(self, earlier: GivenList, now: GivenList, frame: Frame, before: Frame, placed: Placed) -> bool:
-        """Return True if the list may lack pairs that are inside the cutoff and were in the previous list."""
+        """Return True if the list may lack pairs inside the cutoff that the previous list contained."""
         i, j, image, reach = earlier.i, earlier.j, earlier.image, self._rule.reach
         x, (matrix, inverse) = placed.positions, cell_of(frame)
         if (earlier.shifted, earlier.full) != (now.shifted, now.full):

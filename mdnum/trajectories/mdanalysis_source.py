@@ -268,7 +268,7 @@ def _time_factors(trajectory: Any) -> tuple[float, float]:
 
 
 def left_over(trajectory: Any) -> str | None:
-    """Describe data after the last frame that MDAnalysis finds in a file; return None without such data.
+    """Describe data after the last frame that MDAnalysis finds in a file; return None if there are none.
 
     If the file is line-based text, the MDAnalysis reader is moved to its last frame.
     """
@@ -347,7 +347,7 @@ def _last_bytes(path: Path) -> tuple[bytes, int]:
 
 
 def _text(trajectory: Any) -> tuple[Path, str] | None:
-    """Return (path, format) if MDAnalysis's reader reads the file as lines of text; otherwise None."""
+    """Return (path, format) if MDAnalysis reads the file as lines of text; otherwise return None."""
     path, word = file_of(trajectory), next((one for one in formats_of(trajectory) if one in _LINES), None)
     return None if word is None or path is None else (path, word)
 

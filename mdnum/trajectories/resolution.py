@@ -75,7 +75,7 @@ class Resolution:
         axis in opposite directions; for pairs across the boundary, the box error is added. For float64
         positions, the bound is the rounding error of the distance. A margin to a cutoff has the same error
         bound as a distance; a margin among nearest neighbors (a difference of two distances) has twice the
-        bound. If `atoms` are given, the bound is valid for distances between these atoms.
+        bound. If `atoms` are given, the bound is valid for distances between the given atoms.
 
         Error: the bound holds for pairs across one period of the box; each further period adds the box error.
         """

@@ -170,7 +170,7 @@ class Nearest(_Membership):
 class Capped(_Membership):
     """Directed rule: the neighbors of an atom are the `most` nearest atoms inside a cutoff radius.
 
-    Graph builders with a limited number of neighbors use this rule if they keep the nearest atoms.
+    The rule describes graph builders that limit the number of neighbors and keep the nearest atoms.
     """
 
     radius: float

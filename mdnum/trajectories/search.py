@@ -80,7 +80,7 @@ def search(
     room: int = 0,
     open_room: int = 0,
 ) -> Found:
-    """Find pairs of atoms within a radius, without images of an atom itself (see `lattice.own_images`).
+    """Find pairs of atoms within a radius, except for images of an atom itself (see `lattice.own_images`).
 
     Args:
         kind: pairs to record: `INSIDE` (inside the radius) or `DIRECTED` (within radius + band of each

@@ -140,7 +140,7 @@ def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.nd
 
 
 def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Count pairs inside both at a frame and at a later frame, with or without absences in between.
+    """Count pairs that are inside at a frame and at a later frame, even if they are outside in between.
 
     The ratio of the two results is the intermittent counterpart of `residence`. Counts for disjoint subsets
     of the pairs can be added. Lags are between 0 and frames - 1.

@@ -54,7 +54,7 @@ class AseFrames(Trajectory):
         return raw
 
     def _of_atoms(self, first: Any) -> AtomTable:
-        """Return the atom table of the first frame, and set the units to those of ASE or of an mdnum run."""
+        """Return the first frame's table of atoms, and set the units to those of ASE or of an mdnum run."""
         self._timed = "time" in first.info
         units = METAL
         if self.path.name == "trajectory.traj":
@@ -90,7 +90,7 @@ def _ids(atoms: Any) -> np.ndarray | None:
 
 
 class AseTrajectory(AseFrames):
-    """Trajectory read frame by frame with `ase.io`, or all at once if the format requires this."""
+    """Trajectory read with `ase.io`, frame by frame or, if the format requires it, all frames at once."""
 
     def __init__(self, path: Path, topology: Topology | None, frames: slice, format: str):
         super().__init__(path, topology, frames)

@@ -191,7 +191,7 @@ class Topology:
 
 
 def topology_universe(topology: str | Path) -> Any:
-    """Return a Universe of a topology, without its coordinates, whose reader might write index files.
+    """Return a Universe of a topology, without coordinates, since their reader might write index files.
 
     Raises:
         InputError: MDAnalysis cannot read the file.

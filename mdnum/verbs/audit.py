@@ -1,4 +1,4 @@
-"""`mdnum audit`: tests whether an ASE calculator is safe to run and to differentiate.
+"""`mdnum audit`: tests to find out whether an ASE calculator is safe to run and to differentiate.
 
 The checks of `mdnum.audit.checks.CHECKS` run in order, and each result is saved in the output folder. If an
 audit is interrupted, the completed results are in the folder, and the remaining checks can be run later. A

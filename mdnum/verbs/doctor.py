@@ -1,4 +1,4 @@
-"""`mdnum doctor`: tests of whether this machine computes correct numbers."""
+"""`mdnum doctor`: tests to find out whether this machine computes correct numbers."""
 
 from __future__ import annotations
 

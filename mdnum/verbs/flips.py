@@ -524,8 +524,8 @@ def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
     """Yield (part, number of parts, history): the flips of one neighbor rule, in parts, sorted by pair.
 
-    The table of flips is ordered by frame and may be larger than memory. Each part therefore contains all
-    flips of some of the pairs, and the table is read once for each group of parts that fits into memory.
+    The table of flips is ordered by frame and may be larger than memory. Each part contains all flips of some
+    of the pairs, and the table of flips is read once for each group of parts that fits into memory.
     """
     from mdnum.trajectories.history import History
 
@@ -673,7 +673,7 @@ def _counted(
 
 
 def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
-    """Return names of atoms, such as "GLY 12 CA" (without residues, "CA"), or of residues, such as "GLY 12".
+    """Return names of atoms, such as "GLY 12 CA" ("CA" if there are no residues), or of residues ("GLY 12").
 
     If there are several segments, each name begins with the name of the segment: "A GLY 12".
     """

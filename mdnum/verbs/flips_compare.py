@@ -131,7 +131,7 @@ class ComparisonView(FlipsView):
 
     @property
     def largest(self) -> tuple[str, str]:
-        """Largest separation of an atom in any frame, and the part of it that rounding can explain."""
+        """Largest separation of any atom in any frame, and the separation that rounding can explain there."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))

@@ -32,7 +32,7 @@ TEXTS = Texts(Path(__file__).with_name("flips.py"))
 
 
 def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
-    """Return the atom indices of both selections (None for all atoms)."""
+    """Return the atom indices of the two selections (None for all atoms)."""
     from mdnum.trajectories.selection import select
 
     first, second = (None, None) if between is None else (select(trajectory, one) for one in between)
@@ -216,7 +216,7 @@ class FlipsView(View):
         return f"{number(value)} {self.unit}".rstrip()
 
     def rule(self, one: Mapping[str, Any]) -> str:
-        """Format a rule with its unit, such as "r < 8.5 Å"."""
+        """Format a neighbor rule with its unit of length, such as "r < 8.5 Å"."""
         name = one["rule"]
         return f"{name} {self.unit}" if self.unit and "<" in name and "most" not in name else name
 

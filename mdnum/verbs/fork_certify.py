@@ -42,7 +42,7 @@ def fork_certify(
     policies: Mapping[str, Any] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find, for each precision, the first step whose decisions differ from those of exact arithmetic.
+    """Find, for each precision, the first step at which decisions differ from those of exact arithmetic.
 
     Example:
         >>> mdnum.fork_certify("argon/crystal-108", steps=100)

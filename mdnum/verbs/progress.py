@@ -48,8 +48,8 @@ def reported(progress: Wanted) -> Iterator[Progress | None]:
 class ProgressBar:
     """Progress bar, called as progress(step, steps, info); shows steps/s, flips, list rebuilds, time left.
 
-    If the unit of progress is not a step, info["unit"] names it. The bar is drawn by a separate thread,
-    because a run begins with seconds of compilation without calls.
+    If the unit of progress is not a step, info["unit"] names it. A separate thread draws the bar, because a
+    run begins with seconds of compilation without any reports.
 
     Args:
         stream: where to draw a bar, or to print lines if the stream is no terminal; default stderr, or the

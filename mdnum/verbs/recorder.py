@@ -1,4 +1,4 @@
-"""`mdnum.Recorder`: records the flips of any simulation loop in a folder like that of `mdnum flips`."""
+"""`mdnum.Recorder`: records the flips of any simulation loop in a folder, as `mdnum flips` does."""
 
 from __future__ import annotations
 
