@@ -1,4 +1,4 @@
-"""Table of the causes of findings, read from the file causes.toml in this folder."""
+"""Table of the causes of findings, which is read from the file causes.toml in this folder."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def cause(code: str) -> Cause:
 def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
     """Return, for each finding, the index of the finding that explains it; its own index if there is none.
 
-    A finding is listed under the finding that causes it and is at least as severe (of several causes, the
-    deepest), or under the first finding with the same code. A common cause of several findings is likely but
-    not proven: correct the finding listed first, and repeat the audit.
+    A finding is listed under the finding that causes it, if this one is at least as severe (of several
+    causes, under the deepest), or under the first finding with the same code. A common cause of several
+    findings is likely but not proven: correct the finding listed first, and repeat the audit.
 
     Args:
         findings: code and severity of each finding, in the order in which the findings were made.

@@ -190,7 +190,7 @@ def account(
 
 
 def _unexplained(curve: Curve, low: float, high: float) -> float:
-    """Energy change plus work of the force (Simpson's rule); 0 if the force is -dE/dx of this energy."""
+    """Sum of energy change and work of the force (by Simpson's rule); 0 if the force is -dE/dx."""
     if high <= low:
         return 0.0
     (before, first), (after, last) = curve(low), curve(high)
@@ -426,8 +426,8 @@ def drift(time: Steps, values: Steps) -> Drift:
 def wandering(time: Steps, increments: Steps) -> Drift:
     """Return the drift of a quantity that changes by uncorrelated increments, such as energy jumps.
 
-    The deviation of a random walk from a fitted line is itself a random walk, so the standard error is
-    computed from the sums over blocks instead.
+    The deviation of a random walk from a fitted line is itself a random walk; the standard error is therefore
+    computed from sums over blocks and not from this deviation.
 
     Args:
         increments: at least 16, each of the interval that ends at its time.

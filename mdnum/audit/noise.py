@@ -117,7 +117,7 @@ def along_a_line(
 
 @dataclass(frozen=True)
 class Staircase:
-    """Size of the discrete steps in energies and forces along a line in configuration space."""
+    """Size of the discrete steps by which energies and forces change along a line in configuration space."""
 
     energy: float  # the size of a step, eV; 0 where there are none
     force: float  # of a force component, eV/Å
@@ -195,7 +195,7 @@ def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "c
 def order_change(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, rng: np.random.Generator
 ) -> tuple[float, NoiseFloor]:
-    """Largest energy change when the atoms are reordered, eV, and the noise level if rounding explains it.
+    """Largest energy change (eV) when the atoms are reordered, and the noise level if rounding explains it.
 
     The noise level is 0 if rounding does not explain the energy change, or if no change exceeds the noise
     measured along a line. While atoms move along a line, the rounding error of a sum varies randomly, but an
@@ -267,7 +267,7 @@ def _odd_one(values: Float[np.ndarray, "points"]) -> int:
 def under_jitter(
     subject: CalculatorSubject, atoms: Atoms, size: float, rng: np.random.Generator
 ) -> NoiseFloor:
-    """Largest change of the energy and of a force component under random displacements up to `size` Å.
+    """Largest change of the energy and of a force component for random displacements of up to `size` Å.
 
     Rounding the coordinates of a periodic image or of a rotated structure displaces atoms by up to one unit
     in the last place of the largest coordinate.
@@ -365,7 +365,7 @@ class Digits:
         return 0.0 if self.decimals is None else 10.0**-self.decimals
 
     def grain(self, values: np.ndarray) -> float:
-        """Return the spacing between numbers with these digits, at the largest of the given values."""
+        """Return the spacing between numbers with the given digits, at the largest of some values."""
         return max(self.quantum, 2.0**-self.bits * largest(values))
 
     @property

@@ -19,7 +19,7 @@ _PLACES, _CANDIDATES = 48, 4  # places that are tried, and of them for an ordina
 
 @dataclass(frozen=True)
 class WrongPlaces:
-    """Indices in the list of atoms at which energy or forces are wrong, whichever atom is at this index."""
+    """Indices in the list of atoms at which energy or forces are wrong, whichever atom has the index."""
 
     places: tuple[int, ...]
     count: int  # of atoms

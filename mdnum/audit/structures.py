@@ -262,7 +262,7 @@ def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndar
 
 
 def group(atoms: Atoms) -> int | None:
-    """Return the number of atoms per molecule if a structure consists of identical molecules, else None.
+    """Return the number of atoms per molecule for a structure of identical molecules; otherwise None.
 
     A repeating sequence of species does not imply molecules: a salt crystal can have such a sequence too. The
     atoms of a molecule must be bonded to one another (by covalent radii) and to no other atoms.

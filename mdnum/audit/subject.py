@@ -38,7 +38,7 @@ Answered = tuple[float, Forces] | CalculatorError  # energy and forces, or why t
 
 @dataclass
 class RepeatCounts:
-    """Statistics of repeated evaluations of structures that are identical to the last bit."""
+    """Statistics of repeated evaluations of the same structures, identical to the last bit."""
 
     times: int = 0  # answers that could be compared with an earlier one
     differ: int = 0  # of them, those that are not the same to the last bit
@@ -49,7 +49,7 @@ class RepeatCounts:
 
 
 class Repeats:
-    """Hashes of all structures with the calculator's energies and forces, to compare repeated evaluations.
+    """Hashes of all structures, with their energies and forces, for the comparison of repeated evaluations.
 
     Attributes:
         new: statistics of the first results of new calculator objects, which remember no other structure.
@@ -99,7 +99,7 @@ def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
 def not_repeatable(
     how: str, energy: float, force: float, typical: float, kT: float, **values: Any
 ) -> Observed:
-    """Return the finding that two evaluations of one structure differ; an error if by more than rounding.
+    """Report that two evaluations of one structure differ: as an error, if by more than rounding.
 
     Args:
         how: how the difference was discovered, as the name of a text variant.

@@ -3,8 +3,8 @@
 A pair of atoms may interact differently among many atoms (embedding, angles): an energy jump may have another
 size, and a threshold that is smooth for two atoms may jump. To find jumps among many atoms, atoms and triples
 are moved through the pair thresholds and beyond. To detect a limit on the number of neighbors, one more atom
-is moved past all neighbors of a crowded central atom. A calculator that keeps only k neighbors exchanges the
-k-th neighbor for the moving atom when both are equally far away; then the energy or a force jumps. If a
+is moved past all neighbors of a crowded central atom. A calculator that keeps only k neighbors replaces the
+k-th neighbor by the moving atom when the two are equally far away; then the energy or a force jumps. If a
 calculator keeps the first k neighbors in the order of the list, reordering the atoms reveals the limit.
 """
 
@@ -66,7 +66,7 @@ class Route:
     direction: Float[np.ndarray, "3"]  # unit vector
 
     def at(self, along: float) -> Atoms:
-        """Return the structure with its moving atoms displaced by a given length along the line."""
+        """Return the structure with its moving atoms displaced by a given length along their line."""
         atoms = self.atoms.copy()
         atoms.positions[self.moving] += along * self.direction
         return atoms

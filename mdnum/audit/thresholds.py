@@ -72,7 +72,7 @@ class PairThreshold:
 
 @dataclass(frozen=True)
 class Beyond:
-    """Thresholds of a pair at distances beyond the range of the scan."""
+    """Thresholds of a pair interaction at distances beyond the range of the scan."""
 
     thresholds: tuple[PairThreshold, ...]  # changes and the end, by distance
     # (last distance at which the two feel one another, next one), None without an end
@@ -84,7 +84,7 @@ class Beyond:
 
 @dataclass(frozen=True)
 class PairWalk:
-    """Result of moving two particles from a large distance to close contact."""
+    """Result of moving two particles toward each other, from a large distance to close contact."""
 
     pair: Pair
     thresholds: tuple[PairThreshold, ...]  # by distance
@@ -110,7 +110,7 @@ class PairWalk:
 
 @dataclass(frozen=True)
 class PairWalks:
-    """Results of moving every pair of species from large distances to close contact."""
+    """Results of moving two particles, for every pair of species, from a large distance to close contact."""
 
     walks: tuple[PairWalk, ...]  # one for each pair that was walked
     ways: Ways  # all pairs that there are to walk, and what was left out
@@ -340,7 +340,7 @@ def _with_end(
 
 
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
-    """Extrapolate the distance at which an interaction ends, from a power law of the force.
+    """Extrapolate a power law of the force to find the distance at which an interaction ends.
 
     If the last distance with a nonzero force is within the error of the extrapolation, that distance is
     returned instead: the power law holds only in the limit, while the distance is exact unless the force was
@@ -366,8 +366,8 @@ def _beyond(
 ) -> Beyond | None:
     """Search beyond the scan for a cutoff, as long as one could still remove a relevant energy.
 
-    The result is None if no distance could be evaluated: in a periodic cell, where images of the particles
-    come too near, or if the calculator fails.
+    The result is None if no distance could be evaluated, because images of the particles in a periodic cell
+    come too near or because the calculator fails.
     """
     if pair.periodic:
         return None

@@ -164,7 +164,7 @@ class Planted:
 
 @dataclass(frozen=True)
 class Window:
-    """A step at which runs can be compared, with the principal components and the limit at this step."""
+    """A step at which runs can be compared, and the principal components and the limit for this step."""
 
     step: int  # of the comparison
     space: Space  # components of the ensemble

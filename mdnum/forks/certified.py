@@ -44,7 +44,7 @@ _ROOT_BITS = 400
 
 @dataclass(frozen=True)
 class Horizon:
-    """Last step before the first ambiguous decision of a run, and the number of ambiguous decisions."""
+    """Last step before the first ambiguous decision of a run, and the number of its ambiguous decisions."""
 
     # the last one before the first ambiguous decision; the last one followed where there is none, -1 where
     # the start is ambiguous
@@ -142,7 +142,7 @@ def _but_for_roles(run: Simulation) -> tuple[Any, ...]:
 
 @dataclass(frozen=True)
 class AmbiguousDecision:
-    """A decision for which the margin is smaller than the rounding bound."""
+    """A decision with a margin that is smaller than its rounding bound."""
 
     # step, i, j: which decision; i < j
     step: int
@@ -204,11 +204,11 @@ def exact_margin(
     end: Float[np.ndarray, "3"],
     kind: int = 0,
 ) -> tuple[Fraction, bool]:
-    """Compute the margin of a pair without rounding, and the resulting decision.
+    """Compute without rounding the margin of a pair, and the decision that results from this margin.
 
     The positions are the floating-point numbers of the state, taken as exact. The threshold and the lattice
     vectors are the double-precision numbers of the system, as in the exact program, whatever the dtype of the
-    decision. Expressed as a distance, the margin is accurate to 400 binary digits; the decision is exact.
+    decision. The margin, expressed as a distance, is accurate to 400 binary digits; the decision is exact.
 
     Args:
         start, end: positions of the two atoms, length.

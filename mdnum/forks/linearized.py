@@ -52,7 +52,7 @@ _ULPS = 8.0
 
 @dataclass(frozen=True)
 class StepTangents:
-    """The tangent of a run during the time steps in which one neighbor list is used."""
+    """The tangent of a run during the time steps for which one neighbor list is used."""
 
     segment: Segment  # the steps
     # log of the length of the tangent (positions, and velocities times 30 time steps) at each step, relative
@@ -294,7 +294,7 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
 
 @dataclass(frozen=True)
 class PredictedFlip:
-    """A decision that a perturbation of the start is predicted to flip."""
+    """A decision that is predicted to flip if the start is perturbed."""
 
     # step, i, j: of the decision, i < j
     step: int
@@ -471,6 +471,6 @@ def forecast(
 
 
 def direction(simulation: Simulation, seed: int) -> Float[np.ndarray, "atoms 3"]:
-    """Return random displacements of all atoms, scaled so that the largest one is 1."""
+    """Return random displacements of all atoms, scaled so that the longest displacement has length 1."""
     noise = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
     return noise / np.sqrt((noise**2).sum(axis=1)).max()

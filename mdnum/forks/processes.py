@@ -83,7 +83,7 @@ VARIANTS: tuple[Variant, ...] = (
 
 @dataclass(frozen=True)
 class Ran:
-    """Result of running one variant of a program."""
+    """Result of a run with one variant of a program."""
 
     variant: Variant  # which
     hashes: tuple[str, ...]  # of the positions at steps 1, 2, ..., hexadecimal; empty where it failed
@@ -108,7 +108,7 @@ class Ran:
 
 @result
 class Variants:
-    """Variants of the program for one system, grouped by their results."""
+    """Variants of the program of one system, grouped by equal results."""
 
     rows: tuple[Ran, ...]  # one a variant, in the order asked for
     reference: str  # name of the one that the others are compared with: the first that ran

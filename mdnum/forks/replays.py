@@ -1,8 +1,8 @@
 """Repeat molecular-dynamics runs around a fork: find nearby atoms, override decisions, find minimal causes.
 
-To override a decision of run B, the decision of run A is imposed; run B makes all other decisions itself. The
-smallest set of overridden pairs that keeps run B close to run A is found by bisection and delta debugging,
-the method by which Verrou finds the instructions that cause an error.
+To override a decision of run B, the decision of run A is imposed on B; B makes all other decisions itself.
+The smallest set of overridden pairs that keeps run B close to run A is found by bisection and delta
+debugging, the method by which Verrou finds the instructions that cause an error.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SAMPLES = 400
 
 @dataclass(frozen=True)
 class Neighborhood:
-    """The atoms around the pair whose decision differs first, at the step of the fork."""
+    """The atoms near the pair for which the two runs first decide differently, at the step of the fork."""
 
     # labels of A; the pair first, the others by their distance from its middle, shape (near,)
     atoms: Int[np.ndarray, "near"]
@@ -329,7 +329,7 @@ class _Search:
 
 
 def _required(keys: list[int], search: _Search, until: int) -> list[int]:
-    """Find a sufficient set of pairs by bisecting for one necessary pair after another (QuickXplain).
+    """Find a sufficient set of pairs by bisection, one necessary pair after another (QuickXplain).
 
     Each pair requires about log2(n) runs; for delta debugging, the number of runs is quadratic in that of
     pairs. The method assumes that imposing more decisions never causes a split; it stops after `until` runs.

@@ -52,14 +52,14 @@ class DecisionTape:
         )
 
     def inside(self, step: int) -> Int[np.ndarray, "pairs"]:
-        """Return the sorted integer keys of the pairs that are inside the cutoff at a step."""
+        """Return the sorted integer keys of the pairs that are inside the cutoff at a given step."""
         members = set(self.first.tolist())
         for _, key, entered in self.rows(step):
             (members.add if entered else members.discard)(key)
         return np.array(sorted(members), np.int64)
 
     def rows(self, last: int) -> list[tuple[int, int, bool]]:
-        """Return the step, the pair key and the direction of every flip up to a last step."""
+        """Return the step, the pair key and the direction of every flip up to a given last step."""
         columns = (column[self.step <= last].tolist() for column in (self.step, self.key, self.entered))
         return list(zip(*columns, strict=True))
 

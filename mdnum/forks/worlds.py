@@ -30,7 +30,7 @@ _BALL_ELSEWHERE = ("loss", "gradient", "variants", "precision", "fork")
 
 
 def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Program:
-    """Return the program that runs a simulation or a ball system.
+    """Return the program that makes the run of a simulation or of a ball system.
 
     Args:
         steps: number of time steps of a ball's run; default the number in its file.

@@ -225,7 +225,7 @@ class FiniteDifferences(Method):
 
 
 def _counter(progress: Progress | None, runs: int, phase: str) -> Callable[[], None]:
-    """Return a function to be called once per run, which counts runs and reports progress."""
+    """Return a function that must be called once per run; it counts the runs and reports progress."""
     done = 0
 
     def count() -> None:

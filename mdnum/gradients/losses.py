@@ -41,7 +41,7 @@ class LossFrame(NamedTuple):
 
 
 class LossContext(NamedTuple):
-    """Quantities that a loss can use in addition to a frame, such as masses and the box."""
+    """Quantities that a loss can use in addition to those of a frame, such as masses and the box."""
 
     masses: Float[Array, "atoms"]  # of the atoms
     matrix: Float[Array, "3 3"]  # lattice vectors as rows, length
@@ -72,7 +72,7 @@ class Loss(eqx.Module):
             )
 
     def wrong(self, seen: str, remedy: str | None = None) -> InputError:
-        """Create an error with the given message about options of this loss."""
+        """Create an error about the options of this loss, with the given message."""
         return InputError(seen, remedy=remedy, where=f"loss {self.name}")
 
     @classmethod
@@ -81,7 +81,7 @@ class Loss(eqx.Module):
         return cls(**options)
 
     def looks_at(self, steps: Int[np.ndarray, "rows"], last: int) -> Bool[np.ndarray, "rows"]:
-        """Return, for each step, whether the loss uses this step in a run with the given last step."""
+        """Return, for each step of a run with the given last step, whether the loss uses this step."""
         return (steps >= self.first) & ((steps - self.first) % self.every == 0)
 
     @abstractmethod
@@ -230,7 +230,7 @@ class MeanDensity(MeanVolume):
 
 
 class EinsteinDiffusion(Loss):
-    """Diffusion constant from the slope of the mean squared displacement, length² per unit of time.
+    """Diffusion constant (length² per unit of time) from the slope of the mean squared displacement.
 
     A straight line is fitted to the mean squared displacement since step 0; D is a sixth of the line's slope.
     Motion is ballistic at the beginning of a run: set `first` to a step after the ballistic regime.
@@ -261,7 +261,7 @@ class EinsteinDiffusion(Loss):
 
 
 class GreenKuboDiffusion(Loss):
-    """Diffusion constant as the integral of the velocity autocorrelation, length² per unit of time.
+    """Diffusion constant (length² per unit of time) from the integral of the velocity autocorrelation.
 
     D is a third of the integral of v(0) · v(t), averaged over atoms, from step 0 to step `until`. The
     integral is computed by the trapezoidal rule with a spacing of `every` steps.
@@ -349,7 +349,7 @@ class RadialDistribution(Loss):
         return (jnp.arange(self.bins, dtype=jnp.float64) + 0.5) * self.width
 
     def reason_unavailable(self, around: LossContext) -> str | None:
-        """Return the reason why g(r) is not defined (no volume, or a box that is too small), or None."""
+        """Return why g(r) is not defined (no volume, or too small a box); None if it is defined."""
         if why := super().reason_unavailable(around):
             return why
         half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2

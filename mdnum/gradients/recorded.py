@@ -325,7 +325,7 @@ def joined(crossings: Sequence[Crossings], name: str, *, ledger: bool = False) -
 
 
 def radial_speed(simulation: Simulation) -> float:
-    """Return the root mean square radial speed of a pair of atoms, length per internal time."""
+    """Return the root mean square radial speed (length per internal time) of a pair of atoms."""
     speed2 = float(np.mean(np.sum(simulation.velocities**2, axis=1)))
     return float(np.sqrt(2 * speed2 / 3))
 

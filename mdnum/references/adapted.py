@@ -142,7 +142,7 @@ class EnergyOnNeighborList(ClassicalCalculator):
     """ASE calculator for an energy function, compiled separately and evaluated on ASE's neighbor list.
 
     This reference tests neighbor lists, cutoff decisions and time steps, but not the energy function and its
-    derivatives, since the reference uses jax for these too.
+    derivatives, since mdnum and the reference compute these by jax.
     """
 
     implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012

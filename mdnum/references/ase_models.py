@@ -15,7 +15,7 @@ Differences between mdnum and ASE, and conversions of ASE's results that remove 
 | an energy function | no ASE class | the function on ASE's neighbor list, named in the label |
 | all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), named in the label |
 
-ASE's LennardJones keeps a pair at r == rc (it drops r² > rc²); ASE's neighbor lists do not (r < rc). The
+ASE's LennardJones keeps a pair at r == rc (it drops r² > rc²), but ASE's neighbor lists omit it (r < rc). The
 energy of a pair at r == rc is zero for shifted and switched cutoffs, so only its force can differ.
 """
 

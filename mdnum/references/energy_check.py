@@ -38,7 +38,7 @@ ROUNDINGS = 5.0  # that narrower precision must meet, of those expected of a typ
 
 @dataclass(frozen=True)
 class FrameComparison:
-    """Comparison of one frame between mdnum and a reference."""
+    """Comparison of the results of mdnum and of a reference for one frame."""
 
     frame: str  # which
     # energy, energy_reference: total energies (eV or ε)
@@ -344,7 +344,7 @@ def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
 
 
 def _rollout(simulation: Any, steps: int) -> Iterator[tuple[ndarray, ndarray, float]]:
-    """Yield unwrapped positions, velocities (atoms, 3) and potential energy at every step, from step 0 on."""
+    """From step 0, yield unwrapped positions, velocities (atoms, 3) and potential energy at every step."""
     from mdnum.rollout.engine import Engine, unwrapped
 
     for segment in Engine(simulation, steps).segments():
@@ -436,7 +436,7 @@ def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = 
 
 
 def _forces(simulation: Simulation) -> Reference:
-    """Return ASE's class as the reference if it is fast enough; for Tersoff and mixtures, plain numpy."""
+    """Return ASE's class as the reference if it is fast enough; plain numpy for Tersoff and mixtures."""
     judge = reference(simulation)
     slow = isinstance(simulation.model, Tersoff) or len(simulation.symbols) > 1
     return independent(simulation) if slow and not isinstance(simulation.potential, EmbeddedAtom) else judge
@@ -448,7 +448,7 @@ def _sudden(position: Sequence[float], floor: float) -> int | None:
 
 
 def _growth(position: Sequence[float]) -> float:
-    """Return the factor by which the deviation grows per step, from a line fitted to its logarithm."""
+    """Fit a line to the logarithm of the deviation; return the factor by which it grows per step."""
     tail = np.array(position[len(position) // 2 :])
     if len(tail) < 3 or not (tail > 0).all():
         return 1.0

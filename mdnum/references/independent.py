@@ -31,7 +31,7 @@ from mdnum.md.potentials import Channels, CutPotential, LennardJones, Morse, Pai
 
 @dataclass(frozen=True)
 class Edges:
-    """A full neighbor list, with each pair in both directions."""
+    """A full neighbor list, which contains each pair in both directions."""
 
     symbols: ndarray  # chemical symbol of each atom
     i: ndarray  # atom an edge starts from, ascending
@@ -165,7 +165,7 @@ class PairForm:
 
 
 def pair_forms(model: CutPotential, symbols: Sequence[str], compare: str) -> dict[tuple[str, str], PairForm]:
-    """Return the interaction for every two species, in both orders of the species.
+    """Return the interaction of every two species, in both orders of the species.
 
     Args:
         symbols: symbols of the species, sorted.
@@ -295,7 +295,7 @@ class _OneSpecies(Model):
 
 
 class StillingerWeberModel(_OneSpecies):
-    """Stillinger-Weber potential of one species: Physical Review B 31, 5262 (1985), equations 2.1 to 2.5."""
+    """Stillinger-Weber potential for one species: Physical Review B 31, 5262 (1985), equations 2.1 to 2.5."""
 
     def within(self, edges, unit):
         own = self.constants
@@ -325,7 +325,7 @@ class StillingerWeberModel(_OneSpecies):
 
 
 class TersoffModel(_OneSpecies):
-    """Tersoff's potential of one species: Physical Review B 38, 9902 (1988), in LAMMPS notation."""
+    """Tersoff's potential for one species: Physical Review B 38, 9902 (1988), in LAMMPS notation."""
 
     def within(self, edges, unit):
         own, r = self.constants, edges.r

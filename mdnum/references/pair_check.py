@@ -32,7 +32,7 @@ _NEARBY = 3  # ulps either side of r_cut in which oriented pairs are placed
 
 @dataclass(frozen=True)
 class Search:
-    """A neighbor list, called with positions and cell in the form that this list requires."""
+    """A neighbor list that is called with positions and cell in the form that it requires."""
 
     listed: PairList
 

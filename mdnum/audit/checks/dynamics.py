@@ -464,8 +464,8 @@ def run(
 class RigidGroups:
     """ASE constraint that fixes all interatomic distances within groups of equal size, such as molecules.
 
-    The class FixBondLengths of ASE treats one bond at a time in Python; this class treats one bond of every
-    group at once, which is a hundred times faster for water.
+    ASE's class FixBondLengths treats one bond at a time in Python; this class treats one bond of every group
+    at once, and is a hundred times faster for water.
 
     Source:
         H. C. Andersen, Rattle: a velocity version of the Shake algorithm, J. Comput. Phys. 52, 24 (1983).
@@ -518,7 +518,7 @@ class RigidGroups:
                 return
 
     def adjust_forces(self, atoms: Atoms, forces: Float[np.ndarray, "atoms 3"]) -> None:
-        """Leave the forces unchanged, since constrained runs adjust the momenta instead."""
+        """Leave the forces unchanged, since constrained runs adjust the momenta and not the forces."""
 
     def todict(self) -> dict[str, Any]:
         """Return the constraint as a dictionary in ASE's format for constraints."""

@@ -257,7 +257,7 @@ def slope(
 def _best(
     gaps: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
 ) -> tuple[int, float]:
-    """Return index and error of the most accurate finite-difference step, if other steps agree with it.
+    """Return the index and error of the most accurate finite-difference step, if other steps confirm it.
 
     If the energy jumps at flips, two finite-difference steps may include the same jumps by chance and give
     the same wrong slope. A wrong force, in contrast, causes equal deviations for all sufficiently accurate

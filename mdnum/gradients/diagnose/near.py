@@ -99,9 +99,9 @@ class Turns:
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """Magnitude of the possible contribution of the two crossings at each turning point. If distance and
-        cutoff agree within the uncertainty, the pair is assumed to pass the cutoff by 1 % of the uncertainty;
-        otherwise the value is the change of the contribution in a run with shorter time steps.
+        """Magnitude of the contribution that the two crossings at each turning point may have. If distance
+        and cutoff agree within the uncertainty, the pair is assumed to pass the cutoff by 1 % of the
+        uncertainty; otherwise the value is the change of the contribution in a run with shorter time steps.
         """
         bend, reach = self.table["bend"], self.reach
 

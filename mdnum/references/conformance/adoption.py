@@ -1,4 +1,4 @@
-"""The conformance suite for the tests of a library: a class to subclass, with one test per topic.
+"""The conformance suite for a library's own tests: a class to subclass, with one test per topic.
 
     from mdnum.references.conformance import ListLimits, NeighborListConformance
     from mylibrary import neighbor_list

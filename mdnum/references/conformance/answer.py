@@ -23,7 +23,7 @@ _ROWS = "pairs one by one are to be tuples (i, j) in a list, or rows of an array
 
 
 class Malformed(Exception):
-    """Raised if a neighbor list returns a value that is not a list of pairs; the message has the reason."""
+    """Raised if a neighbor list returns a value that is not a list of pairs; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ def read(given: Any) -> ListAnswer:
     vector), or i and j with some of the optional arrays. The arrays are recognized by shape: one number per
     row is a distance, the first array with three integers per row is the shift, and another array with three
     numbers per row is the vector. A mapping with the keys i, j, shift, distance and vector, or an object with
-    attributes of these names, is also accepted. Single pairs are accepted too: a list of tuples (i, j), or
-    one array with a row (i, j) for each pair. A Python list of lists is always read as arrays, not as pairs,
-    since some such lists would be ambiguous.
+    attributes of these names, is also accepted. A list of tuples (i, j), or one array with a row (i, j) for
+    each pair, is accepted too. A Python list of lists is always read as arrays, not as pairs, since some such
+    lists would be ambiguous.
 
     Raises:
         Malformed: the value has none of the supported forms.

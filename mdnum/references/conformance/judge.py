@@ -149,8 +149,8 @@ def without_numbers(text: str) -> str:
 def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
     """Return all errors in the pairs from a neighbor list; the result is empty if there are no errors.
 
-    A pair within rounding error of the cutoff (`Truth.scale` times the unit roundoff) may be listed or not,
-    but consistently for both of its atoms.
+    A pair within rounding error of the cutoff (`Truth.scale` times the unit roundoff) may be listed or
+    omitted, but its two atoms must agree.
 
     Args:
         truth: exact pairs, including all distances at which pairs may be listed.

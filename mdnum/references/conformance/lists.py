@@ -69,7 +69,7 @@ class ListLimits:
     roomy: float = np.inf  # no box of more cells of r_cut than this along all axes together
 
     def refusal(self, case: Case) -> str | None:
-        """Return the limit that a test case exceeds, as text; None if the test case is within all limits."""
+        """Return, as text, the limit that a test case exceeds; None if the test case is within all limits."""
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
@@ -159,7 +159,7 @@ LISTS: Registry[PairList] = Registry("neighbor list", "mdnum.neighbor_lists")
 
 
 def source_of(made: Any) -> str:
-    """Return the source code of a function or class without decorators; empty if it is not available."""
+    """Return the source code of a function or class without decorators; "" if there is no source code."""
     try:
         lines = inspect.getsource(made).splitlines(keepends=True)
     except (OSError, TypeError):

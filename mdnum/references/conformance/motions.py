@@ -58,7 +58,7 @@ def _two(apart: float) -> ndarray:
 
 
 def _beside(apart: float) -> ndarray:
-    """Return positions of two atoms at a given distance along x, with the first atom at `_MIDDLE`."""
+    """Return the positions of two atoms at a given distance along x; the first atom is at `_MIDDLE`."""
     return np.array([_MIDDLE, _MIDDLE + np.array([apart, 0, 0])])
 
 
@@ -205,7 +205,7 @@ def _reuse() -> Iterator[Case]:
 
 
 def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = None) -> Case:
-    """Return a test case that builds a new list at every step, or only at steps for which a skin is given."""
+    """Return a test case that builds a new list at every step, or only at steps that have a skin."""
     case = sequence(name, "reuse", path, _L, _R, max(filter(None, skins)) if skins else _SKIN)
     starts = zip(case.stills, skins or [None] * len(path), strict=True)
     stills = (replace(still, fresh=skin is not None or not skins, skin=skin) for still, skin in starts)

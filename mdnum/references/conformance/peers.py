@@ -135,7 +135,7 @@ def ase_primitive_list(positions, cell, pbc, r_cut):
 
 @peer("vesin", "vesin-half")
 def vesin_cells(positions, cell, pbc, r_cut, half=False):
-    """The cell list of vesin, in which every pair is listed from both atoms."""
+    """The cell list of vesin, which lists every pair once for each of its two atoms."""
 
     from vesin import NeighborList
 

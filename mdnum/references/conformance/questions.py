@@ -177,7 +177,7 @@ def vast() -> Iterator[Case]:
 def lattice(edge: int, seed: int = 0) -> Case:
     """Return a cubic lattice with vacancies at integer positions; atom order and images are random.
 
-    The neighbors of each atom are on the 26 sites around it; they are found by indices modulo the edge,
+    The neighbors of each atom are on the 26 sites around it; indices modulo the edge give the neighbors
     without search or rounding.
 
     Args:

@@ -368,7 +368,7 @@ def _keeps_order(examiner: Examiner) -> bool | None:
 
 
 def _too_long(report: Report, case: Case) -> str | None:
-    """Return a reason if a large test case would take too long (judged from the previous one), or None."""
+    """Return why a large test case would take too long (judged by the previous one); None if it would not."""
     if report.large is None:
         return None
     atoms, seconds = report.large
