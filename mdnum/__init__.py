@@ -7,7 +7,7 @@ A simulation is created from Python objects, or from a system file, as follows:
     >>> sim = mdnum.build("argon/liquid-864")
     >>> sim = mdnum.changed(sim, {"cutoff.radius": 8.0})
 
-Functions take a simulation, or the name or path of a system file, and write a folder:
+A function takes a simulation, or the name or path of a system file, and writes its results to a folder:
 
     run                 simulate, record every flip, compare with ASE
     fork, fork_...      compare two runs that differ in one choice; maps, certificates, forecasts

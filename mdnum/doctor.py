@@ -1,7 +1,7 @@
 """`mdnum doctor`: tests of whether this installation computes correct numbers.
 
-All tests of `mdnum doctor` are computations on the current machine. Versions that are known to be faulty are
-also reported, but no version is assumed to be correct.
+All tests of `mdnum doctor` are computations on the current machine. Package versions that are known to be
+faulty are also reported, but no version is assumed correct.
 
 Error bounds require that +, -, *, / and sqrt are each correctly rounded, and that sums are not reordered. On
 CPUs, XLA rounds correctly and does not reorder sums, but contracts a*b+c and rewrites divisions by constants.
@@ -274,8 +274,8 @@ def subnormals() -> DoctorRow:
     """Test whether numpy and jax keep numbers below 2.2e-308, or flush them to zero.
 
     XLA flushes subnormal numbers to zero on CPUs, and a loaded library can make the processor flush all
-    subnormal numbers. The test also uses arrays that are large enough for XLA's own threads. Results are
-    compared as integers, because a processor that treats subnormals as zero considers them zero.
+    subnormal numbers. The test also uses arrays so large that XLA uses its own threads. Results are compared
+    as integers, because a processor that treats subnormals as zero considers them zero.
     """
 
     def power(exponent: int, count: int) -> np.ndarray:

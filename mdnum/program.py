@@ -3,7 +3,7 @@
 Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. An
 object with this interface (a program) determines all bits of a run, including the initial state. Analyses
 such as forks and parameter maps use only the interface `Program`. Decisions, such as whether a pair is inside
-the cutoff, are an input of each time step. Therefore the decisions of one program can be recorded and imposed
+the cutoff, are an input of each time step. The decisions of one program can therefore be recorded and imposed
 on another program. The implementations are `mdnum.rollout.program.MdProgram` and
 `mdnum.ball.program.BallProgram`.
 """
@@ -162,7 +162,7 @@ class PairRows:
         return len(self.cross)
 
     def until(self, last: int) -> PairRows:
-        """Return the part of the record up to a time step."""
+        """Return the part of the record from the start up to a time step."""
         rows = last - self.first + 1
         if rows >= self.rows:
             return self

@@ -201,7 +201,7 @@ class Registry(Generic[T]):
         return (inspect.getdoc(value) or "").partition("\n")[0].rstrip(".")
 
     def package(self, name: str) -> str:
-        """Return the name of the package that provides the value with this name."""
+        """Return the name of the package that provides the value with a given name."""
         return "mdnum" if name in self._own else _package(self._added()[name])
 
 

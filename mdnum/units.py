@@ -107,7 +107,7 @@ _ALL = {units.name: units for units in (METAL, LJ, BALL)}
 
 
 def get(name: str) -> Units:
-    """Return the unit system with this name ("metal", "lj" or "ball").
+    """Return the unit system with a given name ("metal", "lj" or "ball").
 
     Raises:
         InputError: there is no unit system with this name.

@@ -1,8 +1,8 @@
 """Closed-form motion of a bouncing ball, and the derivatives of this motion with respect to all parameters.
 
-A ball starts at height y0 above the floor (at height 0) with velocity v0, under gravity g. It reaches the
-floor at t_1 = (v0 + s) / g with speed s = sqrt(v0² + 2 g y0). With the coefficient of restitution e, impact n
-has speed e^(n-1) s, and the time between impacts n and n + 1 is 2 e^n s / g. Therefore
+A ball starts at height y0 above the floor (at height 0) with velocity v0, under gravity g. The ball reaches
+the floor at t_1 = (v0 + s) / g with speed s = sqrt(v0² + 2 g y0). With the coefficient of restitution e,
+impact n has speed e^(n-1) s, and the time between impacts n and n + 1 is 2 e^n s / g. Therefore
 
     t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e),
 
@@ -167,7 +167,7 @@ class ExactImpact(_Motion):
         return self._known(at_rest)[0]
 
     def bounces(self, t: Times) -> Float[np.ndarray, "*times"]:
-        """Return the number of impacts up to and including time t (s); infinite once the ball is at rest."""
+        """Return the number of impacts up to and including time t (s), which is infinite at rest."""
         t = _later(t)
         at = self._at
         first, speed = (part.real for part in _down(at))

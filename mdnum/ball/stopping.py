@@ -66,7 +66,7 @@ class StopRule(Protocol):
     def measure(
         self, terms: Float[Array, "balls"], accumulate: Any, decision: Any, zero: Int[Array, ""]
     ) -> Float[Array, "..."]:
-        """Return the residual in the dtype `decision`, from terms summed in the dtype `accumulate`."""
+        """Return the residual, rounded to the dtype `decision`, of terms summed in the dtype `accumulate`."""
         ...
 
     def threshold(self, first: Float[Array, "..."], iteration: Int[Array, "..."]) -> Float[Array, "..."]:

@@ -105,7 +105,7 @@ class World(eqx.Module):
         return None
 
     def has(self, name: str) -> bool:
-        """Return True if this model has a parameter of this name."""
+        """Return True if this model has a parameter of a given name."""
         return self._place(name) is not None
 
     @property

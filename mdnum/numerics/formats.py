@@ -30,7 +30,7 @@ class FloatFormat:
 
     @property
     def emin(self) -> int:
-        """Exponent of the smallest normal number of the format."""
+        """Exponent (of 2) of the smallest normal number of the format."""
         return 2 - 2 ** (self.exponent - 1)
 
     @property

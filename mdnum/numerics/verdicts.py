@@ -245,7 +245,7 @@ def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
     """Fit the exponential growth rate of the separation of two runs before saturation.
 
     The fit uses steps before the split with a separation between 1e-12 and 0.1 times the tolerance, after the
-    last step with a smaller separation. A low r_squared indicates a fit to noise.
+    last step with a smaller separation. A low r_squared indicates that noise was fitted.
 
     Args:
         separation: of each step, length; NaN after a run ended.

@@ -132,7 +132,7 @@ class Scan:
 
     @property
     def ratios(self) -> Float[np.ndarray, "flips"]:
-        """Ratio of |margin| to the rounding bound, for each flip."""
+        """Ratio of |margin| to the bound on its rounding error, for each flip."""
         self._ratios = [np.concatenate(self._ratios or [np.zeros(0)])]
         return self._ratios[0]
 

@@ -286,7 +286,7 @@ def _region(axes: Axes, region: Region) -> None:
 
 
 def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
-    """Return the edges of cells around given centers, halfway between neighbors on the axis scale."""
+    """Return the edges of cells around given centers, halfway between adjacent centers on the axis scale."""
     centers = np.log(centers) if log else np.asarray(centers, float)
     half = np.diff(centers) / 2 if len(centers) > 1 else np.array([0.5])
     edges = np.concatenate(

@@ -132,7 +132,7 @@ class Texts:
         horizontals: Iterable[tuple[float, str]] = (),
         **values: Any,
     ) -> Plot:
-        """Return the figure with this name in the table [plots], with values inserted into its texts."""
+        """Return the figure with a given name in the table [plots], with values inserted into its texts."""
         told: Any = {part: fill(text, values) for part, text in self.entries["plots"][name].items()}
         marks = {"verticals": tuple(verticals), "horizontals": tuple(horizontals)}
         return Plot(name, series=tuple(series), **marks, **told)
@@ -160,7 +160,7 @@ class Texts:
         /,
         **values: Any,
     ) -> Browse:
-        """Return the searchable table with this name in [browse], with the columns present in `rows`.
+        """Return the searchable table with a given name in [browse], with the columns present in `rows`.
 
         Args:
             rows: columns of equal length; a column "pair" is made from two of these columns.

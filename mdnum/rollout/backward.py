@@ -177,7 +177,7 @@ class BackwardRun:
         self._check_bath()
 
     def _change_bath(self) -> None:
-        """Restore the thermostat's stored bath (bits lost by friction) at steps at which it was emptied."""
+        """Restore the thermostat's stored bath (bits lost by friction) at steps that emptied the bath."""
         step, period = int(self.back.step), self.simulation.propagator.pause
         if period is None or step % int(period):
             return

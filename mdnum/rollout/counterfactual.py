@@ -160,7 +160,7 @@ class Counterfactual:
 
 
 def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species species"]:
-    """Return the cutoff radius for each pair of species and group of potential terms, length."""
+    """Return the cutoff radius (length) for each pair of species and each group of potential terms."""
     radii = np.array(simulation.decider.r_cut).reshape(simulation.channels, -1)
     count = len(simulation.symbols)
     if radii.shape[1] == 1:

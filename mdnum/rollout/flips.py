@@ -202,7 +202,7 @@ class PairRecorder:
         return self._once(int(count_set(bits)))
 
     def _once(self, both: int) -> int:
-        """Return the number of pairs, given a number that counts each pair twice."""
+        """Return the number of pairs, given a count in which each pair occurs twice."""
         if both % 2:
             raise MdnumError(
                 "a pair is inside the cutoff for only one of its two atoms", remedy="Report this as a bug"
@@ -216,12 +216,12 @@ class PairRecorder:
         return np.array([self._once(int(both)) for both in segment.rows_of("inside")], np.int64)
 
     def _stacked(self, cells: Sequence[Cell]) -> tuple[Any, Any]:
-        """Return boxes in float64, and also in the dtype of cutoff decisions if this is not float64."""
+        """Return boxes in float64, and also in the dtype of cutoff decisions if this dtype differs."""
         dtype = self.simulation.decider.dtype
         return stacked(cells), None if dtype == "float64" else stacked(cells, dtype)
 
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
-        """Bounds on the rounding errors of r or r² (the compared quantity) at each step."""
+        """Bounds, at each step, on the rounding errors of r or r², whichever is compared with the cutoff."""
         decider = self.simulation.decider
         if not decider.grows and not segment.cells:
             return np.repeat([decider.bounds], segment.rows, axis=0)

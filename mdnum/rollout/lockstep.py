@@ -1,8 +1,8 @@
 """Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other run imposed.
 
 Each run without imposed decisions has the same bits as a single run, because neighbor lists and compiled
-loops are separate. Cutoff decisions are compared by means of their changes in both runs. Therefore the cost
-of the comparison does not depend on the number of pairs, and only pairs with different decisions are stored.
+loops are separate. Cutoff decisions are compared by means of their changes in both runs. The cost therefore
+does not depend on the number of pairs, and only pairs with different decisions are stored.
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ class MdProgram:
         return list(zip(whole[: len(free)], whole[len(free) :], strict=True))
 
     def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
-        """Return copies of the simulation with random displacements of the atoms of at most about `size`.
+        """Return copies of the simulation with atoms displaced at random, by at most about `size`.
 
         The largest displacement is at least one ulp, because rounding removes smaller displacements.
         """

@@ -118,7 +118,7 @@ def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, fli
 
 
 def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dict[str, Any]:
-    """Return the contents of summary.json, except the entries of reference methods and the report page."""
+    """Return the contents of summary.json, except the entries that reference methods and the report add."""
     tally, health, budget = done.tally, done.health, done.budget
     jumps = energy_jump, force_jump = simulation.jumps()
     pairs = pair_names(simulation.symbols)

@@ -98,7 +98,7 @@ def taken(ahead: list[Rows], last: int) -> Rows | None:
 
 
 class Track:
-    """Reader of a run, which returns time steps and flips in order.
+    """Reader of a run, which returns time steps and flips in the order of time.
 
     Args:
         simulation: the run.

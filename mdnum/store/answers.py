@@ -2,8 +2,8 @@
 
 A command with many tests (`audit`, `conform`) keeps its options and results in one dataclass of plain values.
 A result that should not be lost is written at once, and other results about once per second. A resumed
-command restores all values with their types, and runs the tests that have no result. Tables in the folder are
-created from the results.
+command restores all values with their types, and runs the tests that have no result yet. Tables in the folder
+are created from the results.
 """
 
 from __future__ import annotations

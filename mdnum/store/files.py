@@ -300,7 +300,7 @@ def place(path: Path) -> tuple[Path, str]:
 
 
 def foretell(path: Path, new: str) -> None:
-    """Add a digest to the manifest for a file that will be replaced; the present digest remains valid."""
+    """Add the digest of a file's new contents to the manifest; the digest of the old ones remains valid."""
     root, name = place(path)
     if name == NAME or not (root / NAME).exists():
         return

@@ -294,7 +294,7 @@ class TableStream:
             return file.metadata.num_rows
 
     def _replace(self, path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
-        """Write rows into a file of this table; its digest is listed in the manifest before the file exists.
+        """Write rows into a file of this table; the file's digest is in the manifest before the file exists.
 
         Every page of the file has a checksum that readers can verify.
         """

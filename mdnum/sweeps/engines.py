@@ -1,4 +1,4 @@
-"""Execution of tasks by a `concurrent.futures.Executor`; by default in processes on all cores.
+"""Execution of tasks by a `concurrent.futures.Executor`, by default in processes on all cores.
 
 An engine (executor) only starts processes. Whether a point of a sweep was computed is determined from the
 folder of the point, not from the engine, so that a worker process that dies loses only its current point.

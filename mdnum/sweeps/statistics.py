@@ -200,7 +200,7 @@ def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Diff
 
 
 def effects(places: Float[np.ndarray, "points axes"], values: Float[np.ndarray, "points"]) -> list[Any]:
-    """Return the change of a measure between the ends of each axis, from a linear fit to all points.
+    """Return the change of a measure between the ends of each axis (varied choice), from a linear fit.
 
     Args:
         places: position of each point along each axis, from 0 to 1.

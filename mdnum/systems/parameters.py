@@ -116,7 +116,7 @@ def _is_number(simulation: Simulation, name: str) -> bool:
 
 
 def number(simulation: Simulation, name: str) -> float:
-    """Return the value of a scalar parameter (a path in `numbers`)."""
+    """Return the value of a scalar parameter, given its path (one of `numbers`)."""
     return float(value(simulation, name).flat[0])
 
 
@@ -158,7 +158,7 @@ def _by_species(simulation: Simulation) -> set[str]:
 
 
 def unit(simulation: Simulation, name: str) -> str:
-    """Return the unit of a parameter: "" for a pure number, the name in brackets if the unit is unknown."""
+    """Return the unit of a parameter: "" for a pure number, its name in brackets if the unit is unknown."""
     table, whole = name.partition(".")[0], entry(simulation, name).whole
     last = whole.rpartition(".")[2]
     field = simulation.integrator.keys().get(last) if table == "dynamics" else None
@@ -197,7 +197,7 @@ def leaf_of(model: Any, name: str) -> Any:
 def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bool = True) -> dict[str, Any]:
     """Return the parameter arrays of pair potentials and of their cutoffs, by path.
 
-    `shared` includes arrays that do not depend on the pair type, `species` includes arrays with one entry per
+    `shared` adds arrays that do not depend on the pair type; `species` adds arrays with one entry per
     species. The path `cutoff.radius` is the radius of all terms if all radii agree. If radii differ, each
     term has its own path, and terms with equal radii refer to the same array.
     """

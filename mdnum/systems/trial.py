@@ -34,7 +34,7 @@ _MORE = 8
 
 
 class AdmissionError(InputError):
-    """Error for an energy function that cannot be simulated; `code` is the reason, `values` are numbers."""
+    """Error for an energy function that cannot be simulated, with reason (`code`) and numbers (`values`)."""
 
     def __init__(self, code: str, name: str, **values: Any):
         entry = _TEXTS[code]
