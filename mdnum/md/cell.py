@@ -72,7 +72,7 @@ class Cell(eqx.Module):
 
     @property
     def widths(self) -> Float[np.ndarray, "3"]:
-        """Perpendicular widths of the box along periodic axes, length; infinity along nonperiodic axes."""
+        """Perpendicular widths of the box (length) along periodic axes; infinity along nonperiodic axes."""
         with np.errstate(divide="ignore"):
             widths = 1.0 / np.linalg.norm(np.asarray(self.inverse), axis=0)
         return widths
@@ -83,7 +83,7 @@ class Cell(eqx.Module):
 
     @property
     def nearby2(self):
-        """Square of half the smallest perpendicular width, reduced by a margin for rounding (inside jit).
+        """Square of half the smallest perpendicular width, reduced to allow for rounding; for use in jit.
 
         `minimum_image` returns displacements shorter than half a width unchanged, bit for bit.
         """
@@ -162,7 +162,7 @@ class Cell(eqx.Module):
     def spent(self, x, reference: Cell, home, r_list):
         """Return the largest displacement relative to the box plus half the strain loss (inside jit).
 
-        A neighbor list is complete as long as the returned length is at most half the skin.
+        A neighbor list is complete as long as the returned length is at most half the skin thickness.
 
         Args:
             x, home: present positions, in this box, and positions when the list was built, in the box

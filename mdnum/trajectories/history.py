@@ -214,8 +214,8 @@ def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -
     """Count the decisions that change if all atoms move in straight lines for a short time.
 
     The root mean square displacement is the length `move`, which should be small compared with the distance
-    over which paths bend, but large enough that many pairs cross the cutoff. `count` returns the number of
-    flips between two frames.
+    over which the paths of atoms bend, but large enough that many pairs cross the cutoff. `count` returns the
+    number of flips between two frames.
 
     Returns:
         (number of flips, duration of the motion in the time unit of the velocities); None if no atom moves.

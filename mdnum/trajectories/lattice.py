@@ -260,7 +260,7 @@ class Participants:
 
 @dataclass(frozen=True)
 class Placed:
-    """Positions of the atoms to which a rule applies, and the reduced lattice, at one frame."""
+    """Positions of the atoms to which a membership rule applies, and the reduced lattice, at one frame."""
 
     positions: Float[np.ndarray, "atoms 3"]  # as stored, anywhere, length
     lattice: ReducedLattice  # of the box

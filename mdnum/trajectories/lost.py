@@ -4,8 +4,8 @@ Missed flips are defined relative to the flips found if every time step of the r
 estimates (thinning, persistence, velocities and flux), the test systems used to choose the constants, and the
 measured coverage are described in docs/lost-flips.md. Thinning and persistence are extrapolated to shorter
 frame intervals t with a family of laws for the rate of observed flips, (1 + (t/τ)^p)^(-s/p). The exponent p
-is 2 for smooth paths and 1 for abrupt velocity changes; s is 1/2 for diffusive motion and 1 for atoms that
-stay at their sites. The laws that fit the data are averaged.
+is 2 for smooth atomic motion and 1 for abrupt velocity changes; s is 1/2 for diffusive motion and 1 for atoms
+that stay at their sites. The laws that fit the data are averaged.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Membership rules, which define the neighbors of an atom and the margin of every decision.
 
-A rule is *symmetric* (i and j are neighbors of each other) or *directed* (j may be a neighbor of i although i
-is not a neighbor of j). Squared distances are compared in float64. The margin of a pair at distance r is a
-length, positive for neighbors:
+A membership rule is *symmetric* (i and j are neighbors of each other) or *directed* (j may be a neighbor of i
+although i is not a neighbor of j). Squared distances are compared in float64. The margin of a pair at
+distance r is a length, positive for neighbors:
 
     CutoffRule      r_cut - r
     SpeciesCutoffs  r_cut of the two species - r
@@ -66,8 +66,8 @@ class _Membership:
 class CutoffRule(_Membership):
     """Rule by which a pair is inside if its distance is less than `radius` (length).
 
-    The rule compares r² with radius² in float64, as most codes do. A pair whose distance equals the radius
-    within rounding error is marked as ambiguous.
+    Membership is decided by comparing r² with radius² in float64, as in most codes. A pair whose distance
+    equals the radius within rounding error is marked as ambiguous.
     """
 
     radius: float
@@ -170,7 +170,7 @@ class Nearest(_Membership):
 class Capped(_Membership):
     """Directed rule: the neighbors of an atom are the `most` nearest atoms inside a cutoff radius.
 
-    The rule describes graph builders that limit the number of neighbors and keep the nearest atoms.
+    Graph builders that limit the number of neighbors and keep the nearest atoms follow this rule.
     """
 
     radius: float

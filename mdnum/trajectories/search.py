@@ -214,7 +214,7 @@ class Chosen(NamedTuple):
 def nearest(
     placed: Placed, who: Participants, rule: Nearest | Capped, *, band: float, bound: float
 ) -> Chosen:
-    """Find as many nearest neighbors of each center as the rule defines; for arguments, see `search`."""
+    """Find the number of nearest neighbors of each center that the membership rule sets; see `search`."""
     positions, lattice = placed.positions, placed.lattice
     atoms, reach, centers = len(positions), rule.reach, who.centers
     # a distance that no pair exceeds: a lattice has no end
@@ -310,7 +310,7 @@ def _choose(
 
 
 def _guess(placed: Placed, who: Participants, most: int, everything: float) -> float:
-    """Estimate a radius within which most atoms have as many neighbors as the rule requires."""
+    """Estimate a radius within which most atoms have as many neighbors as the membership rule requires."""
     lattice, candidates = placed.lattice, int(who.others.sum())
     if not candidates:
         return 1.0 if not np.isfinite(everything) else max(everything, 1e-300)
@@ -382,7 +382,7 @@ def image_distances(
 ) -> Float[np.ndarray, "pairs"]:
     """Return distances (length) to the image of j that has `rank` nearer images; inf if there is none.
 
-    If the rule is directed, opposite images of an atom are two different neighbors of this atom.
+    If the membership rule is directed, opposite images of an atom are two different neighbors of this atom.
     """
     out = np.empty(len(i))
     rank = np.where(i == j, rank // 2, rank) if directed else rank

@@ -134,8 +134,8 @@ class FreeFlight(NamedTuple):
 def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
     """Compare displacements between two frames with velocities; None if there is no velocity or motion.
 
-    The ratio `moved` is near 1 for straight paths and below 1 if atoms turn around, but never far above 1.
-    The ratio `factor` is near 1 if velocities keep their directions and have the right unit.
+    The ratio `moved` is near 1 for straight atomic paths and below 1 if atoms turn around, but never far
+    above 1. The ratio `factor` is near 1 if velocities keep their directions and have the right unit.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None

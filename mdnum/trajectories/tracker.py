@@ -299,7 +299,7 @@ def _participants(
     species: np.ndarray | None,
     atoms: int,
 ) -> Participants:
-    """Number the atoms to which a rule applies, in the order of the file."""
+    """Number the atoms to which the membership rule applies, in the order of the file."""
     first = np.arange(atoms) if first is None else first
     second = first if second is None else second
     for name, chosen in (("first", first), ("second", second)):

@@ -129,7 +129,7 @@ def _of_rules(view: FlipsView) -> Iterator[Finding]:
 
 
 def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
-    """Yield codes of findings on limits of the flips found by one rule, with text variants and values."""
+    """Yield finding codes on limits of the flips of one neighbor rule, with text variants and values."""
     if len(wrong := _disagreeing(view, place)):
         yield "EVENT_ALGEBRA", (), {"first": int(wrong[0]) + 1, "frames": len(wrong)}
     flips, frames = one["flips"], view.summary["frames"]
@@ -263,7 +263,7 @@ def _time_goes_back(view: FlipsView) -> Finding:
 
 
 def _title(title: str, view: FlipsView, one: Rule) -> str:
-    """Return the title of a section about a rule; the title contains the rule if there are several rules."""
+    """Return the title of a section on a neighbor rule, with the rule itself if there are several rules."""
     return f"{title}, {view.rule(one)}" if len(view.summary["rules"]) > 1 else title
 
 
@@ -430,7 +430,7 @@ def _busiest(view: FlipsView) -> Browse | None:
 
 
 def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]:
-    """Yield the figures of one rule, each with the title of its section; empty figures are omitted."""
+    """Yield the figures of one neighbor rule, each with its section's title; empty figures are omitted."""
 
     def rows(table: str) -> dict[str, np.ndarray]:
         whole = view.table(table)

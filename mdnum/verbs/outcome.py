@@ -52,7 +52,7 @@ class Outcome:
 
     @property
     def folder(self) -> Path:
-        """Path of the output folder; the same as the attribute `path`."""
+        """Path of the output folder; equal to the attribute `path`."""
         return self.path
 
     @property
