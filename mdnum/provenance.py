@@ -103,7 +103,7 @@ def fingerprint(parts: Mapping[str, Any]) -> str:
 
 
 def package_versions() -> dict[str, str | None]:
-    """Return the versions of packages on which results can depend, or None for packages not installed."""
+    """Return the versions of packages on which results can depend, with None for packages not installed."""
     return {package: version(package) for package in _RECORDED["packages"]}
 
 

@@ -214,8 +214,8 @@ class ExactPenalty(_Motion):
 
     The equation y'' = -g - k y - c y' holds as long as the ball is below the floor, so the damper may pull
     the ball down at the end of a contact. Without damping, the end time of a contact has a closed form. With
-    damping, the end time is the root of an equation between the lowest point and the next maximum of the
-    height. A ball whose next maximum is below the floor comes to rest at depth g / k.
+    damping, the end time is a root, between lowest point and next maximum of the height, of the equation
+    height = 0. A ball whose next maximum is below the floor comes to rest at depth g / k.
 
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.

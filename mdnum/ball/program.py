@@ -319,7 +319,7 @@ def _apart(one: BallRun, other: BallRun, last: int) -> Float[np.ndarray, "times"
 
 
 def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
-    """Return the last step at which heights and velocities are finite in both runs, and how each run ends."""
+    """Return the last step at which heights and velocities of two runs are finite, and how each run ends."""
     ends = {}
     for name, run in (("A", a), ("B", b)):
         finite = np.isfinite(run.y.astype(np.float64)) & np.isfinite(run.v.astype(np.float64))

@@ -1,4 +1,4 @@
-"""Simulation of bouncing balls: compiled time-stepping loop, records of runs, and comparison of two runs."""
+"""Simulation of bouncing balls: the compiled time-stepping loop, records of runs, comparison of two runs."""
 
 from __future__ import annotations
 
@@ -273,7 +273,7 @@ class CrossDecision(NamedTuple):
 
     @property
     def run(self) -> str:
-        """Name of the run in which the ball touches the floor, or in which the solver stops first."""
+        """Name of the run in which the ball touches the floor or the solver stops first."""
         return "A" if (self.a > self.b) == (self.channel == "contact") else "B"
 
 

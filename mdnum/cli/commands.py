@@ -215,7 +215,7 @@ def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> in
     stopped = False
 
     def again() -> str | None:
-        """Return a sentence that tells the user how to continue a stopped command."""
+        """Return a sentence that tells the user how to continue a command that was stopped."""
         folder = given.get("resume") or progress.folder or given.get("out")
         with suppress(MdnumError):
             if "resume" in typed and folder is not None:

@@ -231,7 +231,7 @@ class Halves(Reduction):
         return add(in_order(terms[:half], add), in_order(terms[half:], add))
 
     def depth(self, n: int) -> int:
-        """Return the number of additions in the longer half, plus one for the final addition."""
+        """Return the number of additions in the longer half of the terms, plus one for the final addition."""
         return n - n // 2 if n > 1 else 0
 
 

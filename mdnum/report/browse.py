@@ -129,5 +129,5 @@ class Browse:
 
 
 def _script_safe(value: Any) -> Markup:
-    """Return JSON that can be placed in a script element, with "</script>" in strings made harmless."""
+    """Return JSON text for a script element, in which "</script>" inside a string is made harmless."""
     return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))

@@ -329,7 +329,7 @@ def overridden(
     species: Int[np.ndarray, "atoms"],
     r_cut: Float[np.ndarray, "channels species species"],
 ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
-    """Count the pairs with different decisions in two records, and find their largest distance to the cutoff.
+    """Count the pairs with different decisions in two records; find their largest distance from the cutoff.
 
     Args:
         cells: as for `separations`.

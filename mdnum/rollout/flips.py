@@ -174,8 +174,8 @@ class PairRecorder:
     """Recorder of all flips (pairs that cross the cutoff) in a simulation.
 
     A flip is a difference between the decisions for a pair at two consecutive steps, even if the neighbor
-    list was rebuilt in between. A pair that was missing in the old list enters with the new list, and a pair
-    that is beyond the range of the new list leaves.
+    list was rebuilt in between. A pair inside the cutoff that the old list lacks enters with the new list,
+    and a pair that is beyond the range of the new list leaves.
 
     Args:
         simulation: the system as objects.

@@ -106,7 +106,7 @@ def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
 
 
 def strain_of(a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Return the strain between the boxes of two runs at each step, or NaN after run b has ended."""
+    """Return the strain between the boxes of two runs at each step, and NaN after run b has ended."""
     out = np.full(len(a), np.nan)
     if b is not None:
         rows = min(len(a), len(b))
@@ -115,7 +115,7 @@ def strain_of(a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
 
 
 def _differ(a: Rows, b: Rows) -> bool:
-    """Return True if the boxes of two runs can be different."""
+    """Return True if the boxes of two runs can differ from each other."""
     return bool(a.cells or b.cells) or not np.array_equal(a.box.matrix, b.box.matrix)
 
 
@@ -139,7 +139,7 @@ def _per_row(doubts: AmbiguousPairs, rows: Rows) -> Int[np.ndarray, "rows"]:
 
 
 def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarray, "rows"]:
-    """Return a lower bound on the distance of all pairs from their cutoff at each step, length."""
+    """Return, for each step, a lower bound on the distance of every pair from its cutoff, length."""
     if rows is None or rows.nearest is None:
         return np.full(len(clock), np.nan)
     margin = rows.nearest

@@ -272,7 +272,7 @@ class Rollout:
         self.folder.checkpoint_beside(lambda: state if held is None else {**state, "held": held()})
 
     def _to_dict(self, point: Start) -> dict[str, Any]:
-        """Return the data from which a run can be resumed, with the last pairs of a list that was used up."""
+        """Return the data from which a run can be resumed, including the last pairs of a used-up list."""
         last = None if self.done.last is None else np.asarray(self.done.last).T
         frames = {"first": self.done.first, "last": last}
         return {

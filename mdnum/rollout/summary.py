@@ -392,7 +392,7 @@ class ListHealth:
     """Monitor of a run's neighbor lists, which counts missed pairs and dangerous rebuilds.
 
     A list can miss a pair only if the displacements of two atoms add up to more than the skin. A safe rebuild
-    rule prevents such displacements; with any other rule, a new search checks for missed pairs.
+    rule prevents larger displacements; with other rules, a new search checks for missed pairs.
     """
 
     simulation: Simulation  # the system as objects

@@ -180,7 +180,7 @@ class Track:
 
 
 def rows_of(simulation: Simulation, segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
-    """Convert recorded time steps to the user's order of atoms, and to labels and axes of another run."""
+    """Convert recorded time steps to the user's order of atoms, and to the labels and axes of another run."""
     x, v = (in_user_order(segment.rows_of(name), segment.table.order) for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
     nearest = segment.rows_of("nearest").astype(np.float64)

@@ -613,7 +613,7 @@ class RunFolder:
         return TableStream(self.path, name, self._layout, lambda path: self.check(manifest.place(path)[1]))
 
     def _sweep(self, *patterns: str) -> None:
-        """Remove temporary files that remain after a kill, and files that match the patterns."""
+        """Remove temporary files that remain after a kill, and files that match given patterns."""
         for pattern in (*patterns, ".*.part", *(f"{name}/.*.part" for name in SUBFOLDERS)):
             for file in self.path.glob(pattern):
                 if not (file.parent.is_symlink() and file.parent != self.path):

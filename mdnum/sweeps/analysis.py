@@ -256,7 +256,7 @@ def _advice(
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the settings of all recommended and of all converged values (none if the settings are equal).
 
-    Each choice was varied alone; runs with the two settings show the combined effect of all choices.
+    Each choice was varied alone; runs with the two returned settings show the combined effect of all choices.
     """
     best = {row["choice"]: row["best"] for row in advice if row["best"] is not None}
     ends = {row["choice"]: row["end"] for row in advice if row["end"] is not None}

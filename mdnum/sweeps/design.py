@@ -42,7 +42,7 @@ class Axis:
         return all(isinstance(one, int | float) and not isinstance(one, bool) for one in self.values)
 
     def settings(self, value: Any, world: str = "md") -> dict[str, Any]:
-        """Return the keys of the system file that a value of this choice changes, with new values."""
+        """Return the keys of the system file that a value of this choice changes, with their new values."""
         if self.key == "precision" and isinstance(value, str):
             return {f"precision.{role}": value for role in _ROLES[world]}
         return {self.key: value}

@@ -93,7 +93,7 @@ def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tu
 
 
 def longest_radius(spec: SystemSpec, species: tuple[str, ...], folder: Path) -> float:
-    """Return the largest distance at which a pair of atoms interacts directly, length."""
+    """Return the largest distance (a length) at which a pair of atoms interacts directly."""
     potential = spec.potential
     if potential is None or isinstance(potential, schema.PairPotentialTable):
         longest = 0.0

@@ -188,7 +188,7 @@ def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
 
 
 def leaf_of(model: Any, name: str) -> Any:
-    """Return the array of a potential or its cutoff that contains a parameter."""
+    """Return the array, of a potential or of its cutoff, that contains a parameter."""
     if not isinstance(model, CutPotential | Channels):
         return quantities_of(model)[name.removeprefix("potential.")]
     return pair_leaves(model)[name]

@@ -379,7 +379,7 @@ class Simulation:
         return replace(self, policy=policy, decider=decider, fixed_point=None)
 
     def in_row(self, cell: Cell | None) -> Simulation:
-        """Return the system with the box at a given step; unchanged if the box is constant."""
+        """Return the system with the box at a given step, or unchanged if the box is constant."""
         return self.with_cell(jax.tree.map(np.asarray, cell)) if self.integrator.moves_cell else self
 
     def with_cell(self, cell: Cell) -> Simulation:
