@@ -144,7 +144,7 @@ class Barostat(Integrator):
 
 
 def volume(cell: Cell) -> Number:
-    """Return the volume of a box, inside jit."""
+    """Return the volume of a box; for use inside jit."""
     a = cell.matrix
     if cell.orthorhombic:
         return jnp.abs(a[0, 0] * a[1, 1] * a[2, 2])

@@ -98,8 +98,8 @@ class Cell(eqx.Module):
     def reach(self, positions: Float[np.ndarray, "atoms 3"]) -> Reach:
         """Return the largest coordinates and lattice vectors, from which rounding bounds are computed.
 
-        The magnitudes of coordinates along periodic axes follow from the box. Along nonperiodic axes, the
-        magnitudes allow every atom to move by the present extent of all atoms.
+        The largest coordinates along periodic axes follow from the box. Along nonperiodic axes, they allow
+        every atom to move by the present extent of all atoms.
 
         Args:
             positions: initial positions of the atoms, length.
@@ -242,7 +242,7 @@ def stacked(cells: Sequence[Cell], dtype: DTypeLike = np.float64):
 
 @njit(inline="always")
 def box_of(boxes, row):
-    """Return the box of one row of stacked boxes: lattice vectors, inverse, periodicity, orthorhombic flag.
+    """Return one of several stacked boxes: lattice vectors, inverse, periodicity and orthorhombic flag.
 
     The result consists of tuples: arrays would slow down a compiled loop by reference counting.
     """
@@ -275,7 +275,7 @@ class HostCell:
 def wrap_positions(
     cell: Cell, positions: Float[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
-    """Wrap positions, even from far outside the box; return wrapped positions and lattice shifts.
+    """Wrap positions, even from far outside the box; return wrapped positions and numbers of shifts.
 
     Error: the first pass subtracts n lattice vectors at once and rounds n*L; a second pass wraps positions
     that are still outside due to this rounding. A wrapped coordinate may equal the edge length L after L is

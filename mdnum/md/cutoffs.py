@@ -161,7 +161,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
 
 
 def _ends(made: Cutoff, power: int) -> bool:
-    """Run the checks for u = r^(-2 power); return True if a derivative that is allowed to jump does jump."""
+    """Check a cutoff for u = r^(-2 power); return True if a derivative that is allowed to jump jumps."""
     import jax
     import jax.numpy as jnp
 

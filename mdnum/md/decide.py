@@ -44,7 +44,7 @@ CONVENTIONS = ("r2 <", "r2 <=", "r <", "r <=")
 
 @dataclass(frozen=True)
 class PairDecider:
-    """Decision rule for pairs inside, one of `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
+    """Comparison that decides on a pair: `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
 
     r_cut: tuple[float, ...]  # cutoff of each pair type, length
     compare: str = "r2 <"  # quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <="

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 class Columns:
     """Base class of tables: dataclasses whose fields are columns of equal length; the first is an array.
 
-    A field that is not an array is a text that applies to all rows, or None for an unknown column.
+    A field that is not an array is either a text that applies to all rows, or None (unknown column).
     """
 
     def __len__(self) -> int:

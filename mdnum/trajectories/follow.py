@@ -138,7 +138,7 @@ class NeighborCounts:
 
 @dataclass
 class Followed:
-    """Tracker, neighbor counts and statistics of one membership rule while frames are read."""
+    """Tracker, neighbor counts and statistics for one membership rule, updated as frames are read."""
 
     rule: Rule
     tracker: Tracker | ResidueTracker  # of it

@@ -235,7 +235,7 @@ def far_out(
 
 
 def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, float] | None:
-    """Return the atom with the largest displacement since the previous frame, if impossibly large.
+    """Return the atom with the largest displacement since the previous frame if this is impossibly large.
 
     A jump by a lattice vector, as when atoms are wrapped into the box, does not count as a displacement.
 

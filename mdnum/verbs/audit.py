@@ -367,7 +367,7 @@ def _summary(state: AuditState) -> dict[str, Any]:
 
 
 def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
-    """Return the audit's tables: the points of its figures, and the data recorded by its checks."""
+    """Return the audit's tables: the data points of the figures, and the data that the checks recorded."""
     lines = [
         (result.name, f"{result.name}-{place}", label, chart.x, values)
         for result in state.shown

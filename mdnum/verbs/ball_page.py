@@ -27,7 +27,7 @@ class BallView(View):
 
     @property
     def applied(self) -> list[Mapping[str, Any]]:
-        """Derivatives of the loss, from each gradient method that is applicable."""
+        """Derivatives of the loss by each applicable gradient method."""
         return [made for made in self.summary["gradient"] if not made["refused"]]
 
     @property
