@@ -1,4 +1,4 @@
-"""Make runs from perturbed starts, measure features of these runs, and make deliberately changed programs.
+"""Run from perturbed starts, measure features of these runs, and create deliberately changed programs.
 
 Every feature is a continuous function of the positions, so that small differences between the runs of an
 ensemble remain small in the features. Pairs are therefore counted with hat functions and not in bins.
@@ -42,7 +42,7 @@ _NUMBERS = (
 
 
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
-    """Return the distances at which the hat functions of the pair histogram peak, and its upper end.
+    """Return the distances at which the hat functions of the pair histogram peak, and the histogram's end.
 
     The distances extend from the closest pairs of a start to the largest distance that is counted.
     """
@@ -62,7 +62,7 @@ def feature_names(nodes: Float[np.ndarray, "nodes"]) -> tuple[str, ...]:
 def measure(
     simulation: Simulation, segment: Segment, nodes: Float[np.ndarray, "nodes"]
 ) -> Float[np.ndarray, "features"]:
-    """Compute the features at the last step of a part of a run, in the internal units of the system.
+    """Compute the features at the last step of one segment of a run, in the internal units of the system.
 
     Energies, virial and forces are taken from the run; pairs are counted with a separate neighbor list.
     """
@@ -108,7 +108,7 @@ def hats(
     """Count pair distances with hat functions: each distance contributes to the two nearest nodes.
 
     The contribution to a node grows linearly as the distance approaches the node. Distances below the first
-    node count for this node. The last node only marks the end: a pair leaving the histogram causes no jump.
+    node count for this node. The last node marks the end, so that a pair that leaves causes no jump.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)

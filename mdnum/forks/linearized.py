@@ -3,12 +3,12 @@
 The tangent (the derivative of the state) is propagated along the recorded states with the same neighbor
 lists, so that the reference is the recorded run, bit for bit. The exponential growth rate of the tangent is
 the largest Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn
-1980), so it does not saturate, unlike the separation of two runs.
+1980) and, unlike the separation of two runs, does not saturate.
 
 Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation: to first order
 the decision flips at a = -m / (dm/da). The smallest amplitude that flips a decision at a step is a lower
 limit for all perturbations, as long as the perturbed run remains close to the reference run and makes the
-same decisions. If the force jumps at the cutoff, the first flip kicks the two atoms, and the forecast ends
+same decisions. If the force jumps at the cutoff, the first flip kicks the two atoms; the forecast ends there,
 because the linearization then describes another run. If the force is continuous at the cutoff, a flip does
 not change the motion to first order.
 """
@@ -235,9 +235,9 @@ class Lyapunov:
         return self.error / self.timestep
 
     def ratio(self, seen: Growth) -> float:
-        """Return the ratio of two runs' growth rate to the Lyapunov exponent; NaN if no growth was found.
+        """Divide the growth rate of two runs' separation by the Lyapunov exponent; NaN if there is no growth.
 
-        A ratio near 1 means that the dynamics separated the runs; a ratio well above 1 means that flips did.
+        If the ratio is near 1, the dynamics separated the runs; if it is well above 1, flips separated them.
         """
         return seen.rate / self.rate if self.chaotic else float("nan")
 
@@ -351,7 +351,7 @@ class Forecast:
         return self.simulation.cutoff.smoothness < 1
 
     def good_until(self, amplitude: float) -> ForecastRange:
-        """Return the last step for which the forecast at an amplitude is valid, and why it ends there."""
+        """Return the last step for which the forecast at an amplitude is valid, and why the forecast ends."""
         listed = self._until(2 * abs(amplitude) * self.furthest > self.room)
         ends = ((self.steps, "end"), (self.linear_until(amplitude), "size"), (listed, "list"))
         last = min((ForecastRange(*end) for end in ends), key=lambda one: one.step)
@@ -407,7 +407,7 @@ class Forecast:
         return int(beyond.argmax()) - 1 if beyond.any() else self.steps
 
     def _error(self, amplitude: float) -> Float[np.ndarray, "rows"]:
-        """Estimate the relative error of the predicted amplitude of a flip, for each step."""
+        """Estimate, for each step, the relative error of the predicted amplitude of a flip."""
         size = abs(amplitude)
         with np.errstate(divide="ignore", over="ignore"):
             return _SECOND_ORDER * size * self.furthest / self.simulation.r_cut + _ULPS * self.ulp / size

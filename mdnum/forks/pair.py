@@ -217,7 +217,7 @@ def _beyond(step: int) -> int:
 
 
 def displacements(fork: Fork) -> tuple[float, float]:
-    """Return two displacements (lengths) for starts of repeats: the initial separation of the runs, and less.
+    """Return two displacements (lengths) for starts of repeats: the runs' initial separation, and a smaller.
 
     At a hundredth of the first displacement, a repeat begins to have the same rounding errors as the pair of
     runs; at much smaller displacements, the repeat equals the pair and is no evidence. If a hundredth of the

@@ -132,7 +132,7 @@ def variants(
     """Run a system in several variants of its program, two processes at a time, and find which results agree.
 
     All variants use one neighbor list, with a doubled skin if the box is large enough, and stop before motion
-    exceeds this skin. Other machines may give other groups: some processors lack fused multiply-add.
+    exceeds this skin. Other machines may give other groups, since some processors lack fused multiply-add.
 
     Args:
         system: a system that was loaded from a file and has a pair potential.
@@ -229,7 +229,7 @@ def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
 
     Codes: "fused", "others" and "not_fused" for programs without fused operations; "eager_..." for the
     program without a compiler; "same", "fuses", "orders" and "leaves" for other programs, named in "program";
-    "reversed". If a variant departs from the reference, "step" is the first differing step.
+    "reversed". If a variant differs from the reference, "step" is the first step at which they differ.
     """
     by_name = {row.variant.name: row for row in rows if not row.failed}
     reference = next(iter(by_name.values()))
@@ -272,7 +272,7 @@ def positions_of(
 ) -> Float[np.ndarray, "steps 3 atoms"]:
     """Compute wrapped positions at steps 1, 2, ... with one program, in the user's order of atoms.
 
-    The result ends before an atom has moved by half the skin, since there is only one neighbor list.
+    The result ends before an atom has moved by half of the skin, because only one neighbor list is built.
     """
     from mdnum.md.cell import displacement
     from mdnum.rollout.engine import Engine, first_state

@@ -2,7 +2,7 @@
 
 To override a decision of run B, the decision of run A is imposed on B; B makes all other decisions itself.
 The smallest set of overridden pairs that keeps run B close to run A is found by bisection and delta
-debugging, the method by which Verrou finds the instructions that cause an error.
+debugging; Verrou uses delta debugging to find the instructions that cause an error.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
 
 
 def check_pins(fork: Fork) -> None:
-    """Raise an error if single decisions cannot be imposed in a pair of runs.
+    """Raise an error if single decisions of one run cannot be imposed on the other run of a pair.
 
     Raises:
         InputError: a potential is many-body, or the runs have different atom labels or axes.
@@ -300,7 +300,7 @@ class _Search:
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Test whether run B stays close to A under A's decisions on some pairs; False if no run is left."""
+        """Test whether B stays close to A with A's decisions on some pairs; False if no run is left."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():
@@ -331,8 +331,8 @@ class _Search:
 def _required(keys: list[int], search: _Search, until: int) -> list[int]:
     """Find a sufficient set of pairs by bisection, one necessary pair after another (QuickXplain).
 
-    Each pair requires about log2(n) runs; for delta debugging, the number of runs is quadratic in that of
-    pairs. The method assumes that imposing more decisions never causes a split; it stops after `until` runs.
+    Each pair requires about log2(n) runs; in delta debugging, the runs increase with the square of the pairs.
+    The method assumes that imposing more decisions never causes a split; it stops after `until` runs.
 
     Source: Junker, QuickXplain, AAAI 2004.
     """

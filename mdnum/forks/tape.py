@@ -35,7 +35,7 @@ class DecisionTape:
 
     @cached_property
     def changes(self) -> dict[int, tuple[int, ...]]:
-        """Steps at which each pair flips, ascending, in a dictionary by the pair's integer key."""
+        """For each pair, by its integer key, the steps at which the decision on the pair flips, ascending."""
         order = np.argsort(self.key, kind="stable")
         keys, begins = np.unique(self.key[order], return_index=True)
         steps = np.split(self.step[order], begins[1:])

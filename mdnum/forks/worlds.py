@@ -47,9 +47,9 @@ def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Pro
 
 
 def packed(system: Simulation | BallSystem, *more: Any) -> bytes:
-    """Pickle a system, with further objects, for other processes, which `unpacked` restores bit for bit.
+    """Pickle a system and other objects for another process, where `unpacked` restores them bit for bit.
 
-    A system that was loaded from a file is built again from the file: its code is a module only here.
+    A system loaded from a file is built again from the file: its code is a module only in this process.
     """
     import cloudpickle
 
@@ -98,7 +98,7 @@ def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> 
 
 def alike(a: Any, b: Any) -> tuple[Any, Any]:
     """Return two systems with comparable decisions: if only one system shares decisions between terms, both
-    get one decision for each term.
+    systems get one decision for each term.
     """
     if isinstance(a, BallSystem) or not (a.pairwise and b.pairwise):
         return a, b
@@ -125,7 +125,7 @@ def changes(a: Any, b: Any) -> dict[str, list[Any]]:
 
 
 def floats(system: Any) -> dict[str, float]:
-    """Return the floating-point parameters of a system that affect a time step, by dotted key."""
+    """Return, by dotted key, the floating-point parameters of a system that affect a time step."""
     if isinstance(system, BallSystem):
         data = system.spec.model_dump(mode="python", exclude_none=True, exclude=set(_BALL_ELSEWHERE))
         return {key: value for key, value in flat(data).items() if isinstance(value, float)}

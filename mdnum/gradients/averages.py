@@ -2,9 +2,9 @@
 
 The derivative of an average with respect to a parameter has up to three contributions. First, at fixed
 positions, the value of the observable in each frame changes. Second, if the observable jumps when a pair
-enters the cutoff, the average changes with the cutoff radius by the jump times the density of pairs at the
-cutoff; derivatives at fixed decisions lack this contribution. Third, with a thermostat, the statistical
-weight exp(-U/kT) of each frame changes.
+enters the cutoff, the average changes with the cutoff radius: its derivative contains the jump times the
+density of pairs at the cutoff, which derivatives at fixed decisions lack. Third, with a thermostat, the
+statistical weight exp(-U/kT) of each frame changes.
 """
 
 from __future__ import annotations
@@ -210,8 +210,8 @@ def density(
 
     The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
     of the width; extrapolation from three widths, each half of the previous width, removes the second and
-    fourth powers. Extrapolations from kernels of different widths are compared; the result is the widest that
-    agrees with all narrower ones within twice the standard error of the difference.
+    fourth powers. Of the extrapolations, the result is that from the widest kernels that agrees with those
+    from all narrower kernels within twice the standard error of the difference.
 
     Args:
         weights: one per frame and pair type. reach: the largest width, length.

@@ -167,8 +167,8 @@ def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str
 
 
 def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
-    """Return the program with loops in place of the custom derivative rule of `stopping.elementwise`. The
-    rule alone cannot tell whether the derivative through a loop is zero or the loop did not run.
+    """Return the program with loops in place of the custom derivative rule of `stopping.elementwise`. With
+    the rule, a zero derivative through a loop looks the same as a loop that did not run.
     """
 
     def run(*inputs):

@@ -37,7 +37,7 @@ _NARROW = 1e-6
 
 
 def _moving(x: Any) -> Any:
-    """Return zero, but with the derivative of x, by subtracting the value of x as a constant from x."""
+    """Return zero, but with the derivative of x: subtract the value of x, as a constant, from x."""
     return x - lax.stop_gradient(x)
 
 
@@ -241,7 +241,7 @@ def softened(problem: BallProblem, eps: float) -> BallProblem:
 
 
 def _speed(problem: BallProblem) -> float:
-    """Return the speed at which a ball of this problem reaches the floor, m/s; 1 if no ball falls."""
+    """Return the speed (m/s) at which a ball of this problem reaches the floor; 1 if no ball falls."""
     height = max(float(np.max(np.asarray(problem.y0, np.float64))), 0.0)
     square = float(np.max(np.asarray(problem.v0, np.float64) ** 2))
     return float(np.sqrt(square + 2 * abs(float(problem.world.gravity)) * height)) or 1.0

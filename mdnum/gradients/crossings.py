@@ -97,8 +97,8 @@ class Crossings:
 
     @property
     def kick(self) -> Float[np.ndarray, "crossings"]:
-        """Change of a pair's radial momentum per change of its distance at the crossing, energy/length per
-        (length/time): force jump over radial speed, the saltation at the cutoff.
+        """Change of a pair's radial momentum per change of its distance at the crossing: the force jump
+        divided by the radial speed, energy/length per (length/time).
         """
         return self.force / self.speed
 
@@ -250,8 +250,8 @@ def of_energy(
 def _along(
     met: Met, vectors: Float[Array, "3 atoms"], matrix: Float[Array, "3 3"] | None = None
 ) -> Float[Array, "most"]:
-    """Return the difference of a vector between the two atoms of each pair, projected on the direction of the
-    pair; if `matrix` contains lattice vectors, nearest images are used.
+    """For each pair, return the difference of a vector between the two atoms, projected onto the direction of
+    the pair; if `matrix` contains lattice vectors, nearest images are used.
     """
     dtype = vectors.dtype
     there = vectors.at[:, met.j].get(mode="fill", fill_value=0)
@@ -324,7 +324,7 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
         return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)
 
     def apart(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return minimum-image displacements of pairs, and the lattice shifts used for them."""
+        """Return the minimum-image displacements of pairs, and the lattice shifts in them."""
         start, end = positions(rows, i).astype(np.float64), positions(rows, j).astype(np.float64)
         inverse = inverses[rows + 1]
         if stretch.cell.size:

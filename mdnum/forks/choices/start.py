@@ -221,7 +221,7 @@ def exact_images(
 
     Wrapping the images gives the wrapped positions, bit for bit. In a box along the axes, a position with a
     rounded image has an exact image (Sterbenz's lemma: the lattice vector is subtracted again without
-    rounding); a second iteration is needed only if the first crosses a face of the box.
+    rounding); a second iteration is needed only if the first moves a position across a face of the box.
     """
     from mdnum.md.cell import wrap_positions
 

@@ -49,7 +49,7 @@ _EXPONENTIAL = 0.95
 
 @dataclass(frozen=True)
 class PolicyHorizon:
-    """Number of steps for which a run in one precision follows the exact history."""
+    """Number of steps during which a run in one precision follows the exact history."""
 
     # name, roles: of the precision, and its dtype by role
     name: str
@@ -86,7 +86,7 @@ class PolicyHorizon:
 
 @result
 class Certificate:
-    """The exact history of a system, and the number of steps for which finite-precision runs follow it."""
+    """The exact history of a system, and the number of steps during which finite-precision runs follow it."""
 
     steps: int  # last step
     timestep: float  # in the user's units of time

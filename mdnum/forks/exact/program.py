@@ -1,7 +1,7 @@
 """The time steps of a run in exact real arithmetic. Interval arithmetic (Arb) proves every decision.
 
 The initial state and all constants are the double-precision numbers of the program, taken as exact. Positions
-and velocities are balls (intervals) with many bits. A decision is proven if the interval of its margin lies
+and velocities are intervals ("balls") with many bits. A decision is proven if the interval of its margin lies
 on one side of the threshold; otherwise the run is repeated with more bits. The result is the sequence of
 decisions that the program would make without any rounding.
 
@@ -67,7 +67,7 @@ def pull_of(
 
 
 def _lennard_jones(sigma: Any, epsilon: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Return functions for 2 du/d(r²) and u of the Lennard-Jones potential, with few operations."""
+    """Return functions that compute 2 du/d(r²) and u of the Lennard-Jones potential in few operations."""
     s2 = sigma * sigma
     s6 = s2 * s2 * s2
     # u = (4 epsilon s6) r⁻⁶ (s6 r⁻⁶ - 1), 2 du/d(r²) = (attract - repel r⁻⁶) r⁻⁸
@@ -129,14 +129,14 @@ class ExactHistory:
 
 
 def installed() -> bool:
-    """Return True if the package for ball arithmetic (python-flint) is installed."""
+    """Return True if the package for interval arithmetic (python-flint) is installed."""
     from importlib.util import find_spec
 
     return find_spec("flint") is not None
 
 
 def unsupported(simulation: Simulation) -> InputError | None:
-    """Return an error with a remedy if the system cannot be certified; otherwise None."""
+    """If the system cannot be certified, return an error that states a remedy; otherwise None."""
     half, atoms = float(np.min(simulation.cell.widths)) / 2, simulation.atoms
     alone = simulation.pairwise and not isinstance(simulation.potential, SumPotential)
     reasons = (
@@ -185,7 +185,7 @@ def unsupported(simulation: Simulation) -> InputError | None:
 
 
 def _without_balls(simulation: Simulation) -> InputError | None:
-    """Return an error if the potential or cutoff needs an operation that ball arithmetic does not support."""
+    """Return an error if the potential or cutoff needs an operation without interval arithmetic."""
     from flint import arb
 
     try:
@@ -211,7 +211,7 @@ def _pulls(simulation: Simulation) -> list[Callable[[Any], Any]]:
 
 
 class ExactProgram:
-    """The time steps of a simulation in ball arithmetic, from its start in double precision.
+    """The time steps of a simulation in interval (ball) arithmetic, from its start in double precision.
 
     Args:
         simulation: the simulation; its constants are in double precision, whatever its precision policy.
@@ -402,8 +402,8 @@ class _Run:
         """Make all decisions of a step with double-precision bounds, or with intervals if these do not
         suffice.
 
-        If the nearest image in double precision is not the exact one, both images are further than r_cut,
-        because half the box exceeds r_cut by more than rounding.
+        If double precision gives another nearest image than exact arithmetic, both images are further away
+        than r_cut, because half the box exceeds r_cut by more than rounding errors.
         """
         program = self.program
         i, j, matrix = program._i, program._j, program._matrix

@@ -164,7 +164,7 @@ def _asked(method: Method, problem: Problem, names: Sequence[str], progress: Pro
 def compare(
     name: str, one: Gradient, reference: Gradient, unit: float, growth: float, *, jumps: bool
 ) -> GradientDifference:
-    """Compare the derivatives with respect to one parameter in two gradients.
+    """Compare two gradients in their derivatives with respect to one parameter.
 
     Args:
         unit: unit roundoff of the run's state or forces, whichever is coarser.
@@ -358,7 +358,7 @@ def diagnose(
 
 
 def _methods(asked: Sequence[str | Method] | None) -> list[Method]:
-    """Return as objects the gradient methods given by name or as objects; if none are given, return all."""
+    """Convert names of gradient methods to objects; return all methods if none are given."""
     return [by_name(one) if isinstance(one, str) else one for one in (METHODS if asked is None else asked)]
 
 

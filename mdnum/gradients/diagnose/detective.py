@@ -1,4 +1,4 @@
-"""Search for the first operation in a reverse pass whose result is not finite, although the run is finite.
+"""For a finite run, search for the first operation of the reverse pass with a result that is not finite.
 
 For example, a force can be finite while its derivative is not, a loss can contain a square root at zero, or a
 sum can overflow in the reverse pass. The reverse pass is repeated up to the first step that gives a number
@@ -152,7 +152,7 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 def _pair(
     back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
-    """Return both atoms and the distance of the pair of a result; -1, -1, NaN for a result without pair."""
+    """Return both atoms and the distance of a result's pair; -1, -1, NaN for a result without a pair."""
     nowhere = (-1, -1, float("nan"))
     if made is None or not made.index:
         return nowhere

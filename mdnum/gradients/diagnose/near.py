@@ -94,7 +94,7 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """True if a distance equals the cutoff within its error, or crosses it only between two steps."""
+        """True if a distance equals the cutoff within its error, or crosses the cutoff only between steps."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
@@ -156,7 +156,7 @@ class Near:
         return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
 
     def reverse(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Find turning points in a stretch of steps, and compute the weight of each from cotangents."""
+        """Find turning points in a stretch of steps, and compute their weights from cotangents."""
         if not self.jumps:
             return
         simulation = self.simulation
@@ -248,7 +248,7 @@ def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, 
 def hermite(
     r0: np.ndarray, s0: np.ndarray, r1: np.ndarray, s1: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the extremum of the cubic through two distances whose rates of change have opposite signs.
+    """Find the extremum of the cubic that fits two distances, with rates of change of opposite signs.
 
     Args:
         r0, s0, r1, s1: distance and its rate at the two ends. time: between the ends.

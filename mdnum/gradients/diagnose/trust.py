@@ -4,7 +4,7 @@ A gradient ceases to be trusted in five cases. (1) Another precision gives a dif
 rounding errors have grown. (2) Half the time step gives a different gradient. (3) A pair turned around so
 close to its cutoff that another time step could add or remove a flip with a relevant contribution. (4) A
 decision was so close to its threshold that rounding determined the decision. (5) Gradients from other starts
-of the same system scatter by more than their mean. If one of the five limits was not examined, the verdict on
+of the same system scatter by more than their mean. If one of the five cases was not examined, the verdict on
 a gradient is undecided.
 
 The gradients for all horizons are computed from one run and one pass of tangents.
@@ -232,7 +232,7 @@ class Judgment:
 
 @dataclass(frozen=True)
 class Trust(Judgment):
-    """Number of steps for which a gradient can be trusted: verdicts on all parameters and on each."""
+    """Number of steps for which a gradient can be trusted: one verdict on all parameters, and one on each."""
 
     by: dict[str, Judgment]  # of each parameter, by full name
     tolerance: float  # relative difference above which two precisions, or two time steps, disagree
@@ -246,11 +246,11 @@ class Trust(Judgment):
 
 
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
-    """Return a simulation with different rounding for comparison, and the formats narrower than float64.
+    """Return a simulation with different rounding, for comparison, and formats narrower than float64.
 
     If the given run uses formats narrower than float64, the run for comparison is in float64. No hardware
     format is wider than float64: a float64 run is compared with a run whose start is shifted by one rounding
-    error. The shift shows how rounding affects the gradient, up to a factor of order one.
+    error. The shift shows the effect of rounding on the gradient, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -387,7 +387,7 @@ def trust(
 
 
 def grew(growth: GradientGrowth) -> bool:
-    """Return whether a gradient grew so much that gradients from other initial states may be different."""
+    """Return whether a gradient grew so much that gradients from other initial states may differ from it."""
     # over the first horizons all of them grow: velocities turn into lengths, and averages gain frames
     size = growth.table["size"][min(CLOCK_STEPS, len(growth.table["size"]) - 1) :]
     there = size[np.isfinite(size) & (size > 0)]
@@ -396,7 +396,7 @@ def grew(growth: GradientGrowth) -> bool:
 
 
 def no_half_step(simulation: Simulation) -> bool:
-    """Return whether a run at half the time step would have different noise from a thermostat."""
+    """Return whether a thermostat would add different noise in a run with half the time step."""
     return simulation.integrator.random is not None
 
 
@@ -504,7 +504,7 @@ def _left_out(
 
 
 def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]:
-    """Return the relative difference (of norms) of two gradients, by parameter and horizon."""
+    """Return, by parameter and horizon, the difference of two gradients, divided by the larger norm."""
     out = {}
     second = b.by_name()
     for name, first in a.by_name().items():
@@ -515,7 +515,7 @@ def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]
 
 
 def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "points"]]:
-    """Return the standard error of the mean gradient, divided by its norm, by parameter and horizon."""
+    """Return, by parameter and horizon, the standard error of the mean gradient divided by its norm."""
     out = {}
     for name in made[0].by_name():
         each = np.stack([one.by_name()[name] for one in made])
