@@ -98,8 +98,8 @@ class Cell(eqx.Module):
     def reach(self, positions: Float[np.ndarray, "atoms 3"]) -> Reach:
         """Return the largest coordinates and lattice vectors, from which rounding bounds are computed.
 
-        The largest coordinates along periodic axes follow from the box. Along nonperiodic axes, they allow
-        every atom to move by the present extent of all atoms.
+        The largest coordinates along periodic axes follow from the box. Along nonperiodic axes, the result
+        allows every atom to move by the present extent of all atoms.
 
         Args:
             positions: initial positions of the atoms, length.
