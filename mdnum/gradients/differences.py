@@ -64,8 +64,8 @@ class Differentiated(NamedTuple):
 def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
     """Differentiate f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
-    Steps decrease by factors of 1.4, and the extrapolation with the smallest estimated error is returned,
-    which balances truncation errors of large steps against noise of small steps.
+    Steps decrease by factors of 1.4; returning the extrapolation with the smallest estimated error balances
+    the truncation errors of large steps against the noise of small steps.
 
     Args:
         f: function of one number. x: point. step: the largest step. levels: number of steps.
@@ -422,7 +422,7 @@ def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
 
 
 def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
-    """Return the number of steps from which the standard error exceeds the mean, or None."""
+    """Return the number of steps at which the standard error starts to exceed the mean, or None."""
     mine = [row for row in rows if row["name"] == name]
     kept = [k for k, row in enumerate(mine) if row["error"] < row["mean"]]
     after = max(kept, default=-1) + 1

@@ -31,7 +31,7 @@ NOT_REAL = ("it is complex; expected a real number", "Use gradients.value_and_gr
 
 
 class LossFrame(NamedTuple):
-    """State and energies at one step of a trajectory, the input of a loss; atoms are in the user's order."""
+    """Input of a loss: state and energies at one step of a trajectory, with the atoms in the user's order."""
 
     step: Int[Array, ""]  # its number
     x: Float[Array, "3 atoms"]  # positions as if the box had no faces, length
@@ -162,7 +162,7 @@ class FinalProjection(_OfLast):
 
 
 class MeanSquaredDisplacement(_OfLast):
-    """Mean squared displacement since step 0 at the last step, length²."""
+    """Mean squared displacement (length²) of the atoms between step 0 and the last step."""
 
     name, label, unit = "msd", "mean squared displacement at the last step", "{length}²"
 
@@ -267,7 +267,7 @@ class GreenKuboDiffusion(Loss):
     integral is computed by the trapezoidal rule with a spacing of `every` steps.
 
     Error: of order (every × timestep)² times the slope of the autocorrelation at `until`.
-    Source: see the source of `EinsteinDiffusion`.
+    Source: the same as for `EinsteinDiffusion`.
     """
 
     name, unit = "diffusion-green-kubo", "{length}²/{time}"
@@ -340,12 +340,12 @@ class RadialDistribution(Loss):
 
     @property
     def width(self) -> float:
-        """Width of a bin of g(r), length."""
+        """Width (length) of a bin of g(r)."""
         return self.r_max / self.bins
 
     @property
     def centers(self) -> Float[Array, "bins"]:
-        """Centers of the bins of g(r), length."""
+        """Centers (lengths) of the bins of g(r)."""
         return (jnp.arange(self.bins, dtype=jnp.float64) + 0.5) * self.width
 
     def reason_unavailable(self, around: LossContext) -> str | None:

@@ -196,7 +196,7 @@ class ParameterEntry:
 
 
 def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterEntry, ...]:
-    """Return all entries (single numbers) of the given parameters, in order."""
+    """Return all entries (single numbers) of the given parameters, in the order of the parameters."""
     return tuple(
         ParameterEntry(name, tuple(int(k) for k in index))
         for name in names

@@ -228,7 +228,7 @@ def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: boo
 
 
 def pairs_only(simulation: Simulation, *, any_step: bool = False) -> str | None:
-    """Return the reason why a method for pair potentials does not apply; None if the method applies.
+    """Return why a method for pair potentials does not apply; None if the method applies.
 
     Args:
         any_step: whether every integrator is supported.

@@ -1,6 +1,6 @@
 """Gradient methods that linearize a recorded run, in reverse mode (cotangents) or forward mode (tangents).
 
-An ordinary run is made and recorded first. The steps are then linearized at the recorded states and
+First, an ordinary run is made and recorded. The steps are then linearized at the recorded states and
 decisions; for a reversible run with a fixed-point state, the states are recomputed.
 """
 
@@ -54,7 +54,7 @@ Watch = Callable[[TapeStretch, AdjointCarry], None]
 
 @dataclass(frozen=True)
 class ReversePass:
-    """Result of a reverse pass: the recorded run, the gradient, and the crossings of cutoffs."""
+    """Result of a reverse pass: the recorded run, the gradient, and the crossings of the cutoff."""
 
     tape: RunTape  # the run
     parts: Cotangents  # derivatives by all that it is made of
@@ -147,7 +147,7 @@ class Symmetric(Method):
 
 @dataclass(frozen=True)
 class EventAware(Method):
-    """Gradient method: derivative of the steps plus the contributions of the times of all flips."""
+    """Gradient method: derivative of the steps, plus contributions from changes of the times of all flips."""
 
     # radial speed below which a crossing grazes and is left out, as a share of the rms radial speed of a
     # pair. Left in, single crossings would dominate: their terms go with one over that speed
@@ -320,7 +320,7 @@ def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
 
 
 def joined(crossings: Sequence[Crossings], name: str, *, ledger: bool = False) -> np.ndarray:
-    """Concatenate one column of the crossings (or of their flips) of several stretches of steps."""
+    """Concatenate one column of the crossings (or of their flips) in several stretches of steps."""
     return np.concatenate([getattr(one.ledger if ledger else one, name) for one in crossings])
 
 

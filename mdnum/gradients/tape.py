@@ -108,7 +108,7 @@ _COLUMNS = ("x", "v", "images", "bits", "potential", "virial", "cell", "inputs")
 
 
 def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) -> TapeStretch:
-    """Copy the record of a segment of the run, because its memory is reused."""
+    """Copy the record of a segment of the run, because the memory of the record is reused."""
     columns: dict[str, Any] = {name: getattr(segment.record, name) for name in _COLUMNS}
     x_before = np.asarray(start.state.x_before)[:, segment.table.order]
     before = jax.tree.map(np.asarray, start.state.cells[len(start.state.cells) > 1])
@@ -135,7 +135,7 @@ class Pace(NamedTuple):
 
 
 def pace_of(loss: Loss, steps: int) -> Pace:
-    """Return the spacing of the frames that a loss uses in a run with the given number of steps."""
+    """Return the spacing of frames that a loss uses in a run with a given number of steps."""
     seen = np.flatnonzero(loss.looks_at(np.arange(steps + 1), steps))
     spacings = np.unique(np.diff(seen))
     between = int(spacings[0]) if len(spacings) == 1 else 0

@@ -77,7 +77,7 @@ class MdnumCalculator(ClassicalCalculator):
     """ASE calculator that evaluates a potential with mdnum.
 
     Use this calculator to relax structures with ase.optimize, to compute stress and equations of state, and
-    to analyze mdnum's forces with tools of ASE. The Verlet list is kept between calls until motion and box
+    to analyze mdnum's forces by means of ASE. The Verlet list is kept between calls until motion and box
     strain exceed its skin. For molecular dynamics, use the function `rollout` of mdnum, which records flips.
 
     Args:

@@ -174,7 +174,7 @@ def check_energy(
 
 
 def narrowest(simulation: Simulation, roles: Sequence[str] = ("state", "force", "accumulate")) -> str:
-    """Return the narrowest float type of several roles, by default of the roles energy and force."""
+    """Return the narrowest float type of several roles; the default roles are energy and force."""
     kinds = (carrier(getattr(simulation.policy, role)) for role in roles)
     return max(map(str, kinds), key=unit_roundoff)
 

@@ -246,7 +246,7 @@ def _through(shift: ndarray) -> str:
 
 
 def _both(truth: Truth) -> tuple[ndarray, ndarray, ndarray]:
-    """Return every exact pair twice, once from each of its two atoms."""
+    """Return every exact pair twice, once for each of its two atoms."""
     columns = (truth.i, truth.j), (truth.j, truth.i), (truth.shift, -truth.shift)
     i, j, shift = map(np.concatenate, columns)
     return i, j, shift
@@ -437,7 +437,7 @@ class AreaTally:
 
     @property
     def silent(self) -> int:
-        """Number of failed test cases in which the neighbor list returned no pairs."""
+        """Number of failed test cases for which the neighbor list returned no pairs."""
         return sum(self.codes.get(code, 0) for code in SILENT)
 
     @property

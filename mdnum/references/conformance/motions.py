@@ -1,12 +1,12 @@
 """Test updatable neighbor lists with sequences of the smallest motions that require a rebuild of the list.
 
-A pair just beyond r_cut + padding when the list is built is inside the cutoff after its two atoms have
-approached by the padding; the smallest such motion is along the line between the two atoms. A rebuild
-criterion is sufficient if it tests whether two atoms could have approached by the padding, in any direction
-and for any motion of other atoms. Each sequence of `motions` brings a pair closer by slightly more than the
-padding: along axes, diagonals and random directions; by moving both atoms or one, in any proportion; alone,
-among atoms at rest, among hundreds of atoms that move little, or among atoms with the same motion or a common
-drift; in one step, slowly, or back and forth.
+If a pair is just beyond r_cut + padding when the list is built, it is inside the cutoff after its two atoms
+have approached by the padding; the smallest such motion is along the line between the two atoms. A rebuild
+criterion is sufficient if it tests whether any two atoms could have approached each other by the padding, in
+any direction and for any motion of other atoms. Each sequence of `motions` brings a pair closer by slightly
+more than the padding: along an axis, a diagonal or a random direction; by moving both atoms, in any
+proportion, or one; alone, among atoms at rest, among hundreds of atoms that move little, or among atoms with
+the same motion or a common drift; in one step, slowly, or back and forth.
 """
 
 from __future__ import annotations

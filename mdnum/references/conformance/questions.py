@@ -1,4 +1,4 @@
-"""Test cases for neighbor lists: named cases from past failures, dense clusters, lattices, random cases.
+"""Test cases for neighbor lists: past failures by name, dense clusters, lattices, and random test cases.
 
 For the tests of a library: `@given(cases())` draws test cases with all kinds of boxes and positions, and with
 cutoffs at and between neighbor shells; `boxes()` draws only (cell, pbc, description).
@@ -122,7 +122,7 @@ def _outside() -> Named:
 def _across_walls() -> ndarray:
     """Return pairs along x: one atom just below a multiple of the cutoff, the other almost a cutoff lower.
 
-    If an atom is assigned to the next cell, as happens if rounded to float32, its partner is two cells away.
+    If the atom is assigned to the next cell (by rounding to float32), its partner is two cells away.
     """
     hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
     pairs = []
@@ -165,8 +165,8 @@ def _crowds() -> Named:
 def vast() -> Iterator[Case]:
     """Yield few atoms in a volume so large that a cell grid needs too much memory or 64-bit indices.
 
-    Cases with a very large volume are for neighbor lists in a separate process, since a list that allocates a
-    huge cell grid may be killed.
+    These test cases require a separate process for the neighbor list, since a process that allocates a huge
+    cell grid may be killed.
     """
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
     yield once("two pairs thousands of cutoffs apart, free", "axes", apart)
@@ -175,7 +175,7 @@ def vast() -> Iterator[Case]:
 
 
 def lattice(edge: int, seed: int = 0) -> Case:
-    """Return a cubic lattice with vacancies at integer positions; atom order and images are random.
+    """Return a cubic lattice with vacancies, at integer positions; atom order and images are random.
 
     The neighbors of each atom are on the 26 sites around it; indices modulo the edge give the neighbors
     without search or rounding.

@@ -245,7 +245,7 @@ def _value(name: ast.expr, place: TracebackType) -> Any:
 class RemoteSession:
     """Calls of one named neighbor list in a separate process.
 
-    If the process ends, a new one is started, since a crash is a finding and must not end the suite.
+    If the process ends, a new process is started: a crash is a finding and must not end the suite.
     """
 
     most = np.inf  # seconds that an answer may take, where that is less than usual
@@ -260,7 +260,7 @@ class RemoteSession:
         self._from = 0
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """Return the pairs or the error from every call in a test case, up to the first call without pairs.
+        """Return the pairs or error of each call in a test case, up to the first call that returns no pairs.
 
         Raises:
             TimeUp: the deadline passed during the call; the separate process is terminated.

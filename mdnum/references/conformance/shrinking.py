@@ -73,7 +73,7 @@ def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None)
 
 
 def _only(case: Case, atoms: list[int]) -> Case:
-    """Return the test case with only some atoms; precomputed pairs of a small test case are discarded."""
+    """Return the test case with only some atoms; the precomputed pairs of a small test case are discarded."""
     smaller = case.only(np.array(atoms, int))
     return replace(smaller, known=None) if len(atoms) <= 400 else smaller
 
@@ -128,10 +128,10 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 
 
 def deepest(failures: Failures, failed: Failed) -> Failed:
-    """Move the atoms of a missing pair closer together as long as the pair remains missing.
+    """Move the two atoms of a missing pair closer together as long as the list still omits the pair.
 
-    The atoms continue their motion, so that the reported failure has the smallest distance at which the pair
-    is missing.
+    The atoms continue their motion, so that the reported failure shows the smallest distance at which the
+    list omits the pair.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:

@@ -399,7 +399,7 @@ def distinct(failed: Iterable[Failed]) -> list[Failed]:
     """Return the smallest failure of each kind, since one error can cause failures in many test cases.
 
     Failures with the same code and equal numbers of atoms, calls and periodic axes are counted as one error;
-    exceptions and malformed results are compared by message, ignoring numbers.
+    exceptions and malformed results are the same error if their messages differ only in numbers.
     """
 
     def size(failure: Failed) -> tuple[bool, bool, int, int, int]:
