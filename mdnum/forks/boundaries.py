@@ -1,4 +1,4 @@
-"""Find parameter values at which the decisions of a run change, located to adjacent floats.
+"""Find parameter values at which the decisions of a run change, to within two adjacent floats.
 
 Between two adjacent boundaries, the result of a run is a smooth function of the parameter. At a boundary, two
 adjacent floats lead to different decisions, and every later quantity of the run may jump.
@@ -48,7 +48,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Boundary:
-    """Two adjacent floats for which runs make different decisions, and the first differing decision."""
+    """Two adjacent floats for which runs make different decisions, and the first decision that differs."""
 
     # below, above: the two sides; above.at is the float after below.at
     below: Side

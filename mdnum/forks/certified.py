@@ -92,11 +92,11 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 
 
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """For each step, return how far the pair closest to its cutoff is from it, and the required length.
+    """For each step, return how far the pair closest to its cutoff is from it, and how far it must be.
 
     Each atom may be displaced by the separation of the runs, so the distance of two atoms may change by twice
-    the separation. The margins are taken from the run with the smaller rounding error, which is added to the
-    required distance.
+    the separation. The margins are those of the run with the smaller rounding error; this error is added to
+    the required distance.
     """
     deciders = {"A": fork.twin.a.simulation.decider, "B": fork.twin.b.simulation.decider}
     a, b = deciders.values()
@@ -157,7 +157,7 @@ class AmbiguousDecision:
 
 @dataclass(frozen=True)
 class CertifiedHorizon:
-    """The steps for which all decisions of one run are certain, given the states of that run."""
+    """The steps at which all decisions of one run are certain for the states of this run."""
 
     # first step with an ambiguous decision; every decision before it would have come out the same in exact
     # arithmetic from the same states. None where there is none
@@ -207,7 +207,7 @@ def exact_margin(
     """Compute without rounding the margin of a pair, and the decision that results from this margin.
 
     The positions are the floating-point numbers of the state, taken as exact. The threshold and the lattice
-    vectors are the double-precision numbers of the system, as in the exact program, whatever the dtype of the
+    vectors are the double-precision numbers of the system, as in the exact program, for any dtype of the
     decision. The margin, expressed as a distance, is accurate to 400 binary digits; the decision is exact.
 
     Args:

@@ -1,7 +1,7 @@
-"""Energies, forces and stress in plain numpy on ASE's neighbor list, computed from the formulas alone.
+"""Energies, forces and stress from the formulas alone, computed in plain numpy on ASE's neighbor list.
 
-The numpy code is independent of the code used in a run (each cutoff has its own numpy `reference`). It is the
-reference if ASE has no class for a potential or a cutoff, and an additional reference otherwise.
+The numpy code is independent of the code used in a run (each cutoff has its own numpy `reference`). This code
+is the reference if ASE has no class for a potential or a cutoff, and otherwise an additional one.
 
 A model takes directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
 the total energy with respect to every d. Forces and stress follow from the gradient g of the energy with
@@ -46,7 +46,7 @@ SLACK = 1e-12  # what `edges_of` adds to the length it is asked for, relative
 def edges_of(atoms: Atoms, reach: float) -> Edges:
     """Return the pairs within slightly more than `reach`, in both directions, from ASE's neighbor list.
 
-    ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster at 500 atoms than ASE's
+    ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster for 500 atoms than ASE's
     neighbor_list. ASE lists only pairs with r < reach, while the model decides whether r = reach is inside;
     the list therefore extends farther, by SLACK.
     """
@@ -148,7 +148,7 @@ class PairForm:
         return quantity <= threshold if comparison == "<=" else quantity < threshold
 
     def bare(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
-        """Return the pair energy u(r) and its derivative u'(r) without a cutoff."""
+        """Return the pair energy u(r) without a cutoff, and its derivative u'(r)."""
         # by class: a function of somebody's own may be called like one of them
         return _BARE.get(type(self.potential), self.potential.reference)(r, **self.constants)
 
@@ -217,7 +217,7 @@ class PairModel(Model):
 
     @classmethod
     def of(cls, model: CutPotential | Channels, symbols: Sequence[str], compare: str) -> PairModel:
-        """Return the model of a potential with cutoff; arguments as for `pair_forms`."""
+        """Return the model of a potential with cutoff; the arguments are those of `pair_forms`."""
         parts = model.terms.values()
         weights = [np.asarray(part.weights[0]) if part.weights else None for part in parts]
         forms = [pair_forms(part, symbols, compare) for part in parts]

@@ -71,7 +71,7 @@ def exactly_inside(
 ) -> bool:
     """Decide in exact arithmetic whether a pair is inside r_cut; if `closed`, r == r_cut counts as inside.
 
-    In exact arithmetic, r < r_cut and r² < r_cut² are equivalent; rounding can make them differ.
+    In exact arithmetic, r < r_cut and r² < r_cut² are equivalent; with rounding, they may differ.
     """
     squared, threshold = Fraction(0), Fraction(float(r_cut)) ** 2
     for axis in range(3):

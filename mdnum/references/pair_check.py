@@ -241,7 +241,7 @@ def check_pairs(
     searches: Sequence[Search] | None = None,
     effective: bool = True,
 ) -> PairsReport:
-    """Compare the pairs that every neighbor search finds inside the cutoff with brute force.
+    """Find pairs inside the cutoff by every neighbor search, and compare these with brute force.
 
     Each neighbor search is run once for each cutoff radius of the species pairs. Brute force uses the
     comparison (< or <=) of the system file, in rational arithmetic near the cutoff. If only decisions near
@@ -300,7 +300,7 @@ def check_pairs(
 
 
 def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: float) -> tuple[int, int, int]:
-    """Return the numbers of (missing, extra, borderline) pairs of a neighbor search, from brute force.
+    """Compare with brute force; return the numbers of (missing, extra, borderline) pairs of a search.
 
     Args:
         i, j: pairs from the neighbor search, i <= j, one row per periodic image.
@@ -324,7 +324,7 @@ def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: f
 
 @dataclass(frozen=True)
 class EffectiveCutoff:
-    """The cutoff that a neighbor search actually applies when r_cut is requested."""
+    """The cutoff that a neighbor search actually applies if a cutoff r_cut is requested."""
 
     r_cut: float  # the cutoff asked for
     last_counted: float  # largest distance along x at which the pair is still counted

@@ -1,8 +1,8 @@
 """Choices of arithmetic: the floating-point format of each role, and the order in which sums are computed.
 
-The order of a sum is given by the reduction, or by the order of pairs in neighbor lists, which depends on how
-and when the lists are built. A different order of a sum does not change which pairs interact if every list is
-rebuilt before motion exceeds the skin. If sums do not depend on order, a different order must have no effect.
+The order of a sum is set by the reduction, or by neighbor lists: their order of pairs depends on how and when
+they are built. A different order of a sum does not change which pairs interact if every list is rebuilt
+before motion exceeds the skin. If sums do not depend on their order, a different order must have no effect.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class Choice:
 
     @property
     def argument(self) -> str:
-        """Argument of the choice as text, as written after "="."""
+        """Argument of the choice, as the text that is written after "="."""
         values = {one.name: getattr(self, one.name) for one in self._fields()}
         if not self.shown and all(values[one.name] == one.default for one in self._fields()):
             return ""
@@ -117,7 +117,7 @@ def choice(family: str | None):
 
 
 def shipped(world: str) -> dict[str, Choice]:
-    """Return the built-in choices for molecular dynamics or balls that are tested by default, by name."""
+    """Return, by name, the built-in choices for molecular dynamics or balls that are tested by default."""
 
     def of_family(kind: type[Choice]) -> Iterable[Choice]:
         words = kind.screened if isinstance(kind.screened, str) else kind.screened[world]
