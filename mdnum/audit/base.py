@@ -149,7 +149,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of one check, as plain values in eV and Å."""
+    """Result of one check, as plain values in units of eV and Å."""
 
     says: tuple[list[str], dict[str, Any]]  # its summary: names of sentences, and values for all of them
     findings: list[Observed] = field(default_factory=list)

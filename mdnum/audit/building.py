@@ -245,8 +245,8 @@ def water(edge: int = 4) -> Atoms:
 def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
     """Return the processor time of an energy and force calculation, the smaller of two measurements, s.
 
-    The time of the calculator's child processes is included. The time of other programs is excluded, so that
-    the chosen structure does not depend on the load of the machine.
+    This time includes the time of the calculator's child processes. The time of other programs is not
+    included, so that the chosen structure does not depend on the load of the machine.
     """
 
     def clock() -> float:

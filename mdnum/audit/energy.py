@@ -392,7 +392,7 @@ def balance(
 
 @dataclass(frozen=True)
 class Drift:
-    """Rate of change of a quantity with time, and its standard error."""
+    """Rate at which a quantity changes with time, and the standard error of this rate."""
 
     slope: float  # per unit of time
     error: float  # standard error of it, from blocks
@@ -414,8 +414,8 @@ class Drift:
 def drift(time: Steps, values: Steps) -> Drift:
     """Return the slope of a straight line fitted to block averages, with its standard error.
 
-    Values at neighboring time steps are correlated. Blocks are longer than the correlation time, so block
-    averages are independent if the run is long enough. At least 16 values are required.
+    Values at neighboring time steps are correlated. Blocks are longer than the correlation time, so that
+    averages of different blocks are independent if the run is long enough. At least 16 values are required.
     """
     blocks = np.array_split(np.arange(len(values)), _BLOCKS)
     x, y = ([float(row[block].mean()) for block in blocks] for row in (time, values))

@@ -94,7 +94,7 @@ class Pair:
         return self.surrounded(self.first + self.second)
 
     def surrounded(self, atoms: Atoms, middle: bool = False) -> Atoms:
-        """Put atoms into the cell of the pair; `middle` moves the atoms to its center."""
+        """Put atoms into the cell of the pair; if `middle`, move the atoms to the center of this cell."""
         if self.box:
             atoms.set_cell([self.box] * 3)
             if middle:

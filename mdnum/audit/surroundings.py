@@ -81,7 +81,7 @@ class Route:
         return Curve(at)
 
     def crossings(self, thresholds: Sequence[PairThreshold], low: float, high: float) -> list[RouteCrossing]:
-        """Return the points between low and high at which the moving atom crosses a threshold distance.
+        """Return the points between `low` and `high` at which the moving atom crosses a threshold distance.
 
         The squared distance along a line is quadratic, so the points are roots of quadratic equations.
         """

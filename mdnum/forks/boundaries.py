@@ -229,8 +229,8 @@ def boundaries(
     differ, the cell is bisected until its ends are adjacent floats. If the other half of the cell also
     contains a change of decisions, this half is searched later. Boundaries are searched from the lowest
     parameter value upward; if more exist than were requested, the highest are missing. All runs use the
-    program of a normal run; to vary the cutoff radius, the program takes it as an argument. The runs on both
-    sides of every boundary are repeated in a new process.
+    program of a normal run; to vary the cutoff radius, the program takes it as an argument. A new process
+    repeats the runs on both sides of every boundary.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.

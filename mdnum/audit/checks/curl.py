@@ -112,7 +112,7 @@ def agreed(tried: Sequence[Loop]) -> Loop:
 def _planes(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator
 ) -> Iterator[tuple[str, Displacement, Displacement]]:
-    """Yield planes of two orthonormal displacements: of all atoms, of one atom, or of a pair of atoms."""
+    """Yield planes, each spanned by two orthonormal displacements of all atoms, one atom or a pair."""
     count = len(atoms)
     if count > 1:
         for number in range(3):

@@ -241,7 +241,7 @@ def plural(count: int, noun: str) -> str:
 
 
 def summing(both: str | None) -> str:
-    """Return a phrase that describes how both runs compute sums."""
+    """Return a phrase that describes how the two runs compute sums."""
     return "" if both is None else f" (both with {both} sums)"
 
 
