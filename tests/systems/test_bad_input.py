@@ -106,7 +106,7 @@ OWN, PAIR = "epsilon = 0.0103235", "{ sigma = 1.0, epsilon = 1.0 }"
         ('"hard"\nradius = 8.0', '"switched"\nradius = 8.0\nonset = 8.0', 12, "not below the cutoff"),
         ("radius = 8.0", "", 12, "[cutoff] … radius is missing … in_sigma"),
         ("radius = 8.0", "radius = 8.0\nin_sigma = 2.5", 12, "given twice"),
-        ("epsilon = 0.0103235", "", 7, "[potential] … epsilon are missing"),
+        ("epsilon = 0.0103235", "", 7, "[potential] … epsilon missing"),
         (CUTOFF, "", None, "[cutoff] is missing"),
         (LJ, 'kind = "tersoff"', 10, "[cutoff]"),
         (f"[structure]\n{FILE}", "", None, "table [structure] missing"),
