@@ -142,7 +142,8 @@ def strangers_folder(
     """The current folder, in which files with the names of packages tell that they were run."""
     folder = tmp_path_factory.mktemp("stranger")
     ran = folder / "ran"
-    for name in ("jax", "numpy", "ase", "pydantic", "typer", "typing_extensions", "vesin", "matplotlib"):
+    packages = "jax numpy ase pydantic typer typing_extensions vesin matplotlib loky cloudpickle"
+    for name in packages.split():
         (folder / f"{name}.py").write_text(f"open({str(ran)!r}, 'a').write('{name} ')\nraise ImportError\n")
     monkeypatch.chdir(folder)
     yield folder

@@ -80,7 +80,8 @@ def print_reply(reply: Reply, as_json: bool) -> int:
             (print_records if len(one) == 2 else print_table)(*one)
         else:
             print_findings([one])
-    return exit_code([one for one in reply.shown if hasattr(one, "severity")], reply.status)
+    code = exit_code([one for one in reply.shown if hasattr(one, "severity")], reply.status)
+    return EXIT_STOPPED if reply.status == "stopped" else code
 
 
 def say(text: str, *, err: bool = False) -> None:

@@ -272,6 +272,7 @@ def boundaries(
                 line.known |= runs_made
                 edges += [] if edge is None else [edge]
                 count += 1
+        searched.close()
     if confirm and edges:
         edges = _confirmed(system, line, edges, note)
     return _mapped(line, edges)
@@ -355,6 +356,8 @@ def digests_elsewhere(
         MdnumError: the process failed.
     """
     with engines.opened(None, 1) as fresh:
+        # others need cores, too
+        fresh.threads = 1
         data = packed(system, key, steps)
         yield from engines.in_order(_digest, ((data, value) for value in values), fresh)
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from mdnum.ball.limits import DTYPES, rounded
 from mdnum.program import Program, Twin
 from mdnum.systems import BallSystem, opened
-from mdnum.systems.code import allow_code, is_allowed
 from mdnum.systems.toml import flat
 
 if TYPE_CHECKING:
@@ -53,8 +52,10 @@ def packed(system: Simulation | BallSystem, *more: Any) -> bytes:
     """
     import cloudpickle
 
-    own = system if isinstance(system, BallSystem) else system.file or system
-    return cloudpickle.dumps((is_allowed(), own, *more))
+    own: Any = system if isinstance(system, BallSystem) else system.file or system
+    if getattr(own, "path", None):
+        own = replace(own, path=own.path.absolute())
+    return cloudpickle.dumps((own, *more))
 
 
 @lru_cache(1)
@@ -62,9 +63,8 @@ def unpacked(data: bytes) -> tuple[Any, ...]:
     """Restore objects pickled by `packed`; keep the last one, so that its programs are compiled once."""
     import cloudpickle
 
-    allowed, own, *more = cloudpickle.loads(data)
-    with allow_code(allowed):
-        return opened(own), *more
+    own, *more = cloudpickle.loads(data)
+    return opened(own), *more
 
 
 def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> Any:

@@ -108,7 +108,7 @@ def independent(subject: Simulation | System) -> Reference:
     if isinstance(model, EnergyFunction):
         conversion = "none: the function, compiled for itself alone"
         return Reference(ENERGY, False, conversion, lambda: EnergyOnNeighborList(model))
-    again = {tetrahedral.Tersoff: TersoffModel}.get(type(model), StillingerWeberModel)
+    again = TersoffModel if isinstance(simulation.model, tetrahedral.Tersoff) else StillingerWeberModel
     own = simulation.pairwise and all(isinstance(one.potential, PairFunction) for one in model.terms.values())
     return Reference(
         ITSELF if own else "plain numpy on ASE's neighbor list",

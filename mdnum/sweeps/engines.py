@@ -31,6 +31,7 @@ from mdnum.reading import whole_text
 from mdnum.safe_path import guard
 from mdnum.sweeps.points import code
 from mdnum.systems import toml
+from mdnum.systems.code import allow_code, is_allowed
 
 #: Number of times that the process of a task may die before the task counts as failed; the last time the task
 #: runs alone.
@@ -71,20 +72,21 @@ def _pinned(width: int) -> None:
 
 
 def _answered(
-    work: Callable[[Any], Any], task: Any, caller: tuple[str, int, str], width: int
+    work: Callable[[Any], Any], task: Any, caller: tuple[str, int, str, bool], width: int
 ) -> tuple[Any, Exception | None]:
     """Return a task's result or its exception, so that only errors of the engine itself are raised."""
-    host, pid, versions = caller
+    host, pid, versions, allowed = caller
     if (socket.gethostname(), os.getpid()) != (host, pid):
         _pinned(width)
     try:
-        if code() != versions:
+        if code(everywhere=True) != versions:
             raise InputError(
                 "a worker has another version of mdnum, jax or numpy than the process that started it",
                 where=f"{sys.prefix} on {socket.gethostname()}",
                 remedy="Use the same environment: results depend on these versions",
             )
-        return work(task), None
+        with allow_code(allowed):
+            return work(task), None
     except Exception as error:
         with suppress(Exception):
             pickle.loads(pickle.dumps(error))
@@ -122,13 +124,22 @@ class Engine:
 def _local(workers: int | None) -> Engine:
     """Return an engine that starts local processes, which do not import the main script of the user."""
     from loky import get_reusable_executor  # noqa: F401 (its pool starts processes by fork and exec)
+    from loky.backend import resource_tracker
     from loky.backend.context import get_context
     from loky.process_executor import ProcessPoolExecutor
 
     count = workers or cores()
     context, of = get_context("loky"), (os.getpid(),)
     # loky replaces a worker that has grown by 300 MB, which compiled programs take soon; guard limits memory
-    env = {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e15"}
+    env = {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e15", "PYTHONSAFEPATH": "1"}
+    # a file of the current folder must not take the place of a module in the processes that loky starts
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        os.environ.pop("PYTHONSAFEPATH")
+        os.environ.update({} if before is None else {"PYTHONSAFEPATH": before})
     return Engine(
         lambda: ProcessPoolExecutor(count, context=context, initializer=guard, initargs=of, env=env), count,
         max(1, cores() // count), lambda pool: pool.shutdown(wait=False, kill_workers=True),  # type: ignore[call-arg]
@@ -273,7 +284,7 @@ def computed(
         InputError: no such engine, or an engine that fails repeatedly.
     """
     waiting, alone, tries, idle = deque(range(len(tasks))), deque[int](), [0] * len(tasks), 0
-    caller = socket.gethostname(), os.getpid(), code()
+    caller = socket.gethostname(), os.getpid(), code(everywhere=True), is_allowed()
     with opened(on, workers) as engine:
         running: dict[Future[Any], int] = {}
         try:
@@ -352,18 +363,31 @@ def in_order(
         MdnumError: a task failed, or three processes that were working on it ended without a result.
     """
     if engine is None:
-        yield from map(work, tasks)
+        for task in tasks:
+            try:
+                result = work(task)
+            except Exception as error:
+                if not keep:
+                    raise
+                result = _as_error(error)
+            yield result
         return
     found, next_one = dict[int, Any](), 0
     for (k, _), result in computed(partial(_numbered, work), list(enumerate(tasks)), on=engine):
         found[k] = result
-        if isinstance(result, BaseException) and not isinstance(result, MdnumError):
-            found[k] = MdnumError(f"a worker gave no result: {type(result).__name__}: {result}")
+        if isinstance(result, BaseException):
+            found[k] = _as_error(result)
         while next_one in found:
             result, next_one = found.pop(next_one), next_one + 1
             if isinstance(result, MdnumError) and not keep:
                 raise result
             yield result
+
+
+def _as_error(error: BaseException) -> MdnumError:
+    if isinstance(error, MdnumError):
+        return error
+    return MdnumError(f"a task gave no result: {type(error).__name__}: {error}")
 
 
 def _numbered(work: Callable[[Any], Any], task: tuple[int, Any]) -> Any:

@@ -52,11 +52,17 @@ _ARITHMETIC = ("jax", "jaxlib", "numpy", "llvmlite")
 
 
 @cache
-def code() -> str:
-    """Return a digest of the source code that computes points, and of the versions of numerical packages."""
+def code(everywhere: bool = False) -> str:
+    """Return a digest of the source code that computes points, and of the versions of numerical packages.
+
+    Args:
+        everywhere: whether to include all source code of mdnum.
+    """
     versions = package_versions()
     packages = json.dumps([versions.get(name) for name in _ARITHMETIC])
-    return hashlib.sha256((digest(_COMPUTES) + packages).encode()).hexdigest()[:16]
+    return hashlib.sha256(
+        (digest(("**/*.py",) if everywhere else _COMPUTES) + packages).encode()
+    ).hexdigest()[:16]
 
 
 def digest(places: Sequence[str]) -> str:

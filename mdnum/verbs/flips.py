@@ -185,7 +185,7 @@ def flips_each(
 
     Returns:
         an outcome for each trajectory, or the error if the trajectory cannot be used, in the order of the
-        trajectories.
+        trajectories; if interrupted, up to the outcome of the interrupted one.
 
     Raises:
         InputError: no such engine, or an engine that fails repeatedly.
@@ -204,7 +204,7 @@ def flips_each(
             say(progress, f"{file.name} ({done + 1} of {len(tasks)})", done, len(tasks), unit="files")
             made.append(one := next(results))
             if isinstance(one, Outcome) and one.summary["interrupted"]:
-                raise KeyboardInterrupt
+                break
     return made
 
 
@@ -241,10 +241,11 @@ def command(
 
 
 def _replied(trajectories: Sequence[str], **given: Any) -> Reply:
-    rows, fine = [], True
-    for file, one in zip(trajectories, flips_each(trajectories, **given), strict=True):
+    rows, fine, stopped = [], True, False
+    for file, one in zip(trajectories, flips_each(trajectories, **given), strict=False):
         if isinstance(one, Outcome):
             found = [finding.code for finding in one.findings if finding.severity in ("warning", "error")]
+            stopped = one.summary["interrupted"]
             told = {"folder": one.path, "frames": one.summary["frames"], "headline": one.verdict.headline,
                     "flips": [rule["flips"] for rule in one.summary["rules"]], "error": None}  # fmt: skip
         else:
@@ -256,7 +257,8 @@ def _replied(trajectories: Sequence[str], **given: Any) -> Reply:
         for row in rows
     ]
     shown = [("", ("file", "result", "warnings and errors", "folder"), lines)]
-    return Reply(headed("flips-each", {"files": rows}), shown, "complete" if fine else "failed")
+    status = "stopped" if stopped else "complete" if fine else "failed"
+    return Reply(headed("flips-each", {"files": rows}), shown, status)
 
 
 @dataclass

@@ -18,6 +18,7 @@ import pytest
 import mdnum
 from mdnum.errors import InputError
 from mdnum.sweeps.engines import computed, in_order, requested
+from mdnum.systems.code import is_allowed
 
 
 class Twice(Exception):
@@ -47,11 +48,28 @@ def test_an_exception_of_the_work_is_an_answer():
 
 def test_a_worker_of_other_code_computes_nothing(tmp_path, monkeypatch):
     versions = iter(["of this process", "of the worker"])
-    monkeypatch.setattr("mdnum.sweeps.engines.code", lambda: next(versions))
+    monkeypatch.setattr("mdnum.sweeps.engines.code", lambda **_: next(versions))
     with ThreadPoolExecutor(1) as pool:
         ((_, error),) = computed(noted, [str(tmp_path)], on=pool)
     assert isinstance(error, InputError) and "another version of mdnum" in str(error)
     assert not list(tmp_path.iterdir())
+
+
+def allowed(task: int) -> bool:
+    return is_allowed()
+
+
+def test_code_of_files_is_executed_elsewhere_where_the_caller_allows_it():
+    with ThreadPoolExecutor(1) as pool, requested(pool, 1) as engine:
+        with mdnum.allow_code():
+            assert [*in_order(allowed, [0], engine)] == [True]
+        assert [*in_order(allowed, [0], engine)] == [False]
+
+
+@pytest.mark.nightly
+def test_files_of_the_current_folder_are_no_modules_of_workers(strangers_folder):
+    with requested(None, 1) as engine:
+        assert [*in_order(doubled, [1, 2], engine)] == [2, 4]
 
 
 def doubled(task: int) -> int:
@@ -70,6 +88,7 @@ def test_results_come_in_the_order_of_tasks_and_here_no_sooner_than_requested():
 
     here = in_order(doubled, tasks(), None)
     assert (next(here), taken) == (4, [2])
+    assert [str(one) for one in in_order(doubled, [1, 3, 2], None, keep=True)] == ["2", "three.", "4"]
     with ThreadPoolExecutor(2) as pool, requested(pool, 2) as engine, requested(None, None) as none:
         assert none is None and engine is not None
         kept = [*in_order(doubled, tasks(), engine, keep=True)]

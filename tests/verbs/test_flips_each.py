@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,17 @@ def test_from_the_command_line_a_line_for_each(folder, capsys):
     assert [row["file"] for row in rows] == [*FILES[:3]]
     assert [row["frames"] for row in rows] == [4, None, 5] and "no.extxyz" in rows[1]["error"]
     assert rows[0]["flips"] == [len(mdnum.read(rows[0]["folder"]).table("flips"))] != [0]
+
+
+def test_what_was_found_before_control_c_is_shown(folder, capsys, monkeypatch):
+    def until_pressed(file, **options):
+        one = mdnum.flips(file, **options)
+        return replace(one, summary={**one.summary, "interrupted": file.name.startswith("b")})
+
+    monkeypatch.setattr("mdnum.verbs.flips.flips", until_pressed)
+    files = ("a.extxyz", "b.extxyz", "a.extxyz")
+    assert call("flips", "--each", *files, "--cutoff", "3", "-o", "here", "--no-report", "--json") == 130
+    assert [row["file"] for row in json.loads(capsys.readouterr().out)["files"]] == [*files[:2]]
 
 
 @pytest.mark.parametrize("words", [("a", "b", "c"), ("a", "--workers", "2"), ("a", "--on", "tcp://x:1")])
