@@ -16,7 +16,7 @@ import tempfile
 import threading
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager, suppress
 from copy import deepcopy
@@ -351,7 +351,7 @@ def requested(on: str | Executor | None, workers: int | None) -> Iterator[Engine
 
 def in_order(
     work: Callable[[Any], Any], tasks: Iterable[Any], engine: Engine | None, *, keep: bool = False
-) -> Iterator[Any]:
+) -> Generator[Any, None, None]:
     """Yield the results of tasks in the order of the tasks.
 
     Args:
