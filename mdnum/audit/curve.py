@@ -83,7 +83,7 @@ def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
 def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
     """Estimate rounding noise of energy and force (columns), just below `low` and just above `high` (rows).
 
-    The largest estimate for several spacings is used, since float32 values do not change over small spacings.
+    Several spacings are tried and the largest estimate is used: float32 values at close points can be equal.
     """
     sides = []
     for start, sign in ((low, -1.0), (high, 1.0)):

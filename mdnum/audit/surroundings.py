@@ -132,7 +132,7 @@ class EnvironmentWalks:
 
     @property
     def lower(self) -> list[Event]:
-        """Events at pair thresholds at which a lower energy derivative jumps than for two isolated atoms."""
+        """Crossings of pair thresholds at which the energy is less smooth than for two isolated atoms."""
         return [one for one in self.events if one.threshold and one.jump.order < min(one.threshold.order, 2)]
 
 

@@ -91,8 +91,8 @@ class BallProgram:
         kinds = [type(one.problem.world.contact).__name__ for one in (self, other)]
         if kinds[0] != kinds[1] or (self.problem.world.lift is None) != (other.problem.world.lift is None):
             raise InputError(
-                f"the contacts {kinds[0]} and {kinds[1]} make different kinds of decisions",
-                remedy="Compare programs with the same kind of contact",
+                f"the contact models {kinds[0]} and {kinds[1]} involve different kinds of decisions",
+                remedy="Compare only programs with the same kind of contact model",
             )
         if self.size != other.size:
             raise InputError(

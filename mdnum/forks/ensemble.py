@@ -1,7 +1,7 @@
-"""Run from perturbed starts, measure features of these runs, and create deliberately changed programs.
+"""Measure properties of runs with perturbed initial states, and modify programs to test the verdicts.
 
-Every feature is a continuous function of the positions, so that small differences between the runs of an
-ensemble remain small in the features. Pairs are therefore counted with hat functions and not in bins.
+Every property (feature) is a continuous function of the positions, so that a small difference between two
+runs changes the property only slightly. Pairs are therefore counted with hat functions and not in bins.
 """
 
 from __future__ import annotations

@@ -117,8 +117,8 @@ def fork(
     Args:
         twin: the pair of programs.
         steps: last step; default the last step of the system. A comparison of molecular-dynamics runs ends at
-            twice the step of the split at the latest. If the split is near the last step, the runs continue
-            to 1.2 times the step of the split, to distinguish a cause from a delay.
+            twice the step number of the split at the latest. If the split is near the last step, the runs
+            continue to 1.2 times the step number of the split, to distinguish a cause from a delay.
         split: separation that counts as a split, length; default 0.01 of the longest cutoff or start height.
         counterfactual: whether to run B under A's decisions, which is impossible for many-body potentials.
         back: whether to run A under B's decisions too; default: only if B is run under A's decisions.

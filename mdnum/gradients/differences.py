@@ -280,7 +280,7 @@ class Replicas:
     def __post_init__(self):
         if self.count < 2 or self.settle < 0:
             seen = f"replicas = {self.count}, settle = {self.settle}"
-            raise InputError(f"{seen}; expected at least 2 replicas, and 0 or more steps before each start")
+            raise InputError(f"{seen}; expected at least 2 replicas with 0 or more equilibration steps each")
 
     def of(self, problem: Problem) -> list[Problem]:
         """Return a list of problems, one for each replica (initial state)."""

@@ -201,7 +201,7 @@ class MeanTemperature(Loss):
 
 
 class MeanPressure(Loss):
-    """Pressure (2 K + virial) / (3 V), averaged over frames, energy/length³."""
+    """Pressure (2 K + virial) / (3 V), averaged over frames, in units of energy/length³."""
 
     name, label, unit = "pressure", "pressure, averaged over steps", "{energy}/{length}³"
     of_single_frames = needs_volume = True
@@ -211,7 +211,7 @@ class MeanPressure(Loss):
 
 
 class MeanVolume(Loss):
-    """Volume of the periodic box, averaged over frames, length³."""
+    """Volume of the periodic box, averaged over frames, in units of length³."""
 
     name, label, unit = "volume", "volume of the box, averaged over steps", "{length}³"
     of_single_frames = needs_volume = True

@@ -22,8 +22,8 @@ def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3
 
     The largest eigenvalue of the mass-weighted Hessian is found by a Lanczos iteration with finite
     differences of forces. Forces are shifted to zero at the cutoff, to avoid jumps when pairs cross the
-    cutoff between two evaluations. The shift does not change second derivatives of the energy except for a
-    small transverse term.
+    cutoff between two evaluations. Force-shifting the potential changes the second derivatives of the energy
+    only by a small transverse term.
 
     Args:
         simulation: the system as objects.

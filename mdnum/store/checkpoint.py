@@ -73,7 +73,7 @@ def _arrays(file: BinaryIO) -> dict[str, np.ndarray]:
         members = archive.infolist()
         # members that are not packed and share no bytes cannot hold more than the file
         if any(one.compress_type != zipfile.ZIP_STORED for one in members):
-            raise ValueError("the checkpoint file is compressed, but mdnum writes it uncompressed")
+            raise ValueError("the checkpoint is compressed, but mdnum writes checkpoint files uncompressed")
         held = sum(one.file_size for one in members)
         if held > size:
             raise ValueError(f"the header states {held:,} bytes of data, but the file has only {size:,}")

@@ -55,7 +55,7 @@ class Truth(PairSet):
 
 
 def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DOUBLE) -> Truth:
-    """Compute the exact pairs of a test case at one of its neighbor-list calls.
+    """Compute the exact set of pairs that one neighbor-list call of a test case must or may return.
 
     Args:
         reach: largest distance of the pairs, length; the cutoff by default.
