@@ -222,7 +222,7 @@ def run() -> Demo:
         plots=[_errors(histories)],
         in_md=(
             "The force on an atom is such a sum over its neighbors, in the order of the list. The same "
-            "table can be made for this sum (running_sum_table with the terms recorded by a Tap)."
+            "table can be made for this sum."
         ),
         data={
             "penetrations": TERMS.astype(float),
