@@ -111,7 +111,7 @@ def _separation(view: View) -> Iterator[Plot | str]:
         at = np.linspace(fit["first"], guess if shown else fit["last"], 60)
         line = np.exp(fit["intercept"] + fit["rate"] * at)
         series.append(Series("growth, fitted", at, line, role="ink", dashed=True))
-    what = "largest difference of heights" if "balls" in s else "largest distance of an atom from itself"
+    what = "largest difference of heights" if "balls" in s else "largest distance of an atom between runs"
     yield TEXTS.plot(
         "separation", series, verticals, [(float(s["tolerance"]), "split tolerance")], what=what,
         timestep=s["timestep"], time=view.units.time, length=view.units.length,
