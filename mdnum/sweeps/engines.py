@@ -94,7 +94,7 @@ def _answered(
         return None, RuntimeError(f"{type(error).__name__}: {error}")
 
 
-class Engine:
+class TaskEngine:
     """An executor of tasks, which can be replaced when broken, and closed at the end."""
 
     def __init__(
@@ -121,7 +121,7 @@ class Engine:
                 self.end(self.executor)
 
 
-def _local(workers: int | None) -> Engine:
+def _local(workers: int | None) -> TaskEngine:
     """Return an engine that starts local processes, which do not import the main script of the user."""
     from loky import get_reusable_executor  # noqa: F401 (its pool starts processes by fork and exec)
     from loky.backend import resource_tracker
@@ -140,13 +140,13 @@ def _local(workers: int | None) -> Engine:
     finally:
         os.environ.pop("PYTHONSAFEPATH")
         os.environ.update({} if before is None else {"PYTHONSAFEPATH": before})
-    return Engine(
+    return TaskEngine(
         lambda: ProcessPoolExecutor(count, context=context, initializer=guard, initargs=of, env=env), count,
         max(1, cores() // count), lambda pool: pool.shutdown(wait=False, kill_workers=True),  # type: ignore[call-arg]
     )  # fmt: skip
 
 
-def _dask(address: str, workers: int | None) -> Engine:
+def _dask(address: str, workers: int | None) -> TaskEngine:
     try:
         from dask.distributed import Client
     except ImportError:
@@ -160,7 +160,7 @@ def _dask(address: str, workers: int | None) -> Engine:
         return clients[0].get_executor(pure=False, retries=0)
 
     try:
-        engine = Engine(make, 1, 1, lambda _: clients[0].close(timeout=5))
+        engine = TaskEngine(make, 1, 1, lambda _: clients[0].close(timeout=5))
     except OSError as error:
         remedy = "Start the scheduler and a worker: dask scheduler; dask worker tcp://host:port"
         raise InputError(f"no dask scheduler responds: {error}", where=address, remedy=remedy) from None
@@ -170,7 +170,7 @@ def _dask(address: str, workers: int | None) -> Engine:
     return engine
 
 
-def _executorlib(file: str, workers: int | None) -> Engine:
+def _executorlib(file: str, workers: int | None) -> TaskEngine:
     """Return an engine from executorlib, with the class (default SLURM jobs) and keywords in a TOML file."""
     try:
         import executorlib  # pyright: ignore[reportMissingImports]
@@ -219,7 +219,7 @@ def _executorlib(file: str, workers: int | None) -> Engine:
             # of those at work: the others have ended their jobs
             subprocess.run(["scancel", f"--name={job}"], capture_output=True)
 
-    return Engine(
+    return TaskEngine(
         make, int(keywords.get("max_workers", 1)), int(resources.get("threads_per_core", 1)), end,
         ExecutorlibSocketError, lambda: all(thread.is_alive() for thread in feeders),
     )  # fmt: skip
@@ -233,7 +233,7 @@ def _ends_with(parent: int) -> dict[str, Any]:
 
 
 @contextmanager
-def opened(on: str | Executor | Engine | None, workers: int | None) -> Iterator[Engine]:
+def opened(on: str | Executor | TaskEngine | None, workers: int | None) -> Iterator[TaskEngine]:
     """Context manager: make an engine from None (local processes), a dask address, a file or an executor.
 
     An executor that the caller passes remains open.
@@ -241,14 +241,14 @@ def opened(on: str | Executor | Engine | None, workers: int | None) -> Iterator[
     Raises:
         InputError: the engine is unknown, or its package is not installed.
     """
-    if isinstance(on, Engine):
+    if isinstance(on, TaskEngine):
         yield on
         return
     if on is None:
         engine = _local(workers)
     elif not isinstance(on, str):
         width = workers or getattr(on, "_max_workers", cores())
-        engine = Engine(lambda: on, width, max(1, cores() // width))
+        engine = TaskEngine(lambda: on, width, max(1, cores() // width))
     elif on.startswith(("tcp://", "tls://", "ucx://")):
         engine = _dask(on, workers)
     elif on.endswith(".toml"):
@@ -265,7 +265,7 @@ def computed(
     work: Callable[[Any], Any],
     tasks: Sequence[Any],
     *,
-    on: str | Executor | Engine | None = None,
+    on: str | Executor | TaskEngine | None = None,
     workers: int | None = None,
     lost: Callable[[Any, str], bool] = lambda task, why: True,
 ) -> Iterator[tuple[Any, Any]]:
@@ -340,7 +340,7 @@ def computed(
 
 
 @contextmanager
-def requested(on: str | Executor | None, workers: int | None) -> Iterator[Engine | None]:
+def requested(on: str | Executor | None, workers: int | None) -> Iterator[TaskEngine | None]:
     """Context manager that yields the requested engine, or None (this process) if none was requested."""
     if on is None and workers is None:
         yield None
@@ -350,7 +350,7 @@ def requested(on: str | Executor | None, workers: int | None) -> Iterator[Engine
 
 
 def in_order(
-    work: Callable[[Any], Any], tasks: Iterable[Any], engine: Engine | None, *, keep: bool = False
+    work: Callable[[Any], Any], tasks: Iterable[Any], engine: TaskEngine | None, *, keep: bool = False
 ) -> Generator[Any, None, None]:
     """Yield the results of tasks in the order of the tasks.
 

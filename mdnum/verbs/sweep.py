@@ -19,7 +19,6 @@ from mdnum.sweeps.engines import TRIES, computed
 from mdnum.sweeps.measures import USUAL
 from mdnum.sweeps.plan import Plan, Planned, Question, Setting, planned
 from mdnum.sweeps.points import Workspace, gone
-from mdnum.systems.code import is_allowed
 from mdnum.verbs import frame
 from mdnum.verbs.frame import Keep, Outcome, Verb
 from mdnum.verbs.sweep_page import judge, page
@@ -101,12 +100,12 @@ def sweep(
         root = Path(points_in) if points_in is not None else answer.folder.path.parent / "sweep-points"
         place = Workspace(root)
         place.swept()
-        counts = _compute(place, plan, answer.log, on, workers, keep_runs, is_allowed())
+        counts = _compute(place, plan, answer.log, on, workers, keep_runs)
         answer.tables, answer.summary = analyzed(place, plan)
         if joint := recommended(plan, answer.summary["advice"]):
             # what was found by varying one choice at a time is run together
             plan = planned(system, over, replace(question, joint=joint), keep.get("overrides"))
-            more = _compute(place, plan, answer.log, on, workers, keep_runs, is_allowed())
+            more = _compute(place, plan, answer.log, on, workers, keep_runs)
             counts["found"] = more["found"] - counts["computed"]
             counts |= {name: counts[name] + more[name] for name in ("computed", "given_up")}
             answer.tables, answer.summary = analyzed(place, plan)
@@ -167,7 +166,7 @@ def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
 
 
 def _compute(
-    place: Workspace, plan: Plan, log: Any, on: Any, workers: int | None, keep: bool, code: bool
+    place: Workspace, plan: Plan, log: Any, on: Any, workers: int | None, keep: bool
 ) -> dict[str, Any]:
     """Compute missing points, wait for points that another sweep computes, and return the counts."""
     wanted = {one.address: one for one in plan.points if not one.wrong}
@@ -196,7 +195,7 @@ def _compute(
         each = tuple({"address": o.address, "state": o.state, "settings": o.settings} for o in some)
         return Task(
             str(place.root.absolute()), each, str(system) if isinstance(system, Path) else system,
-            plan.overrides, plan.wanted, keep, code,
+            plan.overrides, plan.wanted, keep,
         )  # fmt: skip
 
     left_before = {claim for claim, _ in place.claims() if gone(claim)}

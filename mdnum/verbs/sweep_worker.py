@@ -15,7 +15,6 @@ from mdnum.errors import FolderError, InputError, MdnumError
 from mdnum.sweeps.measures import Sample, chosen, measured
 from mdnum.sweeps.plan import resolved
 from mdnum.sweeps.points import Workspace, write_result
-from mdnum.systems.code import allow_code
 from mdnum.verbs import sweep_measures  # noqa: F401  adds measures
 
 _SERIES = "series.parquet"
@@ -31,7 +30,6 @@ class Task:
     overrides: Mapping[str, Any]
     measures: Mapping[str, str]  # names, with the digests of their sources
     keep: bool  # run folders
-    allow_code: bool
 
 
 def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> bool:
@@ -77,9 +75,8 @@ def work(task: Task) -> list[dict[str, Any]]:
 def _compute(place: Workspace, task: Task, point: Mapping[str, Any]) -> None:
     began = perf_counter()
     stored = place.result(point["address"])
-    with allow_code(task.allow_code):
-        world = "ball" if "integrator" in point["state"]["system"] else "md"
-        measures = chosen(_missing(stored, task.measures), world)
+    world = "ball" if "integrator" in point["state"]["system"] else "md"
+    measures = chosen(_missing(stored, task.measures), world)
     if other := [one.name for one in measures if one.digest != task.measures[one.name]]:
         message = "the file has changed since the sweep began"
         raise InputError(message, where=other[0], remedy="Start the sweep again")
@@ -112,12 +109,11 @@ def _simulation(task: Task, point: Mapping[str, Any]) -> Any:
     """Build the simulation, or the ball system, of a point."""
     from mdnum.systems import opened
 
-    with allow_code(task.allow_code):
-        if isinstance(task.system, str):
-            return opened(task.system, {**task.overrides, **point["settings"]})
-        import cloudpickle
+    if isinstance(task.system, str):
+        return opened(task.system, {**task.overrides, **point["settings"]})
+    import cloudpickle
 
-        return resolved(cloudpickle.loads(task.system), point["settings"])
+    return resolved(cloudpickle.loads(task.system), point["settings"])
 
 
 def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
@@ -129,7 +125,7 @@ def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
         return _bounced(system, point["state"]["asked"]["steps"], task, point, folder)
     made = run(
         system, **point["state"]["asked"], out=folder / "run", check=False, report=False,
-        progress=False, allow_code=task.allow_code,
+        progress=False,
     )  # fmt: skip
     shutil.copy(folder / "run" / _SERIES, folder / _SERIES)
     kept = ("atoms", "steps", "dynamics", "lost_pairs", "flips_entered", "steps_per_second", "wall_seconds")
