@@ -39,7 +39,7 @@ def environment(**changes: str) -> dict[str, str]:
 
 
 def guard(parent: int) -> None:
-    """End this process when its parent process ends, and limit this process to half of the memory.
+    """End this process when its parent process ends, and limit its memory to half of the machine's memory.
 
     On systems other than Linux, a process inside a foreign function ends only when this function returns.
 

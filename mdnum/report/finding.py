@@ -1,7 +1,7 @@
-"""Findings of all commands, the sentences of findings, and the verdict that summarizes findings.
+"""Findings of all commands, the sentences that describe findings, and the verdict that summarizes findings.
 
-A command's module determines code and values of a finding; a text file next to the module has the sentences.
-`mdnum/verbs/__init__.toml` explains the content of the text files, and the formats of the fields.
+Each command's module determines codes and values of findings; a text file (.toml) contains their sentences.
+`mdnum/verbs/__init__.toml` explains the format of these text files and of fields in sentences.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Texts:
         cause: str = "",
         **values: Any,
     ) -> Finding:
-        """Return the finding with the given code, with values inserted into the sentences of the finding.
+        """Return the finding with a given code, and insert values into the fields of its sentences.
 
         Args:
             variants: alternatives to title, text and remedy, and further sentences (see the module).
@@ -121,7 +121,7 @@ class Texts:
         )  # fmt: skip
 
     def __call__(self, name: str, /, **values: Any) -> str:
-        """Return a sentence from the table [sentences], with the given values inserted."""
+        """Return a sentence from the table [sentences] of the text file; insert values into its fields."""
         return fill(self.entries["sentences"][name], {"units": self.units, **values})
 
     def plot(
@@ -132,18 +132,18 @@ class Texts:
         horizontals: Iterable[tuple[float, str]] = (),
         **values: Any,
     ) -> Plot:
-        """Return the figure with a given name in the table [plots], with values inserted into its texts."""
+        """Return the figure with a given name from the table [plots], and insert values into its texts."""
         told: Any = {part: fill(text, values) for part, text in self.entries["plots"][name].items()}
         marks = {"verticals": tuple(verticals), "horizontals": tuple(horizontals)}
         return Plot(name, series=tuple(series), **marks, **told)
 
     def rows(self, table: str, /, **values: Any) -> list[tuple[str, str]]:
-        """Return names and texts of a table, with values inserted, without rows that have a missing value."""
+        """Return the rows (name, text) of a table with values inserted; omit rows with a missing value."""
         rows = ((_first(name, values), _first(text, values)) for name, text in self.entries[table].items())
         return [(name, text) for name, text in rows if name is not None and text is not None]
 
     def keys(self, table: str = "keys", /, **values: Any) -> list[Key]:
-        """Return the key numbers of a page from a table of values and notes; missing numbers are left out."""
+        """Return a page's key numbers from a table of labels, values and notes; omit missing numbers."""
         keys = []
         for label, texts in self.entries[table].items():
             for value, note in [texts] if isinstance(texts[0], str) else texts:
@@ -160,7 +160,7 @@ class Texts:
         /,
         **values: Any,
     ) -> Browse:
-        """Return the searchable table with a given name in [browse], with the columns present in `rows`.
+        """Return the searchable table with a given name from [browse]; omit columns that `rows` lacks.
 
         Args:
             rows: columns of equal length; a column "pair" is made from two of these columns.
@@ -183,13 +183,13 @@ def _plain(value: Any) -> Any:
 
 
 def _first(texts: str | Sequence[str], values: Mapping[str, Any]) -> str | None:
-    """Return the first text whose fields all have values, with the values inserted, or None if none has."""
+    """Return the first text that has values for all its fields, with the values inserted; otherwise None."""
     several = [texts] if isinstance(texts, str) else texts
     return next((fill(text, values) for text in several if _known(text, values)), None)
 
 
 def _known(text: str, values: Mapping[str, Any]) -> bool:
-    """Return True if all fields of a text have values; attributes of a missing value count as missing."""
+    """Return True if every field of a text has a value; an element of a missing value is also missing."""
     names = (name for _, name, _, _ in string.Formatter().parse(text) if name)
     with suppress(TypeError):
         return all(_Fields().get_field(name, (), values)[0] is not None for name in names)
@@ -221,7 +221,7 @@ class Verdict:
         return " ".join((self.headline, *self.evidence))
 
     def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a summary with headline, findings and verdict, or an empty one for an unfinished folder."""
+        """Return a summary with the verdict and its findings; an empty summary becomes "unfinished"."""
         usual = {"status": "complete" if summary else "unfinished", "seconds": None}
         found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
         return headed(kind, {**usual, **summary, **found})
@@ -235,7 +235,7 @@ def conclude(
     best: Tone = "info",
     judged: bool = False,
 ) -> Verdict:
-    """Return a verdict: the most severe finding determines its tone and is named in its headline.
+    """Return a verdict; its tone follows from the most severe finding, which the headline also names.
 
     Args:
         found: findings in the order in which they are to be read, regardless of severity.

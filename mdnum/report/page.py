@@ -65,7 +65,7 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
 
 
 def brief(page: Page, verdict: Verdict, path: Path, verb: str) -> str:
-    """Return verdict, key numbers, findings and first figure of a report page, as HTML for a notebook."""
+    """Return the verdict, key numbers, findings and first figure of a report page as HTML for notebooks."""
     from mdnum.report import drawing
 
     parts = (part for section in page.sections for part in section.parts)
@@ -123,7 +123,7 @@ def _render(template: str, **content: Any) -> str:
 
 
 def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
-    """Describe a table of a system file in a phrase: its kind, then name and value of the other entries."""
+    """Describe a system-file table in one phrase: its kind, then every other entry by name and value."""
     parts = []
     for key, value in table.items():
         if isinstance(value, Mapping):
@@ -141,7 +141,7 @@ def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -
 
 
 def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield (name, text) for all entries of nested tables; the plain values of a table share one line."""
+    """Yield (name, text) for each entry of nested tables; all plain values of one table form one text."""
     for key, item in value.items():
         name = f"{prefix}{key}".replace("_", " ")
         if isinstance(item, Mapping):

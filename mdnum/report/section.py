@@ -1,6 +1,6 @@
 """Building blocks of all pages and terminal output: sections with text, tables and figures.
 
-This module only defines data: `page` renders sections as HTML, and `cli.output` prints sections.
+This module only defines the data of pages. `page` renders sections as HTML; `cli.output` prints sections.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def pairs(rows: Sequence[tuple[str, Any]], title: str = "") -> Table:
 
 
 def cell(value: Any) -> str:
-    """Format a value in a table for readers."""
+    """Format the value of a table cell as text."""
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool_):
@@ -97,7 +97,7 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Code:
-    """A file or a command for copying; on a page it is hidden under its title until unfolded."""
+    """A file or a command to be copied; the report page shows only its title until a reader unfolds it."""
 
     title: str  # what it is
     text: str  # word for word
@@ -129,7 +129,7 @@ def positive(values: np.ndarray) -> np.ndarray:
 def curves(
     x: np.ndarray, lines: Mapping[str, np.ndarray], mark: Mark = "line", log: bool = True
 ) -> tuple[Series, ...]:
-    """Build a plot series for each of several lines; their roles follow the order of the lines.
+    """Build one plot series for each line; the order of the lines determines the style of each line.
 
     Args:
         x: positions shared by all lines.
@@ -145,7 +145,7 @@ def curves(
 
 
 def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.ndarray]:
-    """Return a table of the points in the figures of a folder, with a row for each point.
+    """Return a table with one row for each plotted point in the figures of a run folder.
 
     Args:
         lines: part, curve, label, x and y of each line.
@@ -160,7 +160,7 @@ def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.n
 
 @dataclass(frozen=True)
 class Region:
-    """Map over a grid: an integer class in each cell, and a word for each class (such as "stable")."""
+    """Map of classes: an integer for each grid cell, and a word for each integer (such as "stable")."""
 
     # x, y: centers of the cells, shapes (columns,) and (rows,)
     x: np.ndarray

@@ -55,7 +55,7 @@ def plain(value: float | None, digits: int = 4) -> str:
 
 
 def pair_name(pair: Mapping[str, Any]) -> str:
-    """Return the labels of a pair of atoms, with the potential term of its decision, if there is one."""
+    """Return the atom labels of a pair, and the potential's term if each term has its own cutoff."""
     return f"{pair['i']}–{pair['j']}" + (f" ({pair['terms']})" if pair.get("terms") else "")
 
 
@@ -68,7 +68,7 @@ def many(value: float | None, noun: str, plural: str | None = None) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Format a fraction in percent, never rounded to 0 % or 100 %; None stands for an infinite fraction."""
+    """Format a fraction as a percentage that is never rounded to 0 % or 100 %; None means infinity."""
     if share is None or 0 < share < 0.001:
         return "under 0.1 %" if share else "an unbounded share"
     if 0.999 < share < 1:
@@ -77,7 +77,7 @@ def percent(share: float | None) -> str:
 
 
 def typeset(text: str) -> str:
-    """Typeset numbers in program notation: -1.5e-16 and 2^15 become −1.5 × 10⁻¹⁶ and 2¹⁵."""
+    """Typeset numbers in program notation, such as -1.5e-16 as −1.5 × 10⁻¹⁶, and 2^15 as 2¹⁵."""
     text = re.sub(r"(?<![\w.])(\d+(?:\.\d+)?)[eE]([+-]?\d+)(?![\w.]*\w)", _as_power, text)
     text = re.sub(r"(?<=\w)(?:\^|\*\*)(-?\d+)", lambda found: found[1].translate(_RAISED), text)
     text = re.sub(r"\bsqrt\((\w+)\)", r"√\1", text)

@@ -57,7 +57,7 @@ def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3
 
 
 def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mapping[str, float] | None:
-    """Tail corrections of energy and pressure for pairs beyond the cutoff, with g(r) = 1 beyond the cutoff.
+    """Tail corrections to energy and pressure for pairs beyond the cutoff, where g(r) = 1 is assumed.
 
     Args:
         simulation: the system as objects.
@@ -77,7 +77,7 @@ def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mappin
 
 
 def _beyond(simulation: Simulation, nodes: int, volume: float | None) -> tuple[float, float]:
-    """Integrate the tail corrections of energy per atom and pressure from the cutoff to infinity."""
+    """Integrate the tail corrections to energy per atom and pressure from the cutoff to infinity."""
     density = simulation.atoms / (volume or simulation.cell.volume)
     share = np.bincount(simulation.species) / simulation.atoms
     node, weight = np.polynomial.legendre.leggauss(nodes)

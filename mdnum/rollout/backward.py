@@ -71,7 +71,7 @@ def _before(program: EpochProgram, masses, order, back: Back) -> Back:
 
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
 def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord):
-    """Reverse time steps until the skin is used up, the record is full, or the bath is to be restored."""
+    """Reverse steps until the list's skin is used up, the record is full, or lost bits must be restored."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
 
@@ -177,7 +177,7 @@ class BackwardRun:
         self._check_bath()
 
     def _change_bath(self) -> None:
-        """Restore the thermostat's stored bath (bits lost by friction) at steps that emptied the bath."""
+        """Restore the thermostat's bath (bits lost by friction) at steps at which the run emptied it."""
         step, period = int(self.back.step), self.simulation.propagator.pause
         if period is None or step % int(period):
             return
@@ -187,7 +187,7 @@ class BackwardRun:
         self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
-        """Raise `NumericalError` if the thermostat's bath is not zero where the forward run emptied it."""
+        """Raise `NumericalError` if the thermostat's bath is not zero at the step that emptied it."""
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(

@@ -102,7 +102,7 @@ class ReferenceFrame:
 
 @dataclass(frozen=True)
 class CrossFlip:
-    """A pair of atoms on whose cutoff decision two runs begin or cease to disagree at a step."""
+    """Pair of atoms whose cutoff decision begins, or ceases, to differ between two runs at a step."""
 
     step: int  # of the flip
     # i, j: the pair, labels of the first run, i < j
@@ -118,7 +118,7 @@ class CrossFlip:
 
 @dataclass(frozen=True)
 class PairFlips(Columns):
-    """Changes of cutoff decisions (flips) in one run, as columns with the atom labels of the first run."""
+    """Flips (changes of cutoff decisions) of one of two runs, as columns with the first run's labels."""
 
     step: Int[np.ndarray, "flips"]  # of the flip
     key: Int[np.ndarray, "flips"]  # i * atoms + j of the pair, i < j
@@ -177,7 +177,7 @@ class CrossRecorder:
         self.differing: Int[np.ndarray, "pairs"] = np.setxor1d(a, b, assume_unique=True)
 
     def opening(self) -> list[CrossFlip]:
-        """Return the pairs with decisions that differ between the runs at step 0, as `CrossFlip`s."""
+        """Return the pairs whose decisions differ between the two runs at step 0, as `CrossFlip` objects."""
         i, j = np.divmod(self.differing, self.atoms)
         pairs = zip(i.tolist(), j.tolist(), strict=True)
         return [CrossFlip(0, i, j, True, "B", False, np.nan, np.nan) for i, j in pairs]
@@ -185,7 +185,7 @@ class CrossRecorder:
     def take(
         self, first: int, rows: int, a: PairFlips, b: PairFlips
     ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
-        """Return the number of pairs with different decisions at each of the next steps, and all changes.
+        """Return the number of pairs with different decisions at each step, and all changes as `CrossFlips`.
 
         Args:
             first: step of the first row.
@@ -296,7 +296,7 @@ def separations(
     b: Float[np.ndarray, "rows 3 atoms"],
     others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
-    """Return the largest distance between the same atoms of two runs at each step, NaN if a position is NaN.
+    """Return each step's largest distance between an atom's positions in two runs; NaN if one is NaN.
 
     Args:
         cells: the box, or one box for each row; distances are minimum-image distances.
@@ -329,7 +329,7 @@ def overridden(
     species: Int[np.ndarray, "atoms"],
     r_cut: Float[np.ndarray, "channels species species"],
 ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
-    """Count the pairs with different decisions in two records; find their largest distance from the cutoff.
+    """Return the number of pairs whose decisions differ, and their largest distance from the cutoff.
 
     Args:
         cells: as for `separations`.

@@ -24,8 +24,8 @@ from mdnum.systems.simulation import Simulation
 class Counterfactual:
     """A run with its own arithmetic, on which the cutoff decisions of another run (the leader) are imposed.
 
-    The decisions that the run would have made by itself are also computed, and differences are counted. The
-    object is called with each group of steps of the leader; `until` returns the resulting steps.
+    The decisions that the run itself would make are computed, too; those that differ from the leader's are
+    counted. The object is called with each segment of the leader; `until` returns the steps.
 
     Args:
         simulation: the run whose arithmetic is used.
@@ -70,7 +70,7 @@ class Counterfactual:
         self._record: EpochRecord | None = None
 
     def __call__(self, segment: Segment) -> None:
-        """Simulate the next steps of the leader with the leader's decisions imposed; store the results."""
+        """Simulate a segment of the leader with the leader's decisions imposed, and store the results."""
         if self._over:
             return
         rows = self.follow(segment)
@@ -82,11 +82,11 @@ class Counterfactual:
             self._ahead.append(rows)
 
     def until(self, last: int) -> Rows | None:
-        """Return the simulated time steps up to `last` that were not returned yet; None if none are left."""
+        """Return simulated time steps up to `last` that have not been returned yet; None if none are left."""
         return taken(self._ahead, last)
 
     def follow(self, segment: Segment) -> Rows:
-        """Simulate the next steps of the leader with the leader's decisions imposed; return the results."""
+        """Simulate a segment of the leader with the leader's decisions imposed, and return the results."""
         parts: list[Rows] = []
         row = 0
         while row < segment.rows and not self.failed:

@@ -131,7 +131,7 @@ class Start:
         return np.asarray(self.home, np.float64).T
 
     def check_box(self, simulation: Simulation, which: int = -1) -> None:
-        """Raise `InputError` if the box of the state is too narrow for cutoff and skin."""
+        """Raise `InputError` if the box of the state is too narrow for the cutoff plus the skin."""
         cell = jax.tree.map(np.asarray, self.state.cells[which])
         check_radius(cell, simulation.r_cut, simulation.rule.skin)
 

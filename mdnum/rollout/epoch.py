@@ -262,7 +262,7 @@ def run_epoch(
     pinned: UInt8[Array, "rows words atoms"] | None = None,
     held: UInt8[Array, "words atoms"] | None = None,
 ) -> tuple[EpochOutcome, EpochRecord]:
-    """Advance with one neighbor list until its skin is used up, the record is full or the run ends.
+    """Integrate with one neighbor list until its skin is used up, the record is full or the run ends.
 
     Args:
         leaves, structure: the program, flattened by jax.tree.flatten.

@@ -34,7 +34,7 @@ def _mixed(key):
 
 @njit
 def fingerprint_of_bits(bits, index, order):
-    """Return number and hash of the pairs inside the cutoff, independent of the order of the list."""
+    """Return the number of pairs inside the cutoff and a hash of them, both independent of list order."""
     count, total = 0, np.uint64(0)
     atoms, listed = order.shape[0], index.shape[0] // 8
     for w in range(bits.shape[0]):
@@ -71,7 +71,7 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
 # atoms in one place have no radial speed: not a number, as in numpy
 @njit(error_model="numpy")
 def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, narrow, back, first, factor):
-    """Compute the columns of the table of flips, and check that distances agree with decisions.
+    """Compute the columns of the table of flips; check that distances agree with recorded decisions.
 
     Args:
         labels: labels of the sorted atoms. species: species by label. kinds: pair type of two species.
@@ -139,7 +139,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
 
 
 def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
-    """Return the deformation from the box of each step to the previous box (empty if the box is fixed)."""
+    """Return the deformation from each step's box to the previous step's box; empty for a fixed box."""
     if not segment.cells:
         return np.empty((0, 3, 3))
     before = jax.tree.map(np.asarray, segment.start.cells[1]), *segment.cells[:-1]
@@ -174,8 +174,8 @@ class PairRecorder:
     """Recorder of all flips (pairs that cross the cutoff) in a simulation.
 
     A flip is a difference between the decisions for a pair at two consecutive steps, even if the neighbor
-    list was rebuilt in between. A pair inside the cutoff that the old list lacks enters with the new list,
-    and a pair that is beyond the range of the new list leaves.
+    list was rebuilt in between. If a pair inside the cutoff is missing from the old list, the new list
+    records its flip. A pair beyond the range of the new list counts as outside.
 
     Args:
         simulation: the system as objects.
@@ -202,7 +202,7 @@ class PairRecorder:
         return self._once(int(count_set(bits)))
 
     def _once(self, both: int) -> int:
-        """Return the number of pairs, given a count in which each pair occurs twice."""
+        """Return half of a count in which each pair occurs twice; raise an error if the count is odd."""
         if both % 2:
             raise MdnumError(
                 "a pair is inside the cutoff for only one of its two atoms", remedy="Report this as a bug"
@@ -216,12 +216,12 @@ class PairRecorder:
         return np.array([self._once(int(both)) for both in segment.rows_of("inside")], np.int64)
 
     def _stacked(self, cells: Sequence[Cell]) -> tuple[Any, Any]:
-        """Return boxes in float64, and also in the dtype of cutoff decisions if this dtype differs."""
+        """Return boxes in float64, and also in the dtype of cutoff decisions if that is not float64."""
         dtype = self.simulation.decider.dtype
         return stacked(cells), None if dtype == "float64" else stacked(cells, dtype)
 
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
-        """Bounds, at each step, on the rounding errors of r or r², whichever is compared with the cutoff."""
+        """Bounds on the rounding errors, at each step, of the quantity (r or r²) compared with the cutoff."""
         decider = self.simulation.decider
         if not decider.grows and not segment.cells:
             return np.repeat([decider.bounds], segment.rows, axis=0)
@@ -258,9 +258,9 @@ class PairRecorder:
         return AmbiguousPairs.concatenate(parts)
 
     def flips(self, segment: Segment) -> FlipTable:
-        """Return the flips of a segment, sorted by step, i and j (user's labels, i < j; see `type_of`).
+        """Return a segment's flips sorted by step, i and j (user's atom labels; `type_of` explains i).
 
-        Distance, margin and radial speed refer to the step of the flip. The margin (threshold minus quantity)
+        Distance, margin and radial speed refer to the step of the flip. The margin (threshold minus r or r²)
         has the same bits as in the run.
 
         Raises:
@@ -331,14 +331,14 @@ class PairRecorder:
         return (margin >= 0 if inclusive else margin > 0) != ledger.entered
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
-        """Return integer keys of the pairs inside the cutoff at the last step of the previous list."""
+        """Return integer keys of the pairs that were inside the cutoff at the previous list's last step."""
         if self._held_segment is not None:
             table, bits, _ = self._held_segment
             self._held_keys = _keys(self.simulation, table, np.asarray(bits))
         return self._held_keys
 
     def _cannot_differ(self, segment: Segment) -> bool:
-        """Return True if old and new neighbor list certainly have the same pairs inside the cutoff."""
+        """Return True if the old and the new neighbor list must have the same pairs inside the cutoff."""
         rule = self.simulation.rule
         if self._held_segment is None or not rule.safe:
             return False
@@ -371,7 +371,7 @@ class PairRecorder:
 def pair_keys(
     i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], atoms: int
 ) -> Int[np.ndarray, "pairs"]:
-    """Return sorted integers (keys), one for each pair of atoms i < j; for i see `Simulation.type_of`."""
+    """Return a sorted integer key for each pair of atoms i < j; `Simulation.type_of` explains i."""
     return np.sort(i.astype(np.int64) * atoms + j)
 
 

@@ -1,8 +1,8 @@
 """Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other run imposed.
 
 Each run without imposed decisions has the same bits as a single run, because neighbor lists and compiled
-loops are separate. Cutoff decisions are compared by means of their changes in both runs. The cost therefore
-does not depend on the number of pairs, and only pairs with different decisions are stored.
+loops are separate. Cutoff decisions are compared by means of their changes in both runs. The cost of this
+comparison does not depend on the number of pairs; only pairs with different decisions are stored.
 """
 
 from __future__ import annotations
@@ -86,14 +86,14 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
 def beside(
     leader: Track, runs: Sequence[Track | Counterfactual]
 ) -> Iterator[list[Float[np.ndarray, "rows"]]]:
-    """Yield the separations of several runs from a leading run, in groups of time steps."""
+    """Yield the distance of each run from a leading run at each step, in groups of time steps."""
     while leader.segment() is not None:
         rows = leader.until(end := leader.ready)
         yield [separation_of(rows, run.until(end)) for run in runs]
 
 
 def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Return the largest distance between the same atoms in two runs at each step, NaN after run b has ended.
+    """Return each step's largest distance between an atom's positions in two runs; NaN if run b has ended.
 
     Positions are scaled to the box of the first run, and distances are minimum-image distances in this box.
     """
@@ -139,7 +139,7 @@ def _per_row(doubts: AmbiguousPairs, rows: Rows) -> Int[np.ndarray, "rows"]:
 
 
 def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarray, "rows"]:
-    """Return, for each step, a lower bound on the distance of every pair from its cutoff, length."""
+    """Return, for each step, a lower bound (a length) on the distance of any pair from its cutoff."""
     if rows is None or rows.nearest is None:
         return np.full(len(clock), np.nan)
     margin = rows.nearest
@@ -154,7 +154,7 @@ def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarra
 
 
 def _bound(track: Track, rows: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Return the largest bound on rounding errors of pair distances at each step of a run, length."""
+    """Return, for each step of a run, the largest bound on the rounding error of a pair distance."""
     if rows is None:
         return np.zeros(0)
     decider = track.simulation.decider

@@ -64,7 +64,7 @@ class MdProgram:
 
     @property
     def ulp(self) -> float:
-        """Unit in the last place (ulp) of the largest initial coordinate, length."""
+        """Unit in the last place (ulp) of the largest initial coordinate, as a length."""
         x = np.asarray(self.start.state.x)
         return float(np.spacing(np.abs(x).max().astype(x.dtype)))
 
@@ -75,7 +75,7 @@ class MdProgram:
 
     @property
     def imposable(self) -> str | None:
-        """Reason why decisions cannot be imposed on this simulation, or None if imposing is possible."""
+        """Reason why decisions cannot be imposed on this simulation; None if they can be imposed."""
         if self.simulation.imposable:
             return None
         return "a many-body potential decides inside its energy function"
@@ -113,7 +113,7 @@ class MdProgram:
     def repeats(
         self, others: Sequence[MdProgram], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Return separations of runs with perturbed initial states from one run (see `Program.repeats`)."""
+        """Return distances between one run and runs with perturbed initial states (see `Program.repeats`)."""
         a = self.simulation
         frame = others[0].frame or ReferenceFrame.same(a.atoms)
         imposed = [Counterfactual(b.simulation, a, b.begin, frame, guard) for b in others]
@@ -133,7 +133,7 @@ class MdProgram:
         return list(zip(whole[: len(free)], whole[len(free) :], strict=True))
 
     def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
-        """Return copies of the simulation with atoms displaced at random, by at most about `size`.
+        """Return copies of the simulation with random displacements; the largest is about `size`.
 
         The largest displacement is at least one ulp, because rounding removes smaller displacements.
         """
@@ -170,7 +170,7 @@ class MdProgram:
         )  # fmt: skip
 
     def number(self, key: str) -> Number:
-        """Return the numerical parameter of the system that is given by a path."""
+        """Return the numerical parameter of the system that has a given path (such as "cutoff.radius")."""
         simulation = self.simulation
         name = parameters.resolve(simulation, key, parameters.numbers(simulation))
 
@@ -219,7 +219,7 @@ class MdProgram:
         return Differing(nearest)
 
     def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], Simulation, np.ndarray]:
-        """Return pairs inside the cutoff, the simulation with its box, and positions at a step of a run."""
+        """Return the pairs inside the cutoff, the simulation with its box, and the positions at a step."""
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             if segment.last >= step:
                 row = step - segment.first
@@ -242,7 +242,7 @@ class MdProgram:
 def pair_margin(
     simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int, labels: Simulation | None = None
 ) -> float:
-    """Return threshold minus quantity (r or r²) of a pair, with the same bits as in a run.
+    """Return the margin (threshold minus r or r²) of a pair's decision, with the same bits as in a run.
 
     Args:
         x: wrapped positions, length.

@@ -1,4 +1,4 @@
-"""Simulation runs that write a run folder, check their results, and can be resumed after a kill."""
+"""Simulation runs that write a run folder, check their results, and can be resumed after they are killed."""
 
 from __future__ import annotations
 
@@ -272,7 +272,7 @@ class Rollout:
         self.folder.checkpoint_beside(lambda: state if held is None else {**state, "held": held()})
 
     def _to_dict(self, point: Start) -> dict[str, Any]:
-        """Return the data from which a run can be resumed, including the last pairs of a used-up list."""
+        """Return the data for resuming the run, including the pairs inside the cutoff from the last list."""
         last = None if self.done.last is None else np.asarray(self.done.last).T
         frames = {"first": self.done.first, "last": last}
         return {

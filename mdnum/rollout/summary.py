@@ -23,7 +23,7 @@ from mdnum.systems.simulation import Simulation
 class LineFit:
     """A least-squares line through a stream of points, with memory that does not grow with the points.
 
-    The first value is subtracted from all values, so that the sums contain the drift and not the energy.
+    The first value is subtracted from all values, so that the sums contain only changes of the value.
     """
 
     count: int = 0
@@ -46,7 +46,7 @@ class LineFit:
 
     @property
     def slope(self) -> float | None:
-        """Slope dy/dx of the line, or None for fewer than 3 points or if squares underflow or overflow."""
+        """Slope dy/dx of the line; None for fewer than 3 points, or if sums of squares under- or overflow."""
         spread = self.count * self.xx - self.x * self.x
         if self.count < 3 or not 1e-280 < spread < np.inf:
             return None
@@ -118,7 +118,7 @@ def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, fli
 
 
 def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dict[str, Any]:
-    """Return the contents of summary.json, except the entries that reference methods and the report add."""
+    """Return the contents of summary.json, without entries that reference methods or the report add."""
     tally, health, budget = done.tally, done.health, done.budget
     jumps = energy_jump, force_jump = simulation.jumps()
     pairs = pair_names(simulation.symbols)
@@ -312,7 +312,7 @@ class EnergyBudget:
     def check(
         self, step: int, positions: Float[np.ndarray, "atoms 3"], potential: float, cell: Cell | None = None
     ) -> dict:
-        """Check the energy at one step; return the quantities that `Simulation.numbers` computes.
+        """Check the energy at one step; return forces and pair distances from `Simulation.numbers`.
 
         Args:
             step: the step.
@@ -334,7 +334,7 @@ class EnergyBudget:
 
     @property
     def tolerance(self) -> float:
-        """Largest allowed deviation of the energy: a tenth of the smallest jump, or a rounding error."""
+        """Largest allowed energy error: a tenth of the smallest energy jump, or a rounding-error bound."""
         if self._reference is not self.simulation:
             jumps = np.abs(self.simulation.jumps()[0])
             return _SHARE_OF_A_JUMP * float(jumps[jumps > 0].min())
@@ -391,8 +391,8 @@ class Epoch:
 class ListHealth:
     """Monitor of a run's neighbor lists, which counts missed pairs and dangerous rebuilds.
 
-    A list can miss a pair only if the displacements of two atoms add up to more than the skin. A safe rebuild
-    rule prevents larger displacements; with other rules, a new search checks for missed pairs.
+    A list can miss a pair only if the displacements of two atoms add up to more than the skin. A safe rule
+    rebuilds the list before pairs can be missed; with other rules, a new search checks for missed pairs.
     """
 
     simulation: Simulation  # the system as objects
@@ -406,7 +406,7 @@ class ListHealth:
     mismatches: int = 0
 
     def take(self, segment: Segment, missed: int) -> list[dict[str, np.ndarray]]:
-        """Add a group of time steps; return a table row for each neighbor list whose use has ended.
+        """Add a group of time steps; return a table row for each neighbor list that was replaced.
 
         Args:
             segment: the engine's record.

@@ -158,20 +158,20 @@ class Track:
         return self._ahead[-1].last
 
     def until(self, last: int) -> Rows | None:
-        """Return the time steps up to `last` that were not returned yet, or None if there are none."""
+        """Return the time steps up to `last` that have not been returned yet, or None if there are none."""
         while not self._ahead or self.ready < last:
             if self.segment() is None:
                 break
         return taken(self._ahead, last)
 
     def flips(self, last: int) -> PairFlips:
-        """Return the flips up to step `last` that were not returned yet."""
+        """Return the flips up to step `last` that have not been returned yet."""
         every = PairFlips.concatenate(self._flips)
         self._flips = [every[every.step > last]]
         return every[every.step <= last]
 
     def doubts(self, last: int) -> AmbiguousPairs:
-        """Return the ambiguous decisions up to step `last` that were not returned yet."""
+        """Return the ambiguous decisions up to step `last` that have not been returned yet."""
         every = AmbiguousPairs.concatenate(self._doubts)
         taken = every[every.step <= last]
         self._doubts = [every[every.step > last]]

@@ -2,8 +2,8 @@
 
 A command with many tests (`audit`, `conform`) keeps its options and results in one dataclass of plain values.
 A result that should not be lost is written at once, and other results about once per second. A resumed
-command restores all values with their types, and runs the tests that have no result yet. Tables in the folder
-are created from the results.
+command restores all values with their types, and runs the tests that have no result yet. The tables in the
+command's folder are created from the stored results.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ T = TypeVar("T", bound=Timed)
 
 
 class Answers(Generic[T]):
-    """Writer of the state of a command into its folder.
+    """Writer that saves the state of a command in the command's folder.
 
     Args:
         folder: folder open for writing.
@@ -46,7 +46,7 @@ class Answers(Generic[T]):
         self._before, self._began, self._due = state.seconds, monotonic(), 0.0
 
     def save(self, urgent: bool = True) -> None:
-        """Save the state of a command for resuming; a save that is not urgent may be skipped."""
+        """Save the state of a command for resuming the command; a non-urgent save may be skipped."""
         now = monotonic()
         self.state.seconds = self._before + now - self._began
         if urgent or now >= self._due:
@@ -57,7 +57,7 @@ class Answers(Generic[T]):
 
 
 def take(path: str | Path, layout: Layout) -> RunFolder:
-    """Open the folder of a command that is resumed, and make this process the only writer of the folder.
+    """Open the folder of a command that is to be resumed; no other process can then write into the folder.
 
     Raises:
         FolderError: the folder has no state of this command, another process writes it, or it was changed.
