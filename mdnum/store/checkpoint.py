@@ -146,7 +146,7 @@ class FrameFile:
                 raise
 
     def mark(self) -> tuple[int, int, int]:
-        """Return number of frames, position of the offset table, and file size (all 0 before frame 0)."""
+        """Return the number of frames, the offset table's position, and the file size (0 without frames)."""
         if not self.path.exists() or self.path.stat().st_size < _FRAMES_AT + _HEADER.size:
             return (0, 0, 0)
         with opened(self.path) as file:
@@ -155,7 +155,7 @@ class FrameFile:
         return (frames, table, self.path.stat().st_size)
 
     def truncate(self, mark: tuple[int, int, int]) -> None:
-        """Restore the file to an earlier state given by `mark`, and remove later frames, even partial ones.
+        """Restore the file to the state given by `mark`, and remove all later frames, even incomplete ones.
 
         ASE moves its offset table as the file grows, so `mark` includes the position of this table.
         """

@@ -111,7 +111,7 @@ def subfolder(root: Path, name: str) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a temporary file that replaces the file at path when closed; a kill leaves the old or new file.
+    """Yield a temporary file that replaces the file at path when closed; path never holds partial data.
 
     If path is a symbolic link, the link is replaced, and the file to which the link refers is unchanged.
     """
@@ -146,7 +146,7 @@ def write_bytes(path: Path, data: bytes | memoryview) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace the contents of a file by text in UTF-8; for errors see `write_bytes`."""
+    """Replace the contents of a file by text in UTF-8; `write_bytes` describes the possible errors."""
     write_bytes(path, text.encode())
 
 
@@ -300,7 +300,7 @@ def place(path: Path) -> tuple[Path, str]:
 
 
 def foretell(path: Path, new: str) -> None:
-    """Add the digest of a file's new contents to the manifest; the digest of the old ones remains valid."""
+    """Add the digest of a file's new contents to the manifest; the old digest also remains valid."""
     root, name = place(path)
     if name == NAME or not (root / NAME).exists():
         return
@@ -347,7 +347,7 @@ _RUNS = Path("runs")
 
 
 def default_folder(system: str, runs: Path = _RUNS) -> Path:
-    """Create a new folder runs/NAME-N, with the system's name (with dashes) and the first unused number N.
+    """Create the new folder runs/NAME-N, where NAME is the system's name and N is the first unused number.
 
     The folder is created at once, so that simultaneous processes get different folders.
 

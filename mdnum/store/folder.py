@@ -83,9 +83,9 @@ class RunFolder:
     """The folder of a run on disk.
 
     Rows, frames and log lines can be appended at any time, and become permanent with the next checkpoint. A
-    killed run is resumed from its last checkpoint by `resume`, which removes later data and returns the
-    state, so that the result is the same as without the kill. Use `create` for a new run, and `open` to read
-    or resume an existing run.
+    killed run is resumed from its last checkpoint by `resume`, which removes data written later. A resumed
+    run has the same results as a run that was not killed. Use `create` for a new run, and `open` to read or
+    resume an existing run.
     """
 
     def __init__(self, path: Path, layout: Layout | None = None):
@@ -191,7 +191,7 @@ class RunFolder:
         return self._layout
 
     def read_as(self, layout: Layout) -> None:
-        """Read a folder from an earlier version of mdnum, in the present layout of the command."""
+        """Read a folder from an earlier version of mdnum as if it had the command's present layout."""
         self._layout = layout
 
     @property
@@ -233,9 +233,9 @@ class RunFolder:
     def checkpoint_due(self) -> bool:
         """Return True if the last checkpoint is so old that a new one is due.
 
-        The interval between checkpoints is at least 2 s, 1 % of the run's duration, and fifty times the
-        duration of the last checkpoint. A kill therefore loses about 1 % of a run, and a run of days has only
-        about a thousand part files.
+        The interval between checkpoints is the largest of 2 s, 1 % of the run's duration, and 50 times the
+        duration of the last checkpoint. A killed run loses about 1 % of its computing time, and a run of
+        several days has only about a thousand part files.
         """
         now = time.monotonic()
         due = now - self._written >= max(2.0, 0.01 * (now - self._began), 50 * self._cost)
@@ -407,7 +407,7 @@ class RunFolder:
     def restart(self) -> None:
         """Mark a resumed folder as unfinished, and remove its tables, which are written again at the end.
 
-        Part files that remain after a kill during `finalize` are also removed.
+        Part files that remain because `finalize` was killed are also removed.
         """
         with disk_errors(self.path):
             refuse_link(self.path / "log.txt", in_place=True)
@@ -478,7 +478,7 @@ class RunFolder:
 
     @cached_property
     def about(self) -> dict[str, Any]:
-        """Metadata of the tables: version, kind, system, digest of the run, and units by quantity.
+        """Metadata of the tables: version, kind, system, digest of the run, and the unit of each quantity.
 
         The metadata do not depend on the time of writing, so resumed and unbroken runs write equal bytes.
         """
@@ -613,7 +613,7 @@ class RunFolder:
         return TableStream(self.path, name, self._layout, lambda path: self.check(manifest.place(path)[1]))
 
     def _sweep(self, *patterns: str) -> None:
-        """Remove temporary files that remain after a kill, and files that match given patterns."""
+        """Remove temporary files left behind by a killed process, and files that match given patterns."""
         for pattern in (*patterns, ".*.part", *(f"{name}/.*.part" for name in SUBFOLDERS)):
             for file in self.path.glob(pattern):
                 if not (file.parent.is_symlink() and file.parent != self.path):

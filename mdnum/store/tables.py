@@ -42,8 +42,8 @@ _DISTINCT = frozenset({"i", "j", "distance", "before", "margin", "margin_before"
 class TableStream:
     """A growing table, stored in the files `<name>.parquet` and `parts/<name>-<first row>.parquet`.
 
-    The name of a part file determines the rows in the file. Rows can therefore be identified after a kill at
-    any stage of writing, merging or truncating.
+    The name of a part file tells which rows the file contains. The rows in each file are therefore known even
+    if the process is killed while it writes, merges or truncates.
     """
 
     def __init__(
@@ -275,7 +275,7 @@ class TableStream:
         self._replace(self.merged_path, groups, self._describe(cast(pa.Schema, self._schema)))
 
     def _whole(self, table: pa.Table, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return rows with the requested (default: all) columns; omitted columns are filled in."""
+        """Return rows with the requested (default: all) columns; missing columns get default values."""
         there = table.column_names
         known = [name for name in self._known if name in there or name in self._usual]
         names = columns or [*known, *(name for name in there if name not in self._known)]
@@ -333,7 +333,7 @@ class TableStream:
 
 
 class _Writing:
-    """A file that a background thread writes from a queue of tables, mostly without Python's global lock."""
+    """A file that a background thread writes from a queue of tables, mostly without holding Python's GIL."""
 
     def __init__(self, write: Callable[[Iterator[pa.Table]], None]):
         # with a limit: where the disk is slower than what makes the rows, that waits
@@ -350,7 +350,7 @@ class _Writing:
             raise RuntimeError("some rows of the table were not written")
 
     def put(self, table: pa.Table | None) -> None:
-        """Add a table to the queue when there is space; raise the error of the writing thread, if any."""
+        """Add a table to the queue when there is room; raise the error of the writing thread, if any."""
         while not self._done.ready():
             with suppress(Full):
                 self._tables.put(table, timeout=1.0)
@@ -367,13 +367,13 @@ class _Writing:
 
 
 def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Concatenate tables with the same columns; a single text represents a column with equal rows."""
+    """Concatenate tables with the same columns; one text can stand for a column of equal texts."""
     columns = {name: [part[name] for part in parts] for name in parts[0]}
     return {name: one[0] if isinstance(one[0], str) else np.concatenate(one) for name, one in columns.items()}
 
 
 def _repeats(values: Any, value: Any) -> bool:
-    """Return True if all rows of a column have a given value, and are stored as a text or broadcast array."""
+    """Return True if a column is stored as one value for all its rows, and that value is the given one."""
     if isinstance(values, np.ndarray) and values.strides == (0,):
         values = values[0]
     return value is not None and np.ndim(values) == 0 and bool(values == value)

@@ -25,14 +25,14 @@ _ENDS = {
 
 @dataclass(frozen=True)
 class EndComparison:
-    """Comparison of the results of a value (of a varied choice) or of a setting with converged results."""
+    """Comparison of results for one value of a varied choice, or for one setting, with converged results."""
 
     value: Any
     by_measure: Mapping[str, Within]
 
     @property
     def worst(self) -> str | None:
-        """Measure that is outside its tolerance, or else the undecided measure that needs the most seeds."""
+        """Measure outside its tolerance; if there is none, the undecided one that needs the most seeds."""
         each = self.by_measure
         ranked = sorted(each, key=lambda name: (each[name].inside is not False, -each[name].more))
         return next((name for name in ranked if each[name].inside is not True), None)

@@ -222,7 +222,7 @@ def _advice(
     compared: Mapping[tuple[str, ...], Difference],
     results: _Results,
 ) -> list[dict[str, Any]]:
-    """Return the recommended value of each choice; for a choice in `FREE`, the value of the fastest runs."""
+    """Return the recommended value of each choice; choices in `FREE` get the value with the fastest runs."""
     physical = {measure.name for measure in plan.measures if measure.physical}
     moving = {(key, value) for (name, key, value), one in compared.items() if one.moves and name in physical}
     rows = []
@@ -293,7 +293,7 @@ def _together(
 
 
 def _fastest(plan: Plan, axis: Axis, moving: set[tuple[str, str]], results: _Results) -> dict[str, Any]:
-    """Return the value of a choice with the fastest runs that lose no pairs and do not change results."""
+    """Return the value with the fastest runs among those that miss no pairs and do not change results."""
     rows = []
     for value, setting in plan.along(axis):
         speeds, lost = np.array(results.speeds.get(setting, [(np.nan, 0)])).T

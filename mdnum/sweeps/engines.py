@@ -1,7 +1,7 @@
 """Execution of tasks by a `concurrent.futures.Executor`, by default in processes on all cores.
 
-An engine (executor) only starts processes. Whether a point of a sweep was computed is determined from the
-folder of the point, not from the engine, so that a worker process that dies loses only its current point.
+An engine (executor) only starts worker processes. The folder of a point shows whether the point was computed;
+a worker process that dies therefore loses only its current point.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def _dask(address: str, workers: int | None) -> TaskEngine:
 
 
 def _executorlib(file: str, workers: int | None) -> TaskEngine:
-    """Return an engine from executorlib, with the class (default SLURM jobs) and keywords in a TOML file."""
+    """Return an engine from executorlib; a TOML file gives its class (default: SLURM jobs) and keywords."""
     try:
         import executorlib  # pyright: ignore[reportMissingImports]
         from executorlib.api import ExecutorlibSocketError  # pyright: ignore[reportMissingImports]
@@ -234,7 +234,7 @@ def _ends_with(parent: int) -> dict[str, Any]:
 
 @contextmanager
 def opened(on: str | Executor | TaskEngine | None, workers: int | None) -> Iterator[TaskEngine]:
-    """Context manager: make an engine from None (local processes), a dask address, a file or an executor.
+    """Context manager: yield the engine for None (local processes), a dask address, a file or an executor.
 
     An executor that the caller passes remains open.
 

@@ -181,7 +181,7 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
 
 
 def _of_seed(one: Planned, point: Point, settings: Mapping[str, Any]) -> Planned:
-    """Derive a planned point from a point with the same setting and another seed."""
+    """Return a planned point that differs from the given one only in its seed."""
     system = one.state["system"]
     dynamics = {**system["dynamics"], "seed": settings["dynamics.seed"]}
     state = {**one.state, "system": {**system, "dynamics": dynamics}}

@@ -10,8 +10,8 @@
 
 The address of a point is defined as in signac: the MD5 hash of the state point as JSON. A point is computed
 in a temporary folder, which a single rename moves to the address, so that a killed process leaves no partial
-result. To claim a point, a process creates a claim file, which only one process can do (O_EXCL). If the
-claiming process ends without a result, another process creates a claim with the next number.
+result. To claim a point, a process creates a claim file with O_EXCL, so that only one process can succeed. If
+the claiming process ends without a result, another process creates a claim with the next number.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ class Workspace:
 
     @contextmanager
     def filling(self, address: str, point: Mapping[str, Any]) -> Iterator[Path]:
-        """Yield an empty folder, which becomes the folder of the point if the block raises no error."""
+        """Yield an empty folder, which becomes the point's folder unless the `with` block raises an error."""
         here = self.place / f".{address}.{socket.gethostname()}.{os.getpid()}"
         shutil.rmtree(here, ignore_errors=True)
         with disk_errors(here):
@@ -279,7 +279,7 @@ def boot() -> str:
 
 
 def born(pid: int) -> str | None:
-    """Return the start time of a local process in ticks: None if no such process exists, "" if unknown."""
+    """Return the start time of a local process in ticks; None if it does not exist, "" if unknown."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -48,8 +48,8 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
 
     The error of a mean is the error estimated from its runs, multiplied by the ratio of the scatter between
     seeds to the estimated errors. One ratio is used for all settings of a measure; more settings make the
-    ratio more precise. If this error has fewer degrees of freedom than the scatter between seeds of a single
-    setting, the scatter is used instead.
+    ratio more precise. If the resulting error has fewer degrees of freedom than the scatter between seeds of
+    a single setting, the scatter is used instead.
 
     Args:
         found: (value, standard error, independent samples) of each run; nan if unknown.
@@ -136,12 +136,11 @@ def difference(one: SeedMean, base: SeedMean) -> tuple[float, float, float]:
 def paired(
     raw: Mapping[K, tuple[float, float, float]], by_seed: Mapping[K, Float[np.ndarray, "seeds"]]
 ) -> dict[K, tuple[float, float, float]]:
-    """Return differences from a reference setting, taken seed by seed if runs with one seed are correlated.
+    """Return differences from a reference setting; correlated runs with the same seed are compared in pairs.
 
     Runs at constant energy with the same initial velocities may remain correlated. For uncorrelated runs, the
     scatter of few differences is a poor estimate of the error. Runs are therefore compared seed by seed only
-    if the differences between runs with the same seed scatter significantly less, over all comparisons, than
-    differences between independent runs.
+    if this significantly reduces the scatter of the differences, over all comparisons.
 
     Args:
         raw: results of `difference` for each comparison of one measure. by_seed: the differences of each

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = None) -> Simulation | BallSystem:
-    """Load a molecular-dynamics system or a bouncing-ball system; for the arguments see `load`.
+    """Load a molecular-dynamics system or a bouncing-ball system; `load` describes the arguments.
 
     Raises:
         InputError: the system cannot be run; the message is one line.
@@ -36,7 +36,7 @@ def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = Non
 
 
 class _Package(ModuleType):
-    """Module type that ensures that `build` and `build_ball` are functions, not submodules of these names."""
+    """Module type that keeps the names `build` and `build_ball` bound to functions, not to submodules."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         # Python binds an imported submodule to its package; here that would hide the function of its name

@@ -161,7 +161,7 @@ class _Moved:
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 
     def takes_images(self) -> bool:
-        """Return True if moving an atom by a lattice vector in this convention does not change the energy."""
+        """Return True if moving an atom by a lattice vector of the box leaves the energy unchanged."""
         if not self.unchanged(self.trial.cell):
             return False
         # of a fractional function units are lattice vectors, and perhaps these are whole numbers of units
@@ -179,7 +179,7 @@ class _Moved:
         return all(abs(trial.energy(x, idx, cell) - energy) <= allowed for x in moved)
 
     def follows(self) -> bool:
-        """Return True if moving an atom by a lattice vector of a sheared box does not change the energy."""
+        """Return True if moving an atom by a lattice vector of a sheared box leaves the energy unchanged."""
         trial = self.trial
         cell = trial.cell + trial.cell @ _SHEAR
         energy, push = trial.energy(idx=self.whole), np.abs(trial.there(idx=self.whole)[1]).max()
@@ -303,7 +303,7 @@ def _at_the_cutoff(trial: Trial) -> None:
         toward = np.concatenate(displacement(trial.box, trial.x[[i]], trial.x[[j]])) / r[i, slot]
 
         def crossing(factor: float, i=i, j=j, toward=toward, r=r[i, slot]) -> tuple[float, float]:
-            """Return the contribution of the pair to the energy, and its largest force component."""
+            """Return a pair's contribution to the energy, and the largest component of its force."""
             x = trial.x.copy()
             x[j] += toward * (r_cut * factor - r)
             listed = trial.within(trial.idx, x, r_cut)
@@ -346,7 +346,7 @@ def _at_the_cutoff(trial: Trial) -> None:
 
 
 def _threes(trial: Trial) -> tuple[Any, Any, np.ndarray]:
-    """Arrange the atoms in isolated groups of three.
+    """Return functions that arrange the atoms in groups of three that do not interact with each other.
 
     Returns:
         a function that returns the neighbor list of chosen groups; a function that places the third atom of
@@ -383,9 +383,9 @@ def _adds(trial: Trial) -> bool:
 
 
 def _reach(trial: Trial) -> tuple[float | None, float]:
-    """Return the largest distance at which a listed pair has a force, and the largest distance tested.
+    """Return the largest distance at which a listed pair has a force, and the largest tested distance.
 
-    The first value is None if the pair has no force at any tested distance.
+    The first returned value is None if the pair has no force at any tested distance.
     """
     r_cut, (listed, placed, third) = trial.model.r_cut, _threes(trial)
     furthest = min(2 * r_cut, 0.49 * trial.width if trial.pbc.any() else np.inf)

@@ -259,7 +259,7 @@ def cut(
     *,
     where: str = "",
 ) -> CutPotential:
-    """Truncate a pair potential, with one cutoff radius per pair type; for arguments see `Cut`.
+    """Truncate a pair potential at a cutoff radius for each pair type; `Cut` describes the arguments.
 
     Args:
         weights: weights of the atoms, if any. where: prefix of parameter names in messages.
@@ -289,7 +289,7 @@ def cut(
 
 
 def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequence[str]) -> None:
-    """Check that a user's pair function can be called, is not truncated, and is symmetric in both atoms."""
+    """Check a user's pair function: it must be callable, not truncated, and symmetric in both atoms."""
     here = potential.typed
     is_pair = lambda leaf: isinstance(leaf, tuple)  # noqa: E731
     other = here.with_leaves(
@@ -378,7 +378,7 @@ def _is_array(value: Any) -> bool:
 
 
 def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, "types"]:
-    """Return an array with one number per pair type, from a single number or numbers by pair of species.
+    """Return an array with one number per pair type, from one number for all or one per pair of species.
 
     Raises:
         InputError: the number of a pair is missing or not finite.
@@ -435,7 +435,7 @@ def assembled(
     steps: int,
     save_every: int,
 ) -> Simulation:
-    """Create a simulation from components; arguments not listed are attributes of `Simulation`.
+    """Create a simulation from components; `Simulation` describes the arguments not listed here.
 
     Args:
         atoms: the structure, with momenta unless velocities are drawn.
@@ -479,7 +479,7 @@ def assembled(
 
 
 def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
-    """Create a simulation of other atoms of the same species with the same potential and settings.
+    """Create a simulation of other atoms of the same species; potential and settings remain the same.
 
     Args:
         skin: skin of the Verlet list, length.

@@ -109,7 +109,7 @@ class Evaluator:
         )
 
     def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
-        """Compute only the potential energy and related numbers (see `Simulation.numbers`)."""
+        """Compute only the potential energy and the numbers that `Simulation.numbers` returns with it."""
         own = self.simulation
         _, _, _, tables, x = self._sorted(positions, None)
         bare = own.potential if own.pairwise else None
@@ -119,7 +119,7 @@ class Evaluator:
         return float(energy), found
 
     def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
-        """Return the simulation in a cell, wrapped positions, neighbor list, and positions in its order."""
+        """Return the simulation in a cell, wrapped positions, neighbor list, and positions in list order."""
         check_not_forked()
         own = self.simulation
         same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
@@ -147,7 +147,7 @@ class Evaluator:
 
 
 def _listed(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool) -> Any:
-    """Compute forces and the pairs inside the cutoff; also the virial tensor if the stress is needed."""
+    """Compute forces and the pairs inside the cutoff; if `stress` is True, also compute the virial tensor."""
     return force(x, tables, decisions=True, tensor=stress)
 
 

@@ -1,4 +1,4 @@
-"""Parameters of a simulation: their values and units by path, and simulations with changed values.
+"""Parameters of a simulation: their paths, values and units, and simulations with changed parameter values.
 
 A parameter is a number or an array of numbers, and its name is a path. Paths are keys of a system file
 ("potential.sigma", "cutoff.radius", "dynamics.timestep") or lead to a component of a potential
@@ -6,8 +6,8 @@ A parameter is a number or an array of numbers, and its name is a path. Paths ar
 (as in system files), "position.17.x", "velocity.17.x" or "potential.layers.0.weight.3.2" (a path with
 indices).
 
-`dynamics.temperature` is the temperature of the thermostat and of drawn velocities, which scale with its
-square root; velocities of the structure do not change. `velocity.scale` scales all velocities, drawn or not.
+Drawn velocities scale with the square root of `dynamics.temperature`, which is also the temperature of the
+thermostat; velocities of the structure do not change. `velocity.scale` scales all velocities, drawn or not.
 `cutoff.radius` also sets the onset of a cutoff without switching. `box.scale` scales box and positions.
 """
 
@@ -121,7 +121,7 @@ def number(simulation: Simulation, name: str) -> float:
 
 
 def with_number(simulation: Simulation, name: str, given: float) -> Simulation:
-    """Return the simulation with another value of a scalar parameter; nothing is compiled again."""
+    """Return the simulation with another value of a scalar parameter; compiled functions are used again."""
     return with_values(simulation, {name: np.full(value(simulation, name).shape, given)})
 
 
@@ -158,7 +158,7 @@ def _by_species(simulation: Simulation) -> set[str]:
 
 
 def unit(simulation: Simulation, name: str) -> str:
-    """Return the unit of a parameter: "" for a pure number, its name in brackets if the unit is unknown."""
+    """Return the unit of a parameter; "" for a pure number, and "[name]" if the unit is not known."""
     table, whole = name.partition(".")[0], entry(simulation, name).whole
     last = whole.rpartition(".")[2]
     field = simulation.integrator.keys().get(last) if table == "dynamics" else None
@@ -197,9 +197,9 @@ def leaf_of(model: Any, name: str) -> Any:
 def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bool = True) -> dict[str, Any]:
     """Return the parameter arrays of pair potentials and of their cutoffs, by path.
 
-    `shared` adds arrays that do not depend on the pair type; `species` adds arrays with one entry per
-    species. The path `cutoff.radius` is the radius of all terms if all radii agree. If radii differ, each
-    term has its own path, and terms with equal radii refer to the same array.
+    The argument `shared` adds arrays that do not depend on the pair type, and `species` adds arrays with one
+    entry per species. The path `cutoff.radius` is the radius of all terms if all radii agree. If radii
+    differ, each term has its own path, and terms with equal radii refer to the same array.
     """
     found: dict[str, Any] = {}
     for part in model.parts:
@@ -228,7 +228,7 @@ def shared_radius(model: Any, name: str) -> tuple[str, ...]:
 
 
 def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
-    """Return the simulation with other parameter values, without applying the rules of system files again.
+    """Return the simulation with other parameter values, without repeating the checks of system files.
 
     Raises:
         InputError: a value is not finite, is complex, has the wrong shape, or is not allowed.
@@ -385,8 +385,8 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
 def changed(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
     """Change values of system-file keys or parameters; return the new, validated simulation.
 
-    A simulation from a system file is rebuilt from this file with the new values. If a parameter has no key
-    in system files, the new simulation does not have a file.
+    A simulation from a system file is rebuilt from this file with the new values. If a changed parameter has
+    no key in system files, the new simulation has no system file.
 
     Example:
         >>> mdnum.changed(sim, {"cutoff.radius": 9.0, "precision.force": "float32"})

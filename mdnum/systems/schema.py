@@ -401,7 +401,7 @@ class NVETable(_Dynamics):
 
 
 class LangevinTable(_Dynamics):
-    """Constant temperature with Langevin dynamics (the BAOAB integrator)."""
+    """Langevin dynamics at constant temperature (the BAOAB integrator)."""
 
     kind: Literal["langevin"]
     temperature: NonNegative = Field(description="of the bath, and of drawn velocities (K or ε/k)")
@@ -425,27 +425,27 @@ Links = Annotated[int, Field(ge=1, le=20, description="thermostats of a chain")]
 
 
 class NoseHooverTable(_ThermostatTable):
-    """Constant temperature, with a Nosé-Hoover chain."""
+    """Dynamics at constant temperature with a Nosé-Hoover chain."""
 
     kind: Literal["nose-hoover"]
     chain: Links = 3
 
 
 class CSVRTable(_ThermostatTable):
-    """Constant temperature, with stochastic velocity rescaling."""
+    """Dynamics at constant temperature with stochastic velocity rescaling."""
 
     kind: Literal["csvr"]
 
 
 class MTKTable(_BarostatTable):
-    """Constant pressure and temperature, with the method of Martyna, Tobias and Klein."""
+    """Dynamics at constant pressure and temperature by the method of Martyna, Tobias and Klein."""
 
     kind: Literal["mtk"]
     chain: Links = 3
 
 
 class CellRescalingTable(_BarostatTable):
-    """Constant pressure and temperature, with stochastic cell rescaling."""
+    """Dynamics at constant pressure and temperature with stochastic cell rescaling."""
 
     kind: Literal["cell-rescaling"]
     compressibility: Positive = Field(
@@ -482,7 +482,7 @@ Dynamics = _or_other(_DYNAMICS, OtherDynamics, _INTEGRATORS)
 
 
 class DynamicsAlone(TomlTable):
-    """A dynamics table by itself, for simulations that are made from objects and not from a system file."""
+    """The dynamics table of a simulation that is made from objects and not from a system file."""
 
     dynamics: Dynamics
 
@@ -650,7 +650,7 @@ class SystemSpec(TomlTable):
 
     @staticmethod
     def follow(data: dict[str, Any], values: Mapping[Key, Any]) -> None:
-        """If the temperature or the seed is changed in an NVE system, let velocities be drawn again."""
+        """Set the velocities of an NVE system to be drawn again if its temperature or seed is changed."""
         structure, dynamics = data.get("structure"), data.get("dynamics")
         if not isinstance(structure, dict) or not isinstance(dynamics, dict) or dynamics.get("kind") != "nve":
             return

@@ -197,7 +197,7 @@ class Simulation:
 
     @property
     def smooth(self) -> Simulation:
-        """The same system with a floating-point state, for linearization; integers have no derivative."""
+        """The same system with a floating-point state, because integers have no derivatives."""
         return self if self.fixed_point is None else replace(self, fixed_point=None)
 
     @property
@@ -235,7 +235,7 @@ class Simulation:
         return len(self.decider.r_cut) // self.channels
 
     def type_of(self, i, j) -> Int[np.ndarray, "..."]:
-        """Return an index of the pair's cutoff radius, which depends on species and group of terms.
+        """Return an index of a pair's cutoff radius, which depends on both species and the group of terms.
 
         Args:
             i: index of the first atom, plus the number of atoms times the index of the channel.
@@ -246,25 +246,25 @@ class Simulation:
         return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
 
     def first_atoms(self, i: Any) -> dict[str, Any]:
-        """Return the first atom of each decision's pair, and the term if terms have separate decisions."""
+        """Return the first atom of each cutoff decision, and the term if each term has its own decisions."""
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """Return a table column with the term of each decision (empty if all terms share decisions)."""
+        """Return a table column with the term of each cutoff decision (none if all terms share decisions)."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])
         return {"terms": names[kind // self.pair_types]}
 
     def pair_of(self, i: int, j: int) -> dict[str, Any]:
-        """Return the atoms of a pair as a table row, and the term if terms have separate decisions."""
+        """Return a table row with both atoms of a pair, and the term if each term has its own decisions."""
         return {key: np.asarray(one).item() for key, one in self.first_atoms(i).items()} | {"j": int(j)}
 
     def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
-        """Return the jumps of energy and radial force when a pair enters the cutoff, per decision type.
+        """Return the jumps of energy and radial force at the cutoff, for each type of cutoff decision.
 
         If atoms have weights, the largest absolute jumps of any pair are returned; see also `jumps_of`.
         """
@@ -286,7 +286,7 @@ class Simulation:
         return np.stack([np.asarray(own[0]) if own else np.ones(self.atoms) for own in each])
 
     def jumps_of(self, i, j) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """Return the jumps of energy and radial force when pairs enter the cutoff; for i see `type_of`."""
+        """Return the jumps of energy and radial force when pairs enter the cutoff; `type_of` explains i."""
         kind, weights = self.type_of(i, j), self._weights
         if weights is None:
             energy, force = (jump[kind] for jump in self.jumps())
@@ -331,7 +331,7 @@ class Simulation:
         return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order), edges)
 
     def with_model(self, model: Any) -> Simulation:
-        """Return the system with another potential, and with cutoff decisions at the radii of this potential.
+        """Return the system with another potential; cutoff decisions then use the radii of the new potential.
 
         Raises:
             InputError: the box is too small for the longest radius and the skin, or the precision of a
@@ -374,7 +374,7 @@ class Simulation:
         return self._ended(lambda end: end.continuous)
 
     def with_policy(self, policy: PrecisionPolicy = PrecisionPolicy()) -> Simulation:
-        """Return the system with a floating-point state and a policy's dtypes (default float64)."""
+        """Return the system with a floating-point state and the dtypes of a policy (default: float64)."""
         decider = replace(self.decider, dtype=policy.decision, state=policy.state)
         return replace(self, policy=policy, decider=decider, fixed_point=None)
 
@@ -398,11 +398,11 @@ class Simulation:
         cell: Float[np.ndarray, "3 3"] | None = None,
         stress: bool = True,
     ) -> Evaluation:
-        """Compute energy and forces of one configuration; for arguments see `Evaluator.__call__`."""
+        """Compute energy and forces of a configuration; `Evaluator.__call__` describes the arguments."""
         return Evaluator(self, skin=0.0, often=False)(positions, cell, stress)
 
     def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
-        """Compute the potential energy, the forces and extreme pair distances of one configuration.
+        """Compute the potential energy, the forces, and the smallest and largest pair distances.
 
         Args:
             positions: shape (atoms, 3), length; default those of the structure.

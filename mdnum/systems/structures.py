@@ -310,7 +310,7 @@ def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> No
 def _nearest(
     atoms: Atoms, within: float
 ) -> tuple[Float64[np.ndarray, " atoms"], Int64[np.ndarray, " atoms"], int]:
-    """Find the nearest neighbor of each atom within a distance, and the number of pairs within it."""
+    """Find each atom's nearest neighbor within a distance, and count the pairs closer than this distance."""
     from scipy.spatial import KDTree
 
     count = len(atoms)

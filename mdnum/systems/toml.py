@@ -1,9 +1,9 @@
 """Reading and writing of system files (TOML), with line numbers in errors and with overrides of keys.
 
 The standard library reads TOML, but does not write TOML and does not record the line of a key. For system
-files, this module writes TOML and finds the line of a key. A table whose keys depend on its kind is a union
-of pydantic models, selected by a key such as `kind` or `rule`; `models` finds the model of a key in such
-unions. Each error message is one line with the value found, the expected value and the line of the file.
+files, this module writes TOML and finds the line of a key. If the keys of a table depend on its `kind` or
+`rule`, the table is a union of pydantic models; `models` selects one. Each error message is one line with the
+value found, the expected value and the line of the file.
 """
 
 from __future__ import annotations
@@ -275,7 +275,7 @@ def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
 
 
 def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
-    """Return the possible pydantic models of the table at a key, best match first (none for a value)."""
+    """Return possible pydantic models of the table at a key, best first; empty if the key has no table."""
     found, table = [root], data
     for part in key:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}

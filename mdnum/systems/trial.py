@@ -1,7 +1,7 @@
 """Trial calls of a user's energy function at one configuration, with equivalent neighbor lists.
 
-One compiled function computes energy and derivatives, and another computes only the energy, with more padding
-in the list. The functions are compiled with few optimizations, because only a few dozen calls are needed.
+One compiled function computes energy and derivatives; another only computes the energy for a list with more
+padding. The functions are compiled with few optimizations, because only a few dozen calls are needed.
 """
 
 from __future__ import annotations
@@ -97,13 +97,13 @@ class Trial:
         return self.model.call
 
     def learn(self, **found: Any) -> None:
-        """Store properties that were found for the calling convention of the energy function."""
+        """Store newly found properties of the energy function's calling convention."""
         self.model = replace(self.model, function=replace(self.call, how=replace(self.call.how, **found)))
 
     # --- the programs ---------------------------------------------------------------------------------
 
     def _lists(self) -> None:
-        """Find the format of the function's neighbor list, whether it has self-pairs, and the parameters."""
+        """Find the neighbor list's format and whether it has self-pairs; also initialize parameters."""
         model, lists, own = self.model, self.model.lists, None
         if lists is not None:
             for x in (self.x / self.call.length, self.x @ np.linalg.inv(self.cell)):
@@ -172,7 +172,7 @@ class Trial:
         raise self.error("NOT_CALLABLE", error=failed, tried=", ".join(formats))
 
     def _returned(self) -> str:
-        """Return the kind of result of the energy function, one of the values of `Convention.returns`."""
+        """Return the form in which the energy function returns energies, as named in `Convention.returns`."""
         shape = jax.tree.map(lambda one: one.shape, jax.eval_shape(self.bare, *self.arguments()))
         one = ((), (1,))
         if isinstance(shape, Mapping):
@@ -185,7 +185,7 @@ class Trial:
 
     @cached_property
     def _alone(self) -> tuple[Any, Any]:
-        """The compiled energy function for a neighbor list with more padding, and its traced operations."""
+        """The energy function compiled for a neighbor list with more padding, and its traced operations."""
         traced = jax.jit(self.bare).trace(*self.arguments(self._padded(self.inside)))
         return _quick(traced), traced.jaxpr
 
@@ -200,7 +200,7 @@ class Trial:
     # --- calling it -----------------------------------------------------------------------------------
 
     def there(self, x=None, idx=None, cell=None, code=0) -> tuple[float, Float[np.ndarray, "atoms 3"]]:
-        """Compute energy and forces in the units of the simulation; for arguments see `arguments`."""
+        """Compute energy and forces in the simulation's units; `arguments` describes the arguments."""
         how, call, cell = self.call.how, self.call, self.cell if cell is None else cell
         energy, (slope, *_) = self.slopes(*self.arguments(idx, x, cell, code))
         honest = how.fractional and not how.real_slope

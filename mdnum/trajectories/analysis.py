@@ -1,9 +1,9 @@
 """Analysis of flips as an MDAnalysis class, `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
 
-Frames may be distributed over processes. A flip is found by comparing two successive frames; each process
-therefore reads also the frame before its first frame. No flip is lost at a process boundary, and the results
-are bitwise identical to those of a single process. If two processes find different pairs at a shared frame,
-an error is raised.
+Frames may be distributed over processes. A flip is found by comparing two successive frames, so each process
+also reads the frame before its first frame. No flip is lost at a process boundary, and the results are
+bitwise identical to those of a single process. If two processes find different pairs at a shared frame, an
+error is raised.
 """
 
 from __future__ import annotations
@@ -106,11 +106,11 @@ class NeighborFlips(AnalysisBase):
     `min_margin`, `initial`, `last`, `contacts`, `occupancy`). With several rules, each element of
     `results.rules` is a `RuleResult`. Tables have a method `to_pandas()`. With by="residue", the pairs are
     pairs of residues, `i` and `j` are row numbers of `results.residues`, and `results.left_out` counts the
-    excluded atoms. `results.resolution` is the resolution of positions in the file, and `results.bound` is
-    the resulting error bound of a distance, per frame. `results.repeats` lists the frames that repeat earlier
-    frames (see `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first frame
-    and a reason (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and times of the
-    frames analyzed; `FlipTable.frame` is an index into both.
+    excluded atoms. `results.resolution` is the resolution of positions in the file, and `results.bound`
+    contains the resulting error bound of a distance in each frame. `results.repeats` lists the frames that
+    repeat earlier frames (see `repeats.RepeatedFrames`). `results.other_box` gives another possible box of
+    the first frame and a reason (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers
+    and times of the frames analyzed; `FlipTable.frame` is an index into both.
 
     If a frame cannot be read or contains impossible values, an error with the frame number is raised; the
     results of all earlier frames are kept.
@@ -322,7 +322,7 @@ class NeighborFlips(AnalysisBase):
         self.results.digests[0].append(self._digest)
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
-        """Return (error bound of a distance, flips of each rule) at the frame of an MDAnalysis timestep."""
+        """Return the error bound of a distance, and the flips of each rule, for a timestep of MDAnalysis."""
         frame = self._check(self.library.frame(ts, int(ts.frame)))
         self._digest = digest(frame)
         bound = self._bound_of(frame) if self._bound is None else self._bound
@@ -382,7 +382,7 @@ class NeighborFlips(AnalysisBase):
 
 
 def _changed(before: Frame, after: Frame) -> float:
-    """Return the largest change (length) that transformations cause in a distance between successive atoms.
+    """Return the largest change that transformations cause in the distance between atoms k and k + 1.
 
     Shifts of atoms by lattice vectors and rotations of the system do not count as changes.
     """

@@ -52,7 +52,7 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
 
 
 class ArrayFrames(Trajectory):
-    """Trajectory of frames that a program passes one by one; each is kept until the next one is examined.
+    """Trajectory of frames that a program passes one by one; a frame is kept until the next is examined.
 
     Args:
         name: name of the frames on a results page.
@@ -154,7 +154,7 @@ class ArrayFrames(Trajectory):
 
     @classmethod
     def of(cls, frames: Any, reach: float, velocities: Any = None, **options: Any) -> ArrayFrames:
-        """Build a trajectory from an array of frames or a list of ASE Atoms; `reach`: longest cutoff."""
+        """Build a trajectory from an array of frames or a list of ASE Atoms; `reach`: the longest cutoff."""
         given = {name: options.pop(name) for name in ("cell", "box") if name in options}
         found, given["velocities"] = cls("array", **options), velocities
         found.reach = reach

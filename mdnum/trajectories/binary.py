@@ -1,7 +1,7 @@
 """Readers of GROMACS's xtc and trr files that check each frame before it is decoded.
 
 On damaged data, the library that decodes xtc files divides by zero or writes outside its buffers; the process
-ends, and all earlier results are lost. Each frame of a file is checked before it is decoded. The
+then crashes, and all earlier results are lost. Each frame of a file is checked before it is decoded. The
 compressed stream contains the number of bits of each atom's coordinates, so that the header, the number of
 atoms, the bit counts and the length can be verified without decoding. File damage that leaves a valid stream
 is not detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
@@ -49,7 +49,7 @@ _TEN = np.float32(10)
 
 
 def opened(trajectory: Any) -> XdrFile | None:
-    """Open an xtc or trr file of an MDAnalysis trajectory with a checking reader; None for other formats."""
+    """Open the xtc or trr file of an MDAnalysis trajectory, with frame checks; None for other formats."""
     path, kind = file_of(trajectory), {"XTC": XtcFile, "TRR": TrrFile}.get(str(trajectory.format))
     return None if kind is None or path is None else kind(path)
 
@@ -187,10 +187,10 @@ class XtcFile(XdrFile):
 
 @njit
 def _walk(stream, atoms, whole, small):
-    """Return the number of bits occupied by the coordinates of `atoms` atoms; -8 if the stream is invalid.
+    """Return the number of bits of the coordinates of `atoms` atoms, or -8 if the stream is invalid.
 
-    The coordinates of an atom occupy `whole` bits, followed by a flag. If the flag is set, the next five bits
-    contain the number of following atoms stored as differences of `small` bits each, and the change of
+    Each full set of coordinates of an atom occupies `whole` bits, followed by a flag bit. If the flag is set,
+    the next five bits give the number of atoms that follow as differences of `small` bits, and the change of
     `small`.
     """
     at, done, run = 0, 0, 0
@@ -237,7 +237,7 @@ class TrrFile(XdrFile):
         return 8 * self.head(0)[1]
 
     def head(self, number: int) -> tuple[int, int, list[int]]:
-        """Read a frame header up to the time; return (atoms, bytes per number, bytes of the ten blocks)."""
+        """Read a frame header up to the time; return (atoms, bytes per number, sizes of the data blocks)."""
         self._file.seek(self.start(number))
         magic, _, _, word, *numbers = _TRR.unpack(self._read(_TRR.size))
         sizes, atoms, box = numbers[:10], numbers[10], numbers[_BOX]

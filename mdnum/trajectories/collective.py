@@ -94,7 +94,7 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
 
     Rippled sheets may become flat, and bent chains may become straight, in a correct file. A collapse is
     reported only if the earlier spread across the sheet or chain was larger than the distance between
-    neighbors or, if a coordinate is constant, than a fifth of the largest spread.
+    neighboring atoms. For a constant coordinate, a fifth of the largest spread also suffices.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):
@@ -109,7 +109,7 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
 def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
     """Return (fraction of the atoms with the most frequent coordinate value, axis of the coordinate, value).
 
-    The fraction of the second most frequent value is subtracted; in a crystal, both are equally frequent.
+    The fraction of the second most frequent value is subtracted, as crystals have many equal coordinates.
     """
     ordered = np.sort(x, axis=0)
     repeated = np.count_nonzero(ordered[1:] == ordered[:-1], axis=0)
@@ -122,7 +122,7 @@ def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
 
 
 def _shift(before: np.ndarray, now: np.ndarray, far: float) -> float:
-    """Return the length of a displacement common to all atoms; 0 if it is small or atoms move differently."""
+    """Return the length of a displacement common to all atoms; 0 if small, or if displacements differ."""
     moved = now - before
     if len(now) < 2 or not far or np.abs(moved).max() <= far / (2 * _SUDDEN):
         return 0.0

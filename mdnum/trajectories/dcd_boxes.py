@@ -33,7 +33,7 @@ Examined = list[tuple[int, np.ndarray, np.ndarray]]
 
 
 def conventions(cell: Float[np.ndarray, "6"]) -> dict[str, Float[np.ndarray, "3 3"]]:
-    """Return lattice vectors by each convention that gives a box, with MDAnalysis's convention first."""
+    """Return the lattice vectors by each convention that gives a valid box, MDAnalysis's convention first."""
     from MDAnalysis.lib.mdamath import triclinic_vectors
 
     angles, found = cell[[4, 3, 1]], {}

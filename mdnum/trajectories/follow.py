@@ -170,11 +170,11 @@ def follow(
     trajectory: Trajectory, rules: Sequence[Rule], groups: Groups, resolution: Resolution, sink: Sink,
     residues: ByResidue | None = None,
 ) -> Iterator[Pass]:  # fmt: skip
-    """Read frames once; send rows of the tables "members", "flips", "frames" and "motion" to the sink.
+    """Read frames once; pass rows of the tables "members", "flips", "frames" and "motion" to `sink`.
 
-    If `residues` is given, pairs are pairs of residues, but groups still contain atoms. The same `Pass` is
-    yielded after each frame, and iteration may stop at any frame. Memory use does not grow with the number of
-    frames. Reading ends at the first unreadable or unusable frame; earlier results are kept.
+    If `residues` is given, each pair consists of two residues, but the groups still contain atoms. The same
+    `Pass` is yielded after each frame, and iteration may stop at any frame. Memory use does not grow with the
+    number of frames. Reading ends at the first unreadable or unusable frame; earlier results are kept.
 
     Raises:
         InputError: the first frame cannot be read or used, so there are no results to keep.
@@ -251,7 +251,7 @@ def _hand_on(
 
 
 def _threshold(rule: Rule, members: Members) -> tuple[float, bool]:
-    """Return a pair's typical threshold distance, and True if the order of distances defines neighbors."""
+    """Return a typical threshold distance, and True if neighbors are defined by the order of distances."""
     if isinstance(rule, CutoffRule | SpeciesCutoffs):
         return rule.reach, False
     if not len(members):
@@ -282,7 +282,7 @@ def _measure_flux(one: Followed, frame: Frame, groups: Groups, species: list[str
 
 @dataclass
 class SetDifference:
-    """Pairs (i, j, rank) that are neighbors in only one of two trajectories, updated by the flips of each."""
+    """Pairs (i, j, rank) that are neighbors in only one of two trajectories, updated with all their flips."""
 
     only_a: set[Pair] = field(default_factory=set)
     only_b: set[Pair] = field(default_factory=set)
@@ -320,7 +320,7 @@ class SetDifference:
 
 
 def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[np.ndarray, "pairs"]:
-    """Return distances, in length units, of pairs (i, j, rank of image); inf if an image does not exist."""
+    """Return distances (lengths) of pairs (i, j, rank of periodic image); inf if there is no such image."""
     i, j, rank = np.array(pairs, np.int64).reshape(-1, 3).T
     at = Placed(np.ascontiguousarray(frame.positions), lattice_of(frame.box), 0.0)
     return image_distances(at, np.minimum(i, j), np.maximum(i, j), rank, directed)
@@ -347,7 +347,7 @@ class ComparedSide:
         return self.tracker.step(frame, bound=self.bound)
 
     def position_bound(self, periods: int) -> float:
-        """Return the error bound of a position (length), for separations across `periods` box periods."""
+        """Return the error bound (a length) of a position, for distances that span `periods` box periods."""
         # a distance has two atoms that are off
         return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
 
@@ -434,7 +434,7 @@ class Compared:
 def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Iterator[Compared]:
     """Read two trajectories frame by frame, comparing the given atoms; yield a `Compared` after each frame.
 
-    Rows of the tables "apart" and "differing" are sent to the sink.
+    Rows of the tables "apart" and "differing" are passed to the function `sink`.
     """
     found, sides = Compared(), sets[0].sides
 
@@ -486,7 +486,7 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 def _apart(
     found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
 ) -> tuple[Separation, float]:
-    """Return the separation without a common shift, and the separation that file resolution can explain.
+    """Return the separation of two frames without a common shift, and its bound from file resolution.
 
     A shift common to all atoms is removed only if it explains nearly all of the separation. A shift can
     result from different origins of two files, or from removal of center-of-mass motion in one file.
@@ -518,7 +518,7 @@ def _sets_at(
     now: Separation,
     before: Separation,
 ) -> None:
-    """Record the difference of two files' neighbor sets at a frame; write the newly differing pairs."""
+    """Record how two files' neighbor sets differ at a frame; write the pairs that began to differ there."""
     difference, first = one.difference, False
     if one.certain is None and len(difference):
         # all that differ: one that came to differ within the resolution may be beyond it by now
