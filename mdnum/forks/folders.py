@@ -1,6 +1,6 @@
 """Find where two finished runs diverge, and how the runs differ, using only their folders.
 
-Neither run is repeated. The first differing bit and the fork (first differing decision) are read from both
+Neither run is repeated. The first differing bit and the fork (first differing decision) are read from the two
 folders. To compare positions, `twin_of` rebuilds the programs, and `mdnum.forks.fork` repeats the runs.
 
 Runs cannot be compared if the atoms, box, potential or contact of their systems differ. Runs may differ in
@@ -194,7 +194,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
-    """Find the step at which decisions differ between two trajectories or simulation loops."""
+    """Find the first step at which two trajectories, or two simulation loops, differ in a decision."""
     summaries, names = (first.summary, second.summary), ("rule", "i", "j", "rank")
     rules, between = ([each[name] for each in summaries] for name in ("rules", "between"))
     names_of = [", ".join(one["rule"] for one in each) for each in rules]
@@ -225,8 +225,8 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """Return the choices to which differing keys belong: the dtypes of all roles are one choice, and a cutoff
-    with its parameters is another choice.
+    """Return the numerical choices to which keys with different values belong. The dtypes of all roles form
+    one choice; a cutoff and its parameters form another.
     """
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}

@@ -3,14 +3,14 @@
 The tangent (the derivative of the state) is propagated along the recorded states with the same neighbor
 lists, so that the reference is the recorded run, bit for bit. The exponential growth rate of the tangent is
 the largest Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn
-1980) and, unlike the separation of two runs, does not saturate.
+1980) and, unlike the distance between two runs, does not saturate.
 
 Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation: to first order
-the decision flips at a = -m / (dm/da). The smallest amplitude that flips a decision at a step is a lower
-limit for all perturbations, as long as the perturbed run remains close to the reference run and makes the
-same decisions. If the force jumps at the cutoff, the first flip kicks the two atoms; the forecast ends there,
-because the linearization then describes another run. If the force is continuous at the cutoff, a flip does
-not change the motion to first order.
+the decision flips at a = -m / (dm/da). At each step, a perturbation below the smallest flip amplitude flips
+no decision, as long as the perturbed run remains close to the reference run and makes the same decisions. If
+the force jumps at the cutoff, the first flip changes the momenta of both atoms. The forecast ends there,
+because the linearization no longer describes the perturbed run. If the force is continuous at the cutoff, a
+flip does not change the motion to first order.
 """
 
 from __future__ import annotations
@@ -235,17 +235,17 @@ class Lyapunov:
         return self.error / self.timestep
 
     def ratio(self, seen: Growth) -> float:
-        """Divide the growth rate of two runs' separation by the Lyapunov exponent; NaN if there is no growth.
+        """Divide the rate at which two runs diverge by the Lyapunov exponent; NaN if the run is not chaotic.
 
-        If the ratio is near 1, the dynamics separated the runs; if it is well above 1, flips separated them.
+        The dynamics separates runs at the Lyapunov rate; if two runs diverge faster, flips separated them.
         """
         return seen.rate / self.rate if self.chaotic else float("nan")
 
     def steps_to(self, start: float, end: float) -> float | None:
         """Return the step at which a displacement has grown from an initial length to a given length.
 
-        The growth is that of the run; beyond the end of the run, the growth is extrapolated exponentially.
-        The result is None if the run is not chaotic and the displacement does not reach the final size.
+        Growth is that of the tangent during the run, and is extrapolated exponentially beyond the run's end.
+        The method returns None for a run that is not chaotic if the displacement does not reach `end`.
 
         Args:
             start: largest displacement of an atom at the start, length; for example one rounding unit.
@@ -320,8 +320,8 @@ class ForecastRange(NamedTuple):
 class Forecast:
     """First-order prediction of the decisions flipped by perturbations of the start along one direction.
 
-    Error: second order in the displacement, plus a few rounding units; flips that are uncertain within this
-        error are not predicted. `good_until` returns the last step for which the forecast is valid.
+    Error: neglected second-order terms and a few rounding units; flips that are uncertain within this error
+        are not predicted. `good_until` returns the last step for which the forecast is valid.
     """
 
     # simulation, steps: the run
@@ -383,10 +383,10 @@ class Forecast:
         return _each_pair_once(flips, count)
 
     def nearest(self, count: int = 10) -> tuple[PredictedFlip, ...]:
-        """Return the decisions flipped at the smallest amplitudes of either sign, one for each atom pair.
+        """Return the flips predicted at the smallest amplitudes of either sign, one for each pair of atoms.
 
-        A flip is included only if the forecast is valid up to its step: if flips kick the atoms, no flip
-        after the first can be predicted.
+        A flip is included only if the forecast is valid up to the step of the flip. If the force jumps at the
+        cutoff, only the first flip can be predicted.
         """
         # where flips kick, only what flips sooner or at less than all before it can be the first
         least = np.minimum.accumulate(self.reach.min(axis=2), axis=1)

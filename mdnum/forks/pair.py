@@ -1,4 +1,4 @@
-"""Compare two runs until they split; find the steps of fork and split, the deciding flip, and the verdict."""
+"""Compare two runs: find the step at which decisions first differ, the step of the split, and the verdict."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ def counterfactuals(
 
 
 def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such runs are disabled") -> int:
-    """Return the largest number of repeats: the requested number, or the default if decisions can be imposed.
+    """Return how often run B may be repeated: as requested, or the default if decisions can be imposed.
 
     Raises:
         InputError: the number is negative or too small for a significant result, or no repeats can be run.
@@ -217,11 +217,11 @@ def _beyond(step: int) -> int:
 
 
 def displacements(fork: Fork) -> tuple[float, float]:
-    """Return two displacements (lengths) for starts of repeats: the runs' initial separation, and a smaller.
+    """Return two initial displacements for repeats: the early distance between the runs, and a smaller one.
 
-    At a hundredth of the first displacement, a repeat begins to have the same rounding errors as the pair of
-    runs; at much smaller displacements, the repeat equals the pair and is no evidence. If a hundredth of the
-    first displacement is less than an ulp, the second displacement may be larger than the first.
+    With a hundredth of the first displacement, the rounding errors of a repeat begin to equal those of the
+    compared runs. With a much smaller displacement, the repeat equals the compared runs and is no evidence.
+    If a hundredth of the first displacement is below one ulp, the second may be larger than the first.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]
@@ -327,7 +327,7 @@ def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
 
 @result
 class Screened:
-    """Effect of one numerical choice within the steps of the comparison."""
+    """Effect of one numerical choice on a run, up to the last compared step."""
 
     choice: str  # its name
     difference: str  # one line; why it does not apply where it does not
@@ -342,7 +342,7 @@ class Screened:
 
     @property
     def held(self) -> bool | None:
-        """True if all bits of the two runs agreed; None if the choice was not run."""
+        """True if all bits of the two runs agreed; None if the program with this choice was not run."""
         return None if self.reason_unavailable is not None else self.first_bit is None
 
 
@@ -354,7 +354,7 @@ def screen(
     on: str | Executor | None = None,
     workers: int | None = None,
 ) -> list[Screened]:
-    """Compare runs of a system for every numerical choice, without counterfactual runs; earliest fork first.
+    """Compare two runs for each numerical choice, without counterfactual runs; list the earliest fork first.
 
     Args:
         system: a system that was loaded from a file.

@@ -1,9 +1,9 @@
 """Separate processes that run one system in several differently compiled programs.
 
-Programs of one system (compiled or not, batched, inside a gradient, for other processors) compute the same
-formulas, but may round differently. XLA flags apply to a whole process, so each variant of a program runs in
-its own process. Variants whose positions have equal hashes at every step are numerically the same program; if
-the hashes differ, the pattern of agreement between variants reveals the cause.
+Programs of one system (compiled, uncompiled, batched, differentiated, or for other processors) compute the
+same formulas, but may round differently. XLA flags apply to a whole process, so each variant of a program
+runs in its own process. Variants whose positions have equal hashes at every step are numerically the same
+program; if the hashes differ, the pattern of agreement between variants reveals the cause.
 
 `python -m mdnum.forks.processes FILE` executes the task described in a JSON file, and writes a file with an
 array of positions.
@@ -97,7 +97,7 @@ class Ran:
 
     @property
     def separation(self) -> float:
-        """Largest separation from the reference run at the last common step; NaN if the variant failed."""
+        """Largest displacement of an atom relative to the reference run at the last step; NaN on failure."""
         return float(self.separations[-1]) if len(self.separations) else float("nan")
 
     def agrees(self, other: Ran) -> bool:
@@ -131,8 +131,8 @@ def variants(
 ) -> Variants:
     """Run a system in several variants of its program, two processes at a time, and find which results agree.
 
-    All variants use one neighbor list, with a doubled skin if the box is large enough, and stop before motion
-    exceeds this skin. Other machines may give other groups, since some processors lack fused multiply-add.
+    All variants use one neighbor list, with a doubled skin if the box is large enough, and stop before an
+    atom moves too far. Groups may differ between machines, since some processors lack fused multiply-add.
 
     Args:
         system: a system that was loaded from a file and has a pair potential.
@@ -211,7 +211,7 @@ def _ran(variant: Variant, question: Mapping[str, Any], file: Path) -> tuple[Ran
 
 
 def clustered(rows: Sequence[Ran]) -> list[Ran]:
-    """Add cluster numbers to the rows; cluster 0 contains the reference, the first variant that succeeded."""
+    """Assign each variant to a cluster of equal results; cluster 0 contains the first successful variant."""
     reference = next((row for row in rows if not row.failed), None)
     # the longest of each cluster stands for it, so that a short run joins whom it agrees with
     heads: list[Ran] = []
@@ -225,11 +225,11 @@ def clustered(rows: Sequence[Ran]) -> list[Ran]:
 
 
 def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
-    """Derive causes, as codes, from the agreement between variants; variants that were not run are ignored.
+    """Find why variants differ, as codes, from which of them agree; variants without a result are ignored.
 
-    Codes: "fused", "others" and "not_fused" for programs without fused operations; "eager_..." for the
-    program without a compiler; "same", "fuses", "orders" and "leaves" for other programs, named in "program";
-    "reversed". If a variant differs from the reference, "step" is the first step at which they differ.
+    Codes "fused", "others" and "not_fused" concern programs without fused operations, "eager_..." the program
+    without a compiler, "reversed" the reversed sums, and "same", "fuses", "orders" and "leaves" the program
+    in "program". If a variant differs from the reference, "step" is the first step at which they differ.
     """
     by_name = {row.variant.name: row for row in rows if not row.failed}
     reference = next(iter(by_name.values()))
@@ -272,7 +272,7 @@ def positions_of(
 ) -> Float[np.ndarray, "steps 3 atoms"]:
     """Compute wrapped positions at steps 1, 2, ... with one program, in the user's order of atoms.
 
-    The result ends before an atom has moved by half of the skin, because only one neighbor list is built.
+    The computation ends before an atom has moved by half of the skin, as only one neighbor list is built.
     """
     from mdnum.md.cell import displacement
     from mdnum.rollout.engine import Engine, first_state

@@ -1,14 +1,14 @@
-"""Simulations with neighbor lists in another order: the order of a jax-md format, or a random order.
+"""Simulations whose neighbor lists are reordered: in the order of a jax-md format, or at random.
 
 The two forces of a pair are exactly opposite, so that a list format changes only the order of sums. Dense and
 sparse lists contain each pair twice, and each entry contributes half of the pair force. For a sparse list,
-the halves from an atom's own row form one sum, those from rows that contain the atom as a neighbor another,
-and both sums are added; with sorted rows, one loop over atom labels does the same. For a dense list, the
+the halves from an atom's own row form one sum, and the halves from other atoms' rows form another; both sums
+are added. If the rows are sorted, one loop over atom labels gives the same result. For a dense list, the
 neighbors' halves are added one by one to the sum of an atom's own halves. An ordered-sparse list contains
 each pair once: the terms of an atom with later atoms form one sum, those with earlier atoms another sum.
 
 Source: jax_md.smap.pair_neighbor_list and the transpose of its gathers, whose forces have these orders bit
-for bit (tests/forks/test_choices.py, jax-md 0.2.29). One detail of XLA is not reproduced: XLA sums rows with
+for bit (tests/forks/test_choices.py, jax-md 0.2.29). The module does not reproduce that XLA sums rows with
 more than 32 slots in blocks of 32.
 """
 
@@ -36,7 +36,7 @@ class ReorderedSimulation(Simulation):
 
     @classmethod
     def of(cls, simulation: Simulation, order: str | int) -> ReorderedSimulation:
-        """Create a simulation with reordered lists, and with a list format's sums if sums depend on order."""
+        """Create a simulation with reordered neighbor lists; order-dependent sums follow the list format."""
         same = _fields(Simulation, simulation)
         if isinstance(order, str) and simulation.reduction == Sequential():
             same["reduction"] = _SUMS[order]
@@ -44,7 +44,7 @@ class ReorderedSimulation(Simulation):
 
     @property
     def lists(self):
-        """Properties that identify neighbor lists; lists with another order have other properties."""
+        """Properties that identify neighbor lists, including the order of the pairs in a list."""
         return (*super().lists, self.order)
 
     def verlet_list(self, skin: float | None = None) -> VerletList:

@@ -108,7 +108,7 @@ def pinned(
     last: int | None = None,
     steps: int | None = None,
 ) -> Pinned:
-    """Repeat run B with decisions of run A imposed on some pairs, and compute its separation from run A.
+    """Repeat run B with run A's decisions on some pairs, and compute the distance between the two runs.
 
     Args:
         fork: a pair of runs with the same atom labels.
@@ -271,7 +271,7 @@ def minimal_cause(
 
 
 class _Search:
-    """Repeats run B with decisions of run A imposed on some pairs, to test whether B stays close to A."""
+    """Search that repeats run B with run A's decisions on some pairs, to test whether B stays close to A."""
 
     def __init__(
         self,
@@ -293,14 +293,14 @@ class _Search:
         return self.made >= self.allowed
 
     def _keep(self, segment: Segment) -> None:
-        """Store the positions of A at regular intervals."""
+        """Store the positions of run A at regular intervals."""
         for row in range(segment.rows):
             if (segment.first + row) % self._every == 0:
                 x = segment.unsorted("x", row).astype(np.float64)
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Test whether B stays close to A with A's decisions on some pairs; False if no run is left."""
+        """Test whether run B, with A's decisions on some pairs, stays close to A; False if no run is left."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():
@@ -331,8 +331,8 @@ class _Search:
 def _required(keys: list[int], search: _Search, until: int) -> list[int]:
     """Find a sufficient set of pairs by bisection, one necessary pair after another (QuickXplain).
 
-    Each pair requires about log2(n) runs; in delta debugging, the runs increase with the square of the pairs.
-    The method assumes that imposing more decisions never causes a split; it stops after `until` runs.
+    For n pairs, QuickXplain needs about log2(n) runs per necessary pair; delta debugging needs about n² runs.
+    QuickXplain assumes that imposing more decisions never causes a split; it stops after `until` runs.
 
     Source: Junker, QuickXplain, AAAI 2004.
     """

@@ -42,7 +42,7 @@ class DecisionTape:
         return {key: tuple(own.tolist()) for key, own in zip(keys.tolist(), steps, strict=True)}
 
     def pins(self, keys: Iterable[int], first: int, last: int) -> Pins:
-        """Return decisions on some pairs in a form that can be imposed on another run during some steps."""
+        """Return the decisions on some pairs, to be imposed on another run from a first to a last step."""
         begins = set(self.first.tolist())
         return Pins(
             [

@@ -1,4 +1,4 @@
-"""Programs and parameters of systems, for molecular dynamics and for the bouncing ball.
+"""Build the programs of systems (molecular dynamics or bouncing balls), and read and change parameters.
 
 Modules of molecular dynamics are imported inside functions, because they import jax_md, which is not required
 for a ball.
@@ -48,7 +48,7 @@ def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Pro
 def packed(system: Simulation | BallSystem, *more: Any) -> bytes:
     """Pickle a system and other objects for another process, where `unpacked` restores them bit for bit.
 
-    A system loaded from a file is built again from the file: its code is a module only in this process.
+    A system from a file is loaded again from this file, because its code is a module only in this process.
     """
     import cloudpickle
 
@@ -97,8 +97,8 @@ def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> 
 
 
 def alike(a: Any, b: Any) -> tuple[Any, Any]:
-    """Return two systems with comparable decisions: if only one system shares decisions between terms, both
-    systems get one decision for each term.
+    """Return two systems whose decisions can be compared. If terms of the potential share decisions in only
+    one system, both systems then make separate decisions for each term.
     """
     if isinstance(a, BallSystem) or not (a.pairwise and b.pairwise):
         return a, b

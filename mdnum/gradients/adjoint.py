@@ -6,7 +6,7 @@ steps makes other decisions. This module therefore makes and records an ordinary
 A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
 times that vector. For a pair potential, J times a vector is a sum over neighbors, like the forces, and
 requires no scatter operation. For any other energy, J times a vector is the tangent of the energy's gradient.
-Reverse mode then needs no record of the operations within a step.
+Because of this symmetry, reverse mode needs no record of the operations within a step.
 """
 
 from __future__ import annotations
@@ -116,8 +116,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return reduce(add, (d[a] * turned[a] for a in range(3))), turned
 
     def through(r2, along, inside, types, weights):
-        """Return a function that computes energy and slope of each slot (from r², slot parameters and shared
-        parameters), the values of the slot parameters, and the cotangents of energy and slope.
+        """Return a function that computes energy and du/d(r²) of each neighbor slot, the parameters of every
+        slot, and the cotangents of energy and du/d(r²).
         """
         # each slot has parameters of its own, so that no sum over slots stands inside the loop
         slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
@@ -131,8 +131,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return ended, slots, onto
 
     def with_shared(r2, along, inside, types, weights):
-        """Compute the slope of each slot, and cotangents of r², of slot parameters and of shared parameters.
-        A single reverse pass computes all cotangents; for a neural network, one pass is cheaper than two.
+        """Compute du/d(r²) of neighbor slots, and cotangents of r², slot parameters and shared parameters. A
+        single reverse pass computes all cotangents; for a neural network, one pass is cheaper than two.
         """
         ended, slots, onto = through(r2, along, inside, types, weights)
 
@@ -152,8 +152,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
     def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
-        """Return the contributions of neighbor slots to cotangents: one per slot for positions, forces, scale
-        and parameters of its pair type (in this order); one per block of slots for shared parameters.
+        """Return contributions to cotangents: of each neighbor slot to positions, forces, scale and
+        parameters of its pair type (in this order), and of each block of slots to shared parameters.
         """
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
@@ -220,7 +220,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
 
 def _differences(cell, own, other):
-    """Return position and vector differences of pairs, products of weights, and the weights of atoms j."""
+    """Return differences of pairs' positions and vectors, products of weights, and the weights of atom j."""
     d = [b - a for a, b in zip(own[:6], other[:6], strict=True)]
     products = (a * b for a, b in zip(own[6:], other[6:], strict=True))
     return [*cell.minimum_image(*d[:3]), *d[3:], *products, *other[6:]]
@@ -304,10 +304,10 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
 class AdjointCarry(NamedTuple):
     """Cotangents that a reverse pass propagates from each step to the preceding step.
 
-    A trace is an `AdjointCarry` with the cotangents at every step, but without those of the first frame. Row
-    k of a trace belongs to the state (x, half-kicked v) at the beginning of step first + k, without the
-    contribution of the cutoff crossings that lead to this state. Atoms in a trace are in the order of the
-    neighbor list. Unused rows at the end of a trace are undefined.
+    A trace is an `AdjointCarry` that contains the cotangents at every step, but not those of the first frame.
+    Row k of a trace contains the cotangents of positions and half-kicked velocities at the beginning of step
+    first + k, without contributions of the cutoff crossings that lead to this state. Atoms in a trace are in
+    the order of the neighbor list. Unused rows at the end of a trace are undefined.
     """
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
@@ -415,7 +415,7 @@ class StretchReversal:
         )  # fmt: skip
 
     def through(self, stretch: TapeStretch) -> tuple[Float[np.ndarray, "room most"], AdjointCarry]:
-        """Propagate cotangents through a stretch of steps; return weights of crossings and all cotangents."""
+        """Return the cotangents of every step of a stretch, and the weights of its cutoff crossings."""
         self.carry, (weights, trace) = transposed(*self.arguments(stretch))
         return np.asarray(weights), trace
 
@@ -451,10 +451,10 @@ def transposed(
 ):
     """Propagate cotangents backward through a stretch of steps with one neighbor list.
 
-    Returns cotangents at the beginning of the stretch, weights of crossings, and cotangents of every step.
-    JAX transposes the part of a step between two force evaluations. For a linear `KickDrift` integrator, the
-    derivative of a step does not depend on the forces, which therefore need not be recorded; `pull_back`
-    computes forces for derivatives with respect to the integrator's parameters.
+    The function returns the cotangents at the first step, one weight per cutoff crossing, and the cotangents
+    at every step. JAX transposes the part of a step between two force evaluations. With a linear `KickDrift`
+    integrator, the derivative of a step does not depend on the forces, so that forces need not be recorded.
+    For derivatives with respect to integrator parameters, `pull_back` computes the forces.
     """
     loss, origin, around, onto_total, pace = looking
     order, moves = tables.order, integrator.moves_cell
@@ -477,7 +477,7 @@ def transposed(
         return end.x, end.kicked, ahead, end.cell.matrix, end.v
 
     def look(row):
-        """Compute the cotangents of one frame and of the first frame from those of the loss's sums."""
+        """From cotangents of the summed observations, compute those of a frame and of the first frame."""
 
         def seen_at(x, v, potential, virial, origin, timestep, *box):
             here = (in_box(around, *box) if box else around)._replace(timestep=timestep)

@@ -2,9 +2,9 @@
 
 The derivative of an average with respect to a parameter has up to three contributions. First, at fixed
 positions, the value of the observable in each frame changes. Second, if the observable jumps when a pair
-enters the cutoff, the average changes with the cutoff radius: its derivative contains the jump times the
-density of pairs at the cutoff, which derivatives at fixed decisions lack. Third, with a thermostat, the
-statistical weight exp(-U/kT) of each frame changes.
+enters the cutoff, the average changes with the cutoff radius. The contribution of this jump is its height
+times the density of pairs at the cutoff; derivatives at fixed decisions omit this contribution. Third, with a
+thermostat, the statistical weight exp(-U/kT) of each frame changes.
 """
 
 from __future__ import annotations
@@ -210,8 +210,8 @@ def density(
 
     The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
     of the width; extrapolation from three widths, each half of the previous width, removes the second and
-    fourth powers. Of the extrapolations, the result is that from the widest kernels that agrees with those
-    from all narrower kernels within twice the standard error of the difference.
+    fourth powers. The result is the extrapolation from the widest kernels that agrees with the extrapolations
+    from all narrower kernels within twice the standard error of their difference.
 
     Args:
         weights: one per frame and pair type. reach: the largest width, length.
@@ -319,12 +319,12 @@ class BoundaryTerm(Method):
 class Reweighting(Method):
     """Gradient method: differentiable trajectory reweighting, for averages over a canonical ensemble.
 
-    The derivative is the sum of the explicit derivative (see `BoundaryTerm`) and of the response of the
-    weights, which is minus the covariance of the loss and the derivative of the energy, divided by kT.
+    The derivative is the explicit derivative of the loss (see `BoundaryTerm`) minus cov(loss, dU/dp) / kT,
+    where U is the energy and p the parameter; the second term describes how the weights of the frames change.
 
-    Error: statistical; `details` contains a standard error from block averages. The standard error is large
-    for few independent frames, and covers only the variation within the run. Source: Thaler and Zavadlav,
-    Nature Communications 12, 6884 (2021).
+    Error: the error is statistical; `details` contains a standard error from block averages. The standard
+    error is large for few independent frames, and it covers only fluctuations within one run. Source: Thaler
+    and Zavadlav, Nature Communications 12, 6884 (2021).
     """
 
     at_states: BoundaryTerm = field(default_factory=BoundaryTerm)  # the explicit part

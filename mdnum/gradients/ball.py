@@ -119,8 +119,8 @@ def dependence(
 ) -> dict[str, Dependence]:
     """Determine on which parameters a scalar loss depends, in the branches and iterations that ran.
 
-    The test sets the tangent of a parameter to NaN. This NaN propagates through every operation that has a
-    derivative (even a zero derivative), but through no other operation.
+    A parameter is tested by setting its tangent to NaN. A NaN tangent propagates through every operation that
+    has a derivative (even a zero derivative), but through no other operation.
 
     Args:
         function: maps a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as
@@ -167,8 +167,8 @@ def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str
 
 
 def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
-    """Return the program with loops in place of the custom derivative rule of `stopping.elementwise`. With
-    the rule, a zero derivative through a loop looks the same as a loop that did not run.
+    """Replace the custom derivative rule of `stopping.elementwise` by plain loops in a program. With the
+    custom rule, a loop whose derivative is zero looks the same as a loop that did not run.
     """
 
     def run(*inputs):
@@ -282,8 +282,8 @@ class ThroughIterations(BallMethod):
 class Frozen(BallMethod):
     """Gradient method: derivative of the program with decisions and iteration counts fixed to a recorded run.
 
-    The program with fixed decisions has no branches. Finite differences of this program therefore converge;
-    they are computed in float64 as a check.
+    The program with fixed decisions has no branches. Finite differences of a program without branches
+    converge; as a check, central differences are computed in float64.
     """
 
     name = "frozen"

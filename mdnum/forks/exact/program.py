@@ -1,9 +1,9 @@
 """The time steps of a run in exact real arithmetic. Interval arithmetic (Arb) proves every decision.
 
-The initial state and all constants are the double-precision numbers of the program, taken as exact. Positions
-and velocities are intervals ("balls") with many bits. A decision is proven if the interval of its margin lies
-on one side of the threshold; otherwise the run is repeated with more bits. The result is the sequence of
-decisions that the program would make without any rounding.
+The initial state and all constants are the double-precision numbers of the simulation, treated as exact.
+Positions and velocities are represented by intervals ("balls") in multiple-precision arithmetic. A decision
+is proven if the interval of the squared distance excludes the squared cutoff; otherwise the run is repeated
+with more bits. The exact run makes the decisions that the program would make without any rounding.
 
 Source: Johansson, Arb, IEEE Transactions on Computers 66 (2017) 1281.
 """
@@ -51,8 +51,8 @@ def pull_of(
 ) -> Callable[[Any], Any]:
     """Return a function that computes 2 du/d(r²) for a pair inside the cutoff from an interval of r².
 
-    The factor 2 du/d(r²) multiplies the displacement x_j - x_i in the force on i. Constants are exactly the
-    given doubles; values derived from these are intervals in the precision set at the time of the call.
+    The factor 2 du/d(r²) multiplies the displacement x_j - x_i in the force on i. Constants are exact
+    doubles; values derived from these constants are intervals in Arb's precision at the call.
 
     Raises:
         TypeError: the potential uses an operation that ball arithmetic does not support.
@@ -120,7 +120,7 @@ class ExactHistory:
 
     @property
     def bits_per_step(self) -> float:
-        """Growth of the largest interval in the second half of a run, in bits per step; NaN if too short."""
+        """Growth of the largest interval in the second half of a run, bits per step; NaN for short runs."""
         rows = np.flatnonzero(np.isfinite(self.radius))
         if len(rows) < 4:
             return float("nan")
@@ -185,7 +185,7 @@ def unsupported(simulation: Simulation) -> InputError | None:
 
 
 def _without_balls(simulation: Simulation) -> InputError | None:
-    """Return an error if the potential or cutoff needs an operation without interval arithmetic."""
+    """Return an error if the potential or cutoff uses an operation that ball arithmetic does not support."""
     from flint import arb
 
     try:
@@ -211,7 +211,7 @@ def _pulls(simulation: Simulation) -> list[Callable[[Any], Any]]:
 
 
 class ExactProgram:
-    """The time steps of a simulation in interval (ball) arithmetic, from its start in double precision.
+    """Program that runs a simulation in interval (ball) arithmetic from a double-precision initial state.
 
     Args:
         simulation: the simulation; its constants are in double precision, whatever its precision policy.
@@ -289,7 +289,7 @@ class _Run:
         self._close = 0
 
     def bits_needed(self) -> int:
-        """Estimate the required number of bits from the growth of the intervals so far."""
+        """Estimate how many bits the whole run needs, from the growth of the intervals up to this step."""
         grown = self._radius[: self.step + 1]
         known = np.flatnonzero(np.isfinite(grown))
         if len(known) < 50:
@@ -402,8 +402,8 @@ class _Run:
         """Make all decisions of a step with double-precision bounds, or with intervals if these do not
         suffice.
 
-        If double precision gives another nearest image than exact arithmetic, both images are further away
-        than r_cut, because half the box exceeds r_cut by more than rounding errors.
+        If double precision and exact arithmetic choose different nearest images, both images are further away
+        than r_cut, because half the box exceeds r_cut by more than the rounding errors.
         """
         program = self.program
         i, j, matrix = program._i, program._j, program._matrix
