@@ -172,7 +172,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure described by data: values plotted against values."""
+    """A figure that is described by its data: y values plotted against x values."""
 
     name: str  # of figures/<name>.svg, unique on its page
     title: str  # what is seen, a phrase

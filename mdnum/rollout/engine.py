@@ -1,8 +1,8 @@
 """Control of a simulation run: neighbor lists, calls of the compiled time-stepping loop, and records.
 
-The engine builds neighbor lists, starts the compiled loop over steps with one list, and yields its records. A
-record is yielded only after the next loop has been started, so that the caller processes this record while
-the device computes the next record.
+The engine builds a neighbor list, starts the compiled loop over the steps that use it, and yields the loop's
+records. A record is yielded only after the next loop has been started, so that the caller processes this
+record while the device computes the next record.
 """
 
 from __future__ import annotations

@@ -371,7 +371,7 @@ class PairRecorder:
 def pair_keys(
     i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], atoms: int
 ) -> Int[np.ndarray, "pairs"]:
-    """Return a sorted integer key for each pair of atoms i < j; `Simulation.type_of` explains i."""
+    """Return sorted integer keys, one for each pair of atoms i < j; `Simulation.type_of` explains i."""
     return np.sort(i.astype(np.int64) * atoms + j)
 
 

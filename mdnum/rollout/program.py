@@ -29,7 +29,7 @@ Loss = Callable[[Simulation, Float[np.ndarray, "atoms 3"], Float[np.ndarray, "at
 
 
 def squared_displacement(simulation: Simulation, x: np.ndarray, v: np.ndarray) -> float:
-    """Return the mean squared displacement of the atoms from the start, length²; the default loss."""
+    """Return the mean squared displacement of the atoms from the start (length²), the default loss."""
     return float(np.mean(np.sum((x - simulation.positions) ** 2, axis=1)))
 
 

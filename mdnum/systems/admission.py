@@ -156,7 +156,7 @@ class _Moved:
         self.whole = np.where(whole, near, n).astype(np.int32)
 
     def by(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
-        """Return positions with the atom moved by each vector, followed by the original positions."""
+        """Return copies of the positions with one atom moved by each vector, then the original positions."""
         x, moved = self.trial.x, np.arange(self.trial.n) == self.central
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 
@@ -169,7 +169,7 @@ class _Moved:
         return call.how.fractional or not self.unchanged(np.eye(3) * call.length)
 
     def unchanged(self, vectors, cell=None) -> bool:
-        """Return True if moving the atom by any of the given vectors does not change the energy."""
+        """Return True if moving one atom by any of the given vectors leaves the energy unchanged."""
         trial, idx = self.trial, self.idx
         none = np.nan_to_num(trial.energy(idx=np.full_like(idx, trial.n)))
         *moved, x = self.by(vectors)

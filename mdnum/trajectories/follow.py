@@ -223,7 +223,7 @@ def follow(
 def _hand_on(
     sink: Sink, number: int, one: Followed, flips: FlipTable, frame: Frame, at: int, size: tuple[int, Groups]
 ) -> None:
-    """Send the table rows of one frame and one membership rule to the sink."""
+    """Pass the table rows of one frame and one membership rule to the function `sink`."""
     if one.neighbors is None:
         members = one.tracker.members()
         one.neighbors = NeighborCounts(members, *size, one.rule.directed)
