@@ -294,7 +294,7 @@ class Frozen(BallMethod):
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """Compute derivatives by reverse mode, and central differences at fixed decisions as a check.
 
-        Error: rounding only for the derivative; about u^(2/3) (relative) for the finite differences.
+        Error: rounding only for the derivative; about u^(2/3) (relative, unit roundoff u) for differences.
         """
         run = problem.run(keep=False)
         decisions = jax.tree.map(jnp.asarray, run.decisions())
@@ -320,9 +320,9 @@ def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
 class RandomizedSmoothing(BallMethod):
     """Gradient method: derivative of E[loss(parameters + width * noise)], estimated from values of the loss.
 
-    The estimate includes the effect of jumps of the loss, where iteration counts or contacts change. Each
-    noise sample is used with both signs, so that a constant in the loss does not increase the variance. The
-    same random seed gives the same result, bit for bit.
+    The estimate includes the jumps of the loss at parameter values where iteration counts or contacts change.
+    Each noise sample is used with both signs, so that a constant in the loss does not increase the variance.
+    The same random seed gives the same result, bit for bit.
     """
 
     # standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0)

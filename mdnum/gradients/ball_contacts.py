@@ -82,8 +82,8 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """Gradient method: derivative of the fixed point of the projection, by the implicit function theorem.
 
-    The loss is computed from the executed iterations; the derivative is that of their limit, the floor. The
-    method `unrolled` gives a nonzero derivative with respect to k, an artifact of the solver's tolerance.
+    The loss is computed from the executed iterations; the derivative is that of their limit, the floor. For
+    the gain k, the method `unrolled` gives a nonzero derivative, an artifact of the solver's tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
@@ -210,7 +210,7 @@ class SoftFloor(BallMethod):
 
 
 def softened(problem: BallProblem, eps: float) -> BallProblem:
-    """Return the problem with a soft floor: a softplus penalty or, for impacts, a spring of depth about eps.
+    """Return the problem with a soft floor: softplus or, for impacts, a spring that gives way by about eps.
 
     Raises:
         InputError: the ball would cross the soft floor of width eps in too few steps.
@@ -259,10 +259,10 @@ class ThroughContacts(BallMethod):
     """Gradient method: derivative of the ball's motion in continuous time, including the times of contacts.
 
     Contact is decided at the end of a step. A ball that starts higher arrives later; the derivative of the
-    discrete steps lacks this effect. The saltation matrix of every contact adds this effect. If impacts are
-    located within a step, the program's own derivative already contains the saltation matrix. The method
-    treats a contact by projection like an impact. The force of a spring without a damper does not jump; for a
-    spring without a damper, the result is the same as from the method `unrolled`.
+    discrete steps lacks this effect. A saltation matrix at every contact adds the effect of contact times. If
+    impacts are located within a step, the program's own derivative already contains the saltation matrix. The
+    method treats a contact by projection like an impact. Without a damper, the force of a spring does not
+    jump, and the result is the same as from the method `unrolled`.
     """
 
     name = "event-aware"

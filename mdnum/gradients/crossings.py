@@ -2,8 +2,8 @@
 
 A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the perturbation then
 changes the pair's momentum after the crossing. Derivatives of a program's steps lack the effect of crossing
-times, even for short time steps. In reverse mode, the saltation matrix of mdnum.numerics gives this effect,
-with the cutoff sphere as threshold. A loss that contains the potential energy or the virial also jumps at a
+times, even for short time steps. In reverse mode, the saltation matrix (mdnum.numerics) of the cutoff sphere
+adds the effect of crossing times. A loss that contains the potential energy or the virial also jumps at a
 crossing: if its frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
 
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
@@ -98,7 +98,7 @@ class Crossings:
     @property
     def kick(self) -> Float[np.ndarray, "crossings"]:
         """Change of a pair's radial momentum per change of its distance at the crossing: the force jump
-        divided by the radial speed, energy/length per (length/time).
+        (energy/length) divided by the radial speed (length/time).
         """
         return self.force / self.speed
 
@@ -157,8 +157,8 @@ def onto_crossings(
 
     A crossing lies between two steps, on average at half of the drift between them. Let n be the unit vector
     from i to j, f the force jump and s = n · (v_j - v_i) + n · (dh/dt h^-1) r the radial speed, including the
-    motion of the box. A perturbation of the distance at the crossing by dr = n · (dx_j - dx_i), minus the
-    change of the lattice vectors between the images, changes the time for which the jump acts by dr/s:
+    motion of the box. If the distance at the crossing changes by dr = n · (dx_j - dx_i), minus the change of
+    the lattice vectors between the images, the force jump acts for a time that changes by dr/s:
 
         d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
         d(W) = (f r_cut n ⊗ n) dr/s        on the integrator's use of the virial tensor W
@@ -250,8 +250,8 @@ def of_energy(
 def _along(
     met: Met, vectors: Float[Array, "3 atoms"], matrix: Float[Array, "3 3"] | None = None
 ) -> Float[Array, "most"]:
-    """For each pair, return the difference of a vector between the two atoms, projected onto the direction of
-    the pair; if `matrix` contains lattice vectors, nearest images are used.
+    """For each pair, return the difference of both atoms' vectors, projected onto the direction of the pair.
+    If `matrix` contains lattice vectors, the nearest image of the difference is used.
     """
     dtype = vectors.dtype
     there = vectors.at[:, met.j].get(mode="fill", fill_value=0)
@@ -324,7 +324,7 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
         return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)
 
     def apart(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the minimum-image displacements of pairs, and the lattice shifts in them."""
+        """Return minimum-image displacements of pairs, and the numbers of lattice vectors subtracted."""
         start, end = positions(rows, i).astype(np.float64), positions(rows, j).astype(np.float64)
         inverse = inverses[rows + 1]
         if stretch.cell.size:

@@ -3,9 +3,9 @@
 A replica is the same system with different initial velocities and, with a thermostat, different noise.
 Replicas have different neighbor lists and are therefore run one after another on each device.
 
-If a parameter changes, pairs cross the cutoff at other steps. If the force jumps at the cutoff, the loss
-then jumps; between jumps, its slope is the derivative of the steps. The event-aware gradient is the slope
-across many jumps; a finite difference for comparison must span many jumps.
+If a parameter changes, pairs cross the cutoff at other steps. If the force jumps at the cutoff, the loss as a
+function of the parameter then jumps; between jumps, its slope is the derivative of the steps. The event-aware
+gradient is the slope of the loss across many jumps; for comparison, finite differences must span many jumps.
 """
 
 from __future__ import annotations

@@ -189,7 +189,7 @@ def _meaning(
     name: str, one: Gradient, reference: Gradient, size: float, relative: float, rounding: float,
     grown: float, jumps: bool,
 ) -> tuple[str, dict[str, float] | None]:  # fmt: skip
-    """Return why two derivatives differ, and numbers that support this reason (None for a rounding bound)."""
+    """Return why two derivatives differ, and numbers that support this reason (None if no numbers exist)."""
     kinds = {one.kind: one, reference.kind: reference}
     if not np.isfinite(relative):
         return "unexplained", {}

@@ -152,7 +152,7 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 def _pair(
     back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
-    """Return both atoms and the distance of a result's pair; -1, -1, NaN for a result without a pair."""
+    """Return both atoms and the distance of the pair with a given result; -1, -1, NaN if there is no pair."""
     nowhere = (-1, -1, float("nan"))
     if made is None or not made.index:
         return nowhere

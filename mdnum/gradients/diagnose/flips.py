@@ -1,13 +1,13 @@
 """Contribution of each flip to a gradient, and parameter values at which flips and the gradient change.
 
-The contribution of a crossing is a product of two factors. The first factor, from a reverse pass, is the
-derivative of the loss with respect to the cutoff of one crossing alone, including the effect of all later
-flips. The second factor, from tangents without flips, is the change of the cutoff minus the change of the
-pair distance. The contributions of single flips therefore sum exactly to the total contribution of all flips.
+The contribution of a flip to a gradient is a product of two factors. The first factor of a contribution, from
+a reverse pass, is the derivative of the loss with respect to the cutoff of one crossing alone, including the
+effect of later flips. The second factor, from tangents without flips, is the derivative of the cutoff minus
+that of the pair distance. The contributions of single flips therefore sum exactly to that of all flips.
 
 A decision boundary is a value of a parameter at which the decision on a pair changes, between two adjacent
 floats. Between two boundaries all runs make the same decisions, and loss and gradient are smooth functions of
-the parameter. The two gradients at a boundary show whether an optimizer step across the boundary is useful.
+the parameter. Gradients on both sides of a boundary show whether an optimizer step across it is useful.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _FIRST, _FACTOR = 1e-12, 8.0
 class FlipTerms:
     """Contributions of all flips to the derivative with respect to each parameter entry, largest first.
 
-    Here, a number is a scalar parameter or one entry of an array parameter ("potential.sigma[1]").
+    A number in the table is a scalar parameter or one entry of an array parameter ("potential.sigma[1]").
     """
 
     # a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the decision,

@@ -109,8 +109,8 @@ class GrowthWatch:
                 self.gradient[name][first + row] = value
 
     def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> GradientGrowth:
-        """Return the table of norms and its growth rate. The last row is the gradient of the whole run: the
-        loss may depend on the first frame, and cotangents of single steps lack this dependence.
+        """Return the norms of the gradient by horizon, and their growth rate. The last row is the gradient of
+        the whole run, because cotangents of single steps omit a dependence of the loss on the first frame.
         """
         units = self.simulation.units
         timestep = float(self.simulation.integrator.timestep)
@@ -141,7 +141,7 @@ class GrowthWatch:
 
 
 def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
-    """Choose the entry of WORDS that describes a run, from gradient growth and outliers of the rms speed."""
+    """Return the word from WORDS that describes the growth of a gradient and outliers of the rms speed."""
     usual = float(np.median(speed))
     if usual > 0 and not (np.isfinite(speed).all() and speed.max() <= _WILD * usual):
         return WORDS[2]
@@ -252,7 +252,7 @@ class ScalingWatch:
 class Spectrum:
     """Growth of small perturbations of the initial state: singular values of the Jacobian of the whole run.
 
-    The norm of a perturbation includes positions, and velocities times the internal time `clock`.
+    The norm of a perturbation combines positions, and velocities times the internal time `clock`.
     """
 
     steps: int  # of the run
@@ -286,7 +286,7 @@ class TangentImage:
 class Jacobian:
     """Derivative of the last state with respect to the state of step 0, at fixed decisions.
 
-    A state is a vector of all positions, and of all velocities times the internal time `clock`.
+    The state vector contains all positions, and all velocities multiplied by the internal time `clock`.
 
     Raises:
         InputError: a many-body potential, or an integrator that is not a linear `KickDrift`.

@@ -1,10 +1,10 @@
-"""Pairs whose distance turns around near the cutoff: contributions of flips that almost happened.
+"""Pairs whose distance has an extremum near the cutoff: contributions of flips that almost happened.
 
 A pair that turns back just outside its cutoff causes no flip. If the pair came slightly closer, it would
 enter and leave at a radial speed near zero, and the contribution of each crossing to the gradient would be
 proportional to the inverse of this speed. Conversely, if a pair comes inside the cutoff by only a small
-distance, a small perturbation can remove its contribution. Therefore, all turning points near the cutoff are
-examined: on both sides of the cutoff, and also between two steps.
+distance, a small perturbation can remove both crossings and their contribution. Therefore, all turning points
+near the cutoff are examined: on both sides of the cutoff, and also between two steps.
 
 Near the turning point the distance is r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth
 d crosses the cutoff twice at speed sqrt(2 a d), and the two crossings contribute 2 w / sqrt(2 a d), where w
@@ -101,7 +101,7 @@ class Turns:
     def term(self) -> Float[np.ndarray, "turns columns"]:
         """Magnitude of the contribution that the two crossings at each turning point may have. If distance
         and cutoff agree within the uncertainty, the pair is assumed to pass the cutoff by 1 % of the
-        uncertainty; otherwise the value is the change of the contribution in a run with shorter time steps.
+        uncertainty. Otherwise, the result is how much the contribution changes in a run with shorter steps.
         """
         bend, reach = self.table["bend"], self.reach
 
@@ -139,7 +139,7 @@ class Turns:
 
 @dataclass
 class Near:
-    """Collects turning points of pair distances, and their weights, tangents and shifts in other runs."""
+    """Collector of extrema of pair distances, with derivatives, and with shifts of extrema in other runs."""
 
     simulation: Simulation
     pace: Pace  # how often the loss looks
@@ -206,7 +206,7 @@ class Near:
         found["moved"] = np.asarray(along.r_cut).T[found["kind"]] - dr
 
     def compared(self, stretch: TapeStretch, per: int) -> None:
-        """Compare distances at turning points with those in a run of `per` steps for each step."""
+        """Compare distances at turning points with those in a run with `per` times as many steps."""
         cell, place = HostCell(self.simulation.cell), stretch.table.place
         for found in self._found.values():
             for earlier, name in ((1, "before"), (0, "after")):
@@ -248,7 +248,7 @@ def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, 
 def hermite(
     r0: np.ndarray, s0: np.ndarray, r1: np.ndarray, s1: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the extremum of the cubic that fits two distances, with rates of change of opposite signs.
+    """Find the extremum of the cubic through two distances whose rates of change have opposite signs.
 
     Args:
         r0, s0, r1, s1: distance and its rate at the two ends. time: between the ends.

@@ -7,7 +7,7 @@ decision was so close to its threshold that rounding determined the decision. (5
 of the same system scatter by more than their mean. If one of the five cases was not examined, the verdict on
 a gradient is undecided.
 
-The gradients for all horizons are computed from one run and one pass of tangents.
+A single run, with its tangents (derivatives in forward mode), gives the gradients for all horizons.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class Shorter(Loss):
 
 
 def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Problem:
-    """Return a problem that evaluates the loss at several horizons and makes `per` steps for each given step.
+    """Return a problem with the loss at several horizons, and with `per` times as many, shorter time steps.
 
     Args:
         at: horizons, rising; the last horizon is the length of the run.
@@ -246,11 +246,11 @@ class Trust(Judgment):
 
 
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
-    """Return a simulation with different rounding, for comparison, and formats narrower than float64.
+    """Return a simulation with different rounding, for comparison, and formats in use narrower than float64.
 
     If the given run uses formats narrower than float64, the run for comparison is in float64. No hardware
     format is wider than float64: a float64 run is compared with a run whose start is shifted by one rounding
-    error. The shift shows the effect of rounding on the gradient, up to a factor of order one.
+    error. The shifted start shows how rounding affects the gradient, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -403,7 +403,7 @@ def no_half_step(simulation: Simulation) -> bool:
 def verdict_of(
     limits: Sequence[Limit], steps: int, chaotic: bool, skipped: bool
 ) -> tuple[str, int, str, tuple[str, ...]]:
-    """Return the verdict, the last horizon within all limits, the first limit, and unexamined limits."""
+    """Return the verdict, the last horizon within all limits, the first limit, and limits not examined."""
     examined = [one for one in limits if one.horizon is not None]
     horizon = min((one.horizon or 0 for one in examined), default=0)
     met = [one.what for one in examined if one.reached and one.horizon == horizon]
@@ -418,7 +418,7 @@ def verdict_of(
 
 
 def _unseen(part: StretchTangents) -> None:
-    """Ignore the tangents of a stretch of steps (a callback without effect)."""
+    """Ignore the tangents of a stretch of steps; this callback does nothing."""
 
 
 def _digits(*relative: float) -> int:
@@ -440,7 +440,7 @@ def _missed(
     problem: Problem, own: Horizons, turns: Turns | None, unseen, made: ReversePass, moved, tolerance: float,
     saltation: bool, names: Sequence[str],
 ) -> Limit:  # fmt: skip
-    """Find the step after which excluded flips or near misses of the cutoff affect derivatives noticeably."""
+    """Find the last step up to which excluded flips and near misses of the cutoff have negligible effects."""
     if not np.any(np.asarray(problem.simulation.jumps())):
         return Limit(NEAR, problem.steps, False, "no jump")
     if not saltation:
@@ -475,7 +475,7 @@ def _missed(
 
 
 def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
-    """Divide terms by the size of derivatives; return the ratios and their cumulative sums in quadrature."""
+    """Divide contributions by derivatives; return the ratios and their cumulative sums in quadrature."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
         share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))
@@ -528,7 +528,7 @@ def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "poi
 def last_below(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the last horizon before values exceed a limit at two successive horizons, and whether they do.
+    """Return the last horizon before two successive values exceed a limit, and whether such values exist.
 
     A single value beyond the limit is ignored (except at the last horizon), because relative errors are large
     where a gradient changes sign.
@@ -546,9 +546,9 @@ def last_agreeing(
 ) -> tuple[int, bool]:
     """Return the longest horizon at which all values are below a limit, and whether a longer horizon exists.
 
-    Disagreement at shorter horizons is ignored: the relative error due to the time step may decrease again,
-    and if there are few flips, a single flip may contribute a large part of the gradient. Agreement at one
-    horizon with disagreement at adjacent horizons is regarded as chance.
+    Disagreement of two gradients at shorter horizons is ignored: the relative error due to the time step may
+    decrease again, and a single flip among few may contribute a large part of the gradient. If two gradients
+    agree at one horizon, but not at adjacent horizons, the agreement is regarded as chance.
     """
     within = np.max(np.stack(list(values.values())), axis=0) <= limit
     if len(within) > 1:
