@@ -73,7 +73,7 @@ class Program(Protocol):
     def repeats(
         self, others: Sequence[Any], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Return the separations of other runs from this run, without and with this run's decisions imposed.
+        """Return the distances of other runs from this run, without and with this run's decisions imposed.
 
         Args:
             others: the same program with perturbed starts.
@@ -84,7 +84,7 @@ class Program(Protocol):
         ...
 
     def nudged(self, size: float, count: int, seed: int) -> list[Any]:
-        """Return programs whose initial states are randomly displaced, by at most about `size`."""
+        """Return programs whose initial states are displaced randomly, by about `size` or less."""
         ...
 
     def decision(self, other: Any, flips: Sequence[Any], separation: float) -> Decision:
@@ -215,7 +215,7 @@ class Decision:
 
     @property
     def margin(self) -> float:
-        """Margin (threshold minus quantity) in the run that made the decision, or in run A at the start."""
+        """Margin (threshold minus quantity) in the run that decided; for a decision at the start, in A."""
         return self.margins["A" if self.run == "start" else self.run]
 
     @property

@@ -19,7 +19,7 @@ def smallest(name: str) -> float:
 
 
 def columns(quantities: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return table columns with the largest and smallest magnitudes of quantities, shape (rows, values).
+    """Return the largest and smallest magnitude in each row of quantities (rows, values) as table columns.
 
     `largest_NAME` is the largest magnitude in a row, `smallest_NAME` the smallest nonzero magnitude (or NaN).
     """

@@ -1,7 +1,7 @@
 """Registries of named objects (cutoffs, integrators, methods) from mdnum and from other packages.
 
 A registry maps a name to a *value*: an object, or a class or function that creates an object. Another package
-adds a value to a registry by an entry point of the registry's group, such as
+adds a value to a registry by an entry point in the registry's group, for example:
 
     [project.entry-points."mdnum.cutoffs"]
     "smooth-cubic" = "my_package.cutoffs:SmoothCubic"

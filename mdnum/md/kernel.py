@@ -1,10 +1,10 @@
-"""Sums over the neighbors of every atom, by one compiled loop that XLA calls on a CPU.
+"""Sums over the neighbors of every atom, computed by one compiled loop that XLA calls on a CPU.
 
-A function of one pair is traced by jax, and its operations are written as LLVM text for vectors of eight
-atoms. The data of an atom are contiguous, so that loading a neighbor takes one or two instructions, and the
-terms of eight slots are summed in registers. XLA's own loop gathers and computes in separate passes. No
-operation is contracted or reordered, so that equal input gives equal bits on every processor. XLA calls the
-loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
+jax traces a function of one pair, whose operations are written as LLVM text for vectors of eight atoms. The
+data of each atom are contiguous, so that loading a neighbor takes one or two instructions. The terms of eight
+neighbor slots are summed in registers. XLA's own loop gathers neighbor data and computes terms in separate
+passes. No operation is contracted or reordered, so that equal input gives equal bits on every processor. XLA
+calls the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ _Pair = Callable[..., Sequence[Any]]
 
 
 class Shortcut(NamedTuple):
-    """A cheaper function of a pair, used for vectors of pairs that are all near (see `far`)."""
+    """A faster version of the pair function, for vectors of pairs in which no pair is far (see `far`)."""
 
     # whether a pair is far, from the arguments of a function of a pair
     far: Callable[..., Any]
@@ -99,7 +99,7 @@ def over_pairs(
     near: Shortcut | None = None,
     totals: int = 0,
 ) -> PairSums | None:
-    """Sum a function of pairs over the neighbor slots of every atom; inside jit, on a CPU.
+    """Sum a pair function over the neighbor slots of every atom; use this function inside jit and on a CPU.
 
     Args:
         pair: a function of scalars: the columns of the atom, those of its neighbor, the pair type (None if
@@ -151,7 +151,7 @@ def over_pairs(
 
 
 def left_out(potential: Any) -> str | None:
-    """Return jax's name of an operation that the loop does not support; None if all are supported."""
+    """Return jax's name of an operation that the compiled loop does not support, or None if there is none."""
     return _LEFT_OUT.get(jax.tree.structure(potential))
 
 
@@ -163,7 +163,7 @@ class _NotKnown(Exception):
 
 
 class _Value(NamedTuple):
-    """A value that differs between pairs: the name of a vector of numbers or decisions in the loop."""
+    """Name of an LLVM vector of numbers or decisions that differ between pairs."""
 
     name: str
     kind: str = "VEC"
@@ -220,7 +220,7 @@ def _number(value: Any, kind: str = "VEC") -> str:
 
 
 def _whole_power(equation: Any, inputs: list[Any]) -> int:
-    """Return the exponent of a power that is computed by products; 0 for other operations."""
+    """Return the exponent if an operation is a power that is computed by products, and 0 otherwise."""
     name, y = equation.primitive.name, inputs[-1]
     if name in ("square", "integer_pow"):
         return equation.params.get("y", 2)
@@ -239,11 +239,11 @@ def _written(
     inverses: bool,
     totals: int,
 ) -> _Written:
-    """Return the source of the loop over eight slots of a block of atoms, an LLVM function `word`.
+    """Return the source of an LLVM function `word` that processes eight neighbor slots of a block of atoms.
 
     The arguments of `word` are the number of atoms, the constants, the stride between slots (in atoms), and
-    the addresses of rows. The rows are columns of the atoms, flags, sums, totals, decisions, types and
-    neighbors of the first slot, smallest |margin| so far, and the table of atom data.
+    an address for each data row. The data rows are columns of the atoms, flags, sums, totals, decisions,
+    types and neighbors of the first slot, the smallest |margin| so far, and the table of atom data.
     """
     number, truth = jax.ShapeDtypeStruct((), np.float64), jax.ShapeDtypeStruct((), np.bool_)
     kind = jax.ShapeDtypeStruct((), np.uint8) if types else None
@@ -521,7 +521,7 @@ def _of_width(text: str, wide: int) -> str:
 
 
 def _listed(rows: int, margins: bool) -> list[str]:
-    """Write a test for neighbors of any atom of a vector in eight slots; reset the decisions to false."""
+    """Write code that tests whether atoms have neighbors in eight slots, and clears their decisions."""
     lines = []
     for k in range(8):
         lines += [
@@ -546,7 +546,7 @@ def _listed(rows: int, margins: bool) -> list[str]:
 
 
 def _others(wide: int, columns: int, rows: int) -> list[str]:
-    """Write LLVM code that loads the neighbors in a slot, four numbers at a time, and transposes the data."""
+    """Write LLVM code that loads and transposes the data of a slot's neighbors, four numbers at a time."""
     parts = -(-columns // 4)
     lines = [
         f"%at.WIDE = getelementptr i32, ptr %r{rows - 3}, i64 %from.WIDE",
@@ -651,7 +651,7 @@ define i64 @called(i64 %frame) {{
 
 @cache
 def _registered(source: str, cpu: str = "") -> str:
-    """Compile a loop, for this or a named processor, and register it with XLA; return its name in XLA."""
+    """Compile a loop for the named processor (default: this one) and register it; return its name in XLA."""
     name = f"mdnum_pairs_{cpu}{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     features = "" if cpu else llvm.get_host_cpu_features().flatten()
     machine = llvm.Target.from_default_triple().create_target_machine(
@@ -709,7 +709,7 @@ _USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _WORD, _TABLE, _THREADS, _ASKED, _NEAREST
 
 @njit
 def _work(job):
-    """Process blocks of atoms of a job, one after the other, until no block is left."""
+    """Process the blocks of atoms that other threads have not taken, one by one, until no block is left."""
     block, blocks = added(job + 8 * _NEXT, 1), peek(job, _BLOCKS)
     if block >= blocks:
         return
@@ -763,7 +763,7 @@ def _leave(job):
 
 
 def _help(job):
-    """Task of a helper thread: process blocks of a job, then release the job."""
+    """Task of a helper thread: process blocks of atoms of a job, then release the job."""
     _work(job)
     _leave(job)
     return 0
@@ -825,7 +825,7 @@ def _over_blocks(frame, word, task):
 
 @cache
 def _driver() -> tuple[int, int]:
-    """Return the addresses of the driver and of its helper task, compiled once per installation."""
+    """Return the addresses of `_over_blocks` and of `_help`, compiled once per installation."""
     made = [
         cfunc(types.intp(*[types.intp] * count), function)
         for function, count in ((_over_blocks, 3), (_help, 1))

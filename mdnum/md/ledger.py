@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Int
 
 
 class Columns:
-    """Base class of tables: dataclasses whose fields are columns of equal length; the first is an array.
+    """Base class of tables, which are dataclasses with columns of equal length. The first field is an array.
 
-    A field that is not an array is either a text that applies to all rows, or None (unknown column).
+    A field that is not an array is either one text for all rows, or None if the column is unknown.
     """
 
     def __len__(self) -> int:
@@ -50,7 +50,7 @@ class Columns:
 
 @dataclass(frozen=True)
 class Members(Columns):
-    """Pairs inside the cutoff at one frame, sorted by (i, j, rank) without duplicates."""
+    """Pairs inside the cutoff in one frame, sorted by (i, j, rank), without duplicates."""
 
     i: Int[
         np.ndarray, "pairs"
@@ -65,8 +65,8 @@ class Members(Columns):
 class FlipTable(Columns):
     """Table with one row per flip, sorted by (step or frame, i, j, rank).
 
-    In a run of mdnum, flips are changes of the decisions used for forces, for each pair at each step. For a
-    trajectory or other given positions, flips are computed from the positions at each frame.
+    In a run of mdnum, a flip is a change of the decision used for the forces of a pair between two steps. For
+    given positions, such as those of a trajectory, flips are computed from the positions in each frame.
     """
 
     i: Int[np.ndarray, "flips"]  # the pair, as in `Members`
@@ -94,6 +94,6 @@ class FlipTable(Columns):
     by_box: Float[np.ndarray, "flips"] | Any = None
 
     def columns(self, rule: int = 0) -> dict[str, Any]:
-        """Return the known columns by their names in flips.parquet, for rows of one neighbor rule."""
+        """Return the known columns of the flips of one neighbor rule, by their names in flips.parquet."""
         known = {name: column for name, column in vars(self).items() if column is not None}
         return {"rule": np.broadcast_to(np.int32(rule), len(self)), **known}

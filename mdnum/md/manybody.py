@@ -81,7 +81,7 @@ class ManyBody(eqx.Module):
         cell: Float[Array, "3 3"],
         deformation: Float[Array, "3 3"],
     ) -> Float[Array, ""]:
-        """Return the energy after a deformation near 1 of positions and lattice vectors (as rows)."""
+        """Return the energy of positions and lattice vectors (rows) times a deformation near identity."""
         return self.energy(positions @ deformation, neighbor, cell @ deformation)
 
     def forces(

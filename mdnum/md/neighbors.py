@@ -86,9 +86,9 @@ class PairTable:
     def decided(
         self, bits: UInt8[np.ndarray, "words atoms"]
     ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Return indices i < j of the pairs whose packed decision is true, each once, in table order.
+        """Return atoms i < j of the pairs with a true decision, each pair once, in the order of the table.
 
-        In channel number c (from 0), i is increased by c times the number of atoms.
+        For channel number c (counted from 0), c times the number of atoms is added to i.
         """
         slots, columns = set_bits(bits)
         channel, slots = np.divmod(slots, self.slots)
@@ -97,7 +97,7 @@ class PairTable:
         return (i + channel * len(self.order))[keep], j[keep]
 
     def listed(self, channels: int = 1) -> tuple[Int[np.ndarray, "pairs"], ...]:
-        """Return sorted indices of both atoms, and i and j as in `decided`, for every pair and channel."""
+        """Return both sorted indices, and i and j as in `decided`, of every pair in every channel."""
         slots, first = np.nonzero(self.index < len(self.order))
         second = self.index[slots, first]
         i, j = self.order[first], self.order[second]
@@ -127,7 +127,7 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Return index table, atom order and largest neighbor count; if > slots, neighbors are missing."""
+        """Return neighbor table, atom order and largest neighbor count; above `slots`, pairs are missing."""
         ...
 
 
@@ -169,7 +169,7 @@ BUILDERS.add("device", "mdnum.md.device_search:BUILDER")
 
 
 def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
-    """Raise an error if the list radius is too large for the minimum image.
+    """Raise an error if r_cut + skin is too large for the minimum-image convention.
 
     Raises:
         InputError: r_cut + skin exceeds half the smallest perpendicular width of the box.
@@ -186,7 +186,7 @@ def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
 
 @dataclass
 class VerletList:
-    """Builder of Verlet lists, which increases the capacity when needed."""
+    """Builder of Verlet lists, which increases the number of neighbor slots per atom when needed."""
 
     builder: ListBuilder  # the neighbor search
     rule: RebuildRule  # when to rebuild
@@ -199,7 +199,7 @@ class VerletList:
     slots: int = field(default=0)  # room per atom; 0 lets the density decide
 
     def build(self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell) -> PairTable:
-        """Return the pairs within r_cut + skin of wrapped positions, increasing the capacity as needed.
+        """Return the pairs closer than r_cut + skin for wrapped positions; add slots per atom if needed.
 
         Raises:
             CapacityError: an atom would need more slots than there are other atoms.
@@ -238,7 +238,7 @@ class VerletList:
         return max(SLOTS, int(np.ceil(slots / SLOTS)) * SLOTS)
 
     def consumed(self, positions, cell: Cell, reference, reference_cell: Cell) -> float:
-        """Return the fraction of the skin used up by motion and strain; above 1, pairs may be missing.
+        """Return the fraction of the skin that motion and strain have used up; above 1, pairs may be missing.
 
         Args:
             positions, cell: present state. reference, reference_cell: state when the list was built.

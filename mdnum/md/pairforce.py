@@ -2,9 +2,9 @@
 
 Every pair is evaluated twice, once for each atom. Each atom sums over its neighbors in a fixed order, without
 scattered writes. In double precision on a CPU, forces are computed by one compiled loop (`md.kernel`). On
-other devices, or in other precisions, XLA evaluates a group of slots for all atoms at once and packs the
-decisions into bits, so that temporary arrays are small enough for the cache. Evaluating the whole (slots,
-atoms) array at once takes twice as long for 4,000 atoms and ten times as long for 32,000 atoms.
+other devices, or in other precisions, XLA evaluates a group of neighbor slots for all atoms at once and packs
+the decisions into bits, so that temporary arrays fit in the cache. Evaluating all slots of all atoms at once
+would take twice as long for 4,000 atoms and ten times as long for 32,000 atoms.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class PairForce(eqx.Module):
 
     @property
     def law(self) -> CutPotential | Guarded:
-        """The potential in the precision policy's arithmetic; 16-bit types are rounded at every operation."""
+        """The potential in arithmetic of the force dtype; 16-bit results are rounded at every operation."""
         model = self.model.typed
         return Guarded(model, self.zero, rounded) if self._short else model
 
@@ -118,11 +118,11 @@ class PairForce(eqx.Module):
 
     @property
     def _inside(self) -> str:
-        """Comparison of the margin with 0 that is true for a pair inside the cutoff, ">" or ">="."""
+        """Comparison (">" or ">=") of the margin with 0 that is true for a pair inside the cutoff."""
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
     def _near(self, pair: Callable[..., Any], tensor: bool) -> kernel.Shortcut | None:
-        """Return a pair function without minimum image, for near pairs; None if it would save no time."""
+        """Return the pair function without minimum image, for close pairs; None if it would save no time."""
         if not any(self.cell.pbc) or (self.cell.orthorhombic and not tensor):
             return None
 
@@ -182,7 +182,7 @@ class PairForce(eqx.Module):
         return wide and few and self.reduction == Sequential() and foreign.known()
 
     def _terms(self, tensor: bool) -> Callable[..., tuple[Float[Array, "..."], ...]]:
-        """Return a function that computes force, energy and virial from displacement and decision of a pair.
+        """Return a function of a pair's displacement and decision that computes force, energy and virial.
 
         Args:
             tensor: True for a virial with six components, in Voigt order.
@@ -253,9 +253,9 @@ class PairForce(eqx.Module):
 
 
 class ChannelForce(PairForce):
-    """Forces of terms with different cutoff radii, evaluated one after the other over one neighbor list.
+    """Forces of potential terms with different cutoff radii, evaluated in turn over one neighbor list.
 
-    The decisions of all terms are concatenated along the first axis.
+    The decisions of all terms are concatenated along the first array axis.
     """
 
     model: Channels  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -302,7 +302,7 @@ def _joined(parts: Sequence[Any]) -> Decisions:
 
 
 def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...]]:
-    """Return factors of the term energies, for `CutPotential.evaluate`; empty if no term has weights.
+    """Return weight factors of the term energies for `CutPotential.evaluate`; empty if no term has weights.
 
     Args:
         products: products of the weights of both atoms, for terms with weights.
@@ -354,10 +354,10 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
 
 
 def _virial(made: kernel.PairSums, x: Float[Array, "3 atoms"]) -> list[Float[Array, ""]]:
-    """Return force times displacement, in Voigt order, summed over all pairs for each of the two atoms.
+    """Return the sum of force times displacement over all pairs, counted for both atoms, in Voigt order.
 
     A displacement is x_j - x_i minus lattice vectors. In the virial, force times position is summed over
-    atoms; force times lattice vectors is added in the loop over pairs, for the few pairs across a boundary.
+    atoms. Force times lattice vectors is added in the pair loop for the few pairs across a periodic boundary.
     """
     return list(-2 * products(made.sums, x) - made.totals)
 
@@ -376,10 +376,10 @@ def _in_one_loop_jvp(primals, tangents, *, decisions: bool, tensor: bool):
 def imposed(
     inside: Bool[Array, "4 atoms"], given: UInt8[Array, "atoms"], where: UInt8[Array, "atoms"] | None
 ) -> Bool[Array, "4 atoms"]:
-    """Return the decisions for a group of slots: imposed decisions if there are any, otherwise `inside`.
+    """Return the decisions in a group of slots: imposed if given for a slot, otherwise computed (`inside`).
 
-    A simple mask makes the compiler compute distances twice: a step of 864 atoms takes 2.2 times as long as a
-    normal step, 1.3 times with a mask per slot (`unpacked`), and 1.2 times with this code.
+    With a simple mask, the compiler computes distances twice: a step of 864 atoms takes 2.2 times as long as
+    without imposed decisions. The factor is 1.3 with a mask per slot (`unpacked`), and 1.2 with this code.
 
     Args:
         where: slots in which decisions are imposed; None for all.
@@ -390,7 +390,7 @@ def imposed(
 
 
 class Guarded(eqx.Module):
-    """A cut potential with modified arithmetic (`how`): rounded after every operation, or reproducible."""
+    """A potential with cutoff, evaluated by `how`: with every operation rounded, or reproducibly."""
 
     model: CutPotential
     zero: Int[Array, ""]
@@ -409,10 +409,10 @@ VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
 def products(a: Float[Array, "_ atoms"], b: Float[Array, "_ atoms"]) -> Float[Array, "6"]:
-    """Return, in Voigt order, the sums over atoms of a_i b_j, for rows i and j (the first three) of a and b.
+    """Return the six sums over atoms of a_i b_j, in Voigt order, for the first three rows i of a and j of b.
 
-    Eight partial sums are added at a time, which XLA does in vectors; for 4,000 atoms, this takes a third of
-    the time of sequential sums.
+    XLA computes eight partial sums at a time with vector instructions. For 4,000 atoms, this takes a third of
+    the time of a sequential sum.
     """
     pieces = [jnp.pad(one[:3], ((0, 0), (0, -one.shape[1] % 8))).reshape(3, 8, -1) for one in (a, b)]
     sums = [reduce(add, (pieces[0][i, k] * pieces[1][j, k] for k in range(8))) for i, j in VOIGT]
@@ -553,7 +553,7 @@ class PairDynamics(eqx.Module):
     """Dynamics on a fixed neighbor list with imposed decisions.
 
     The class is used to replay the decisions of another run, and to compute gradients at fixed decisions. A
-    normal simulation makes the same steps in compiled epochs, with decisions from its own positions.
+    normal simulation makes the same time steps, in compiled blocks, with decisions from its own positions.
     """
 
     force: PairForce  # the pair force

@@ -81,11 +81,11 @@ class PairPotential(eqx.Module):
 
     @property
     def typed(self) -> PairPotential:
-        """The potential with two values per pair type, one for each atom, of each per-species parameter."""
+        """The potential with every per-species parameter as two values per pair type, one for each atom."""
         return self
 
     def split(self) -> tuple[Any, Any]:
-        """Return two copies: one with per-pair-type parameters only, and one with shared parameters only."""
+        """Return two copies of the potential: with only per-pair-type and with only shared parameters."""
         return self, jax.tree.map(lambda _: None, self)
 
     @property
@@ -300,7 +300,7 @@ for _potential in (LennardJones, Morse, SoftSphere):
 
 
 class SumPotential(PairPotential):
-    """Potentials of several terms with a common pair decision; energies and slopes are tuples, by term."""
+    """Potential terms with a common pair decision; energies and slopes are tuples with one entry per term."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     parts: tuple[PairPotential, ...]
@@ -322,7 +322,7 @@ class SumPotential(PairPotential):
 
 
 class Together(Cutoff):
-    """Cutoffs of several terms with a common decision; onsets, energies and slopes are tuples, by term."""
+    """Cutoffs of terms with one pair decision; onsets, energies and slopes have one entry per term."""
 
     def __init__(self, ends: tuple[Cutoff, ...]):
         self.ends = ends
@@ -370,7 +370,7 @@ class CutPotential(eqx.Module):
 
     @property
     def parts(self) -> tuple[CutPotential, ...]:
-        """Channels, one for each cutoff radius; a `CutPotential` has a single channel, itself."""
+        """Potentials of all channels, one for each cutoff radius; a `CutPotential` has only one channel."""
         return (self,)
 
     @property
@@ -399,7 +399,7 @@ class CutPotential(eqx.Module):
 
     @property
     def typed(self) -> CutPotential:
-        """The potential with two values per pair type, one for each atom, of each per-species parameter."""
+        """The potential with every per-species parameter as two values per pair type, one for each atom."""
         return replace(self, potential=self.potential.typed)
 
     def at_cutoff(self) -> AtCutoff:
@@ -421,7 +421,7 @@ class CutPotential(eqx.Module):
         return self.cutoff.cut(r2, u, w, here, *weights)
 
     def jumps(self) -> Float[np.ndarray, "2 terms types"]:
-        """Return jumps of energy and radial force when a pair of weight 1 enters, by term and pair type."""
+        """Return jumps of energy and radial force as a pair of weight 1 enters r_cut, by term and type."""
         # in numpy: to jax each operation on these few numbers is a program to compile
         made = self.cutoff.jumps(jax.tree.map(np.asarray, self).at_cutoff())
         return np.array(made).swapaxes(0, 1)
@@ -473,16 +473,16 @@ class Channels(eqx.Module):
 
     @property
     def weights(self) -> tuple[Any, ...]:
-        """Weights of the terms, for all channels in order."""
+        """Weights of the potential terms of all channels, in the order of the channels."""
         return tuple(weight for part in self.parts for weight in part.weights)
 
     @property
     def r_cut(self) -> Float[Array, "kinds"]:
-        """Cutoff radius for each channel and pair type, length."""
+        """Cutoff radius (a length) for each channel and pair type."""
         return jnp.concatenate([part.r_cut for part in self.parts])
 
     def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
-        """Return jumps of energy and radial force when a pair enters, by term, channel and pair type."""
+        """Return jumps of energy and radial force as a pair enters r_cut, by term, channel and pair type."""
         sides = zip(*(part.jumps() for part in self.parts), strict=True)
         return np.stack([np.asarray(block_diag(*one)) for one in sides])
 

@@ -46,7 +46,7 @@ class StillingerWeber(ManyBody):
 
     @property
     def r_cut(self) -> Any:
-        """Cutoff radius (the product of a and sigma), length."""
+        """Cutoff radius (a length), the product of a and sigma."""
         return self.a * self.sigma
 
     def energy(self, positions, neighbor, cell):
@@ -75,11 +75,11 @@ _LARGEST_EXPONENT = 69.0776
 
 
 class Tersoff(ManyBody):
-    """Bond-order potential for one element; the default constants are those of silicon, set Si(C), "T3".
+    """Bond-order potential for one element; the default constants are set T3 for silicon, named Si(C).
 
-    Energy and force go to zero at r_cut = R + D, where the derivative of the force jumps. If only the
-    crossing atom affects the order of a bond, the bond order varies as (r_cut - r)^(2n). For n < 1, the force
-    is continuous but has an infinite derivative (in dilute silicon, not in the crystal).
+    Energy and force go to zero at r_cut = R + D, where the derivative of the force jumps. If only the atom
+    that crosses the cutoff affects a bond, the bond order varies as (r_cut - r)^(2n). For n < 1, the force is
+    then continuous but has an infinite derivative (this occurs in dilute silicon, not in the crystal).
 
     The implementation was checked against ase.calculators.tersoff and a plain numpy evaluation
     (tests/support/oracles_manybody.py). Source: Tersoff, Phys. Rev. B 38, 9902 (1988), eqs. 1 to 3 and table
@@ -121,7 +121,7 @@ class Tersoff(ManyBody):
         return self.R + self.D
 
     def taper(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the taper: 1 up to R - D, then a squared quarter sine, and exactly 0 beyond R + D."""
+        """Return the taper: 1 for r up to R - D, then a squared quarter sine, and exactly 0 beyond R + D."""
         # (1 - sin(pi x / 2)) / 2 with x = (r - R) / D, in the form that does not cancel where it vanishes
         inward = jnp.clip((self.r_cut - r) / (2 * self.D), 0.0, 1.0)
         return jnp.sin(0.5 * np.pi * inward) ** 2

@@ -1,8 +1,8 @@
 """Thermostats that scale all velocities by one factor (Nosé-Hoover chains, stochastic rescaling).
 
 A total momentum of zero stays zero, which reduces the number of degrees of freedom and affects the
-temperature (`Integrator.freedom`). The extra states of thermostats are always float64. Velocities are scaled
-in float64, too: if a factor near one were rounded to float32, all atoms would have the same relative error.
+temperature (`Integrator.freedom`). The variables of a thermostat are always float64. Velocities are scaled in
+float64, too: if a factor near one were rounded to float32, all atoms would have the same relative error.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class Chain(NamedTuple):
     def act(
         self, kinetic: Number, freedom: int | Number, kT: Number, relaxation: Number, time: Number
     ) -> tuple[Number, Chain]:
-        """Advance the chain by a given time; return the scale factor of the velocities, and the new chain.
+        """Advance the thermostat chain by a given time; return the velocity scale factor and the new chain.
 
-        Each of three substeps updates the links from last to first, scales the velocities, and updates the
-        links in reverse order (Tuckerman et al., J. Phys. A 39, 5629, 2006, the operator L_NHC). The error is
-        O(time⁵).
+        Each of three substeps updates the thermostats of the chain from last to first, scales the velocities,
+        and updates the thermostats in reverse order (Tuckerman et al., J. Phys. A 39, 5629, 2006, the
+        operator L_NHC). The error is O(time⁵).
 
         Args:
             kinetic: kinetic energy of the atoms or the box, with the number of degrees of freedom.

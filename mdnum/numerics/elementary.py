@@ -2,8 +2,8 @@
 
 Elementary functions differ between libraries, and between the instruction sets for which a compiler generates
 code. The functions here have no branch, no table and no fused multiply-add. Each function consists of sums,
-products, quotients, roots, comparisons, selections and bit operations. Every interpreter that runs a function
-operation by operation, such as the compiled loop, obtains the same number.
+products, quotients, roots, comparisons, selections and bit operations. The result is the same number wherever
+a function is run operation by operation, as in the compiled force loop.
 
 Arguments and results are float64. Subnormal arguments are treated as 0. Results below 2.2261e-308 are 0, and
 results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps; an ulp is the spacing of
@@ -154,7 +154,7 @@ def log1p(x: Any) -> Any:
 
 
 def power(x: Any, y: Any) -> Any:
-    """Return x to the power y; if x is negative, y must be an integer. Error: below 1.5 + |y|/40 ulp."""
+    """Return x to the power y, an integer if x is negative. The error is below 1.5 + |y|/40 ulp."""
     size, huge = jnp.abs(x), 2.0**1000
     n, m = _split(size)
     # the logarithm in two parts: s and the sum that divides it lose what the second one has
@@ -184,7 +184,7 @@ _SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1)]
 
 
 def cos_sin(x: Any) -> tuple[Any, Any]:
-    """Return cosine and sine of x, or NaN if |x| exceeds 8e5. Absolute error: below 2.5e-16."""
+    """Return cosine and sine of x, or NaN if |x| exceeds 8e5. The absolute error is below 2.5e-16."""
     n = jnp.round(x * (2 / math.pi))
     r = (x - n * _HALF_PI[0]) - n * _HALF_PI[1]
     square = r * r

@@ -34,8 +34,8 @@ class Threshold:
     def margin(self, quantity):
         """Return the threshold minus the compared quantity, which is positive if the decision is "yes".
 
-        Error: the difference is exact if the quantity is within a factor of 2 of the threshold (Sterbenz
-        lemma). The sign is always correct, because an IEEE difference of unequal numbers is never zero.
+        The margin is exact if the quantity is within a factor of 2 of the threshold (Sterbenz lemma). The
+        sign is always correct, because an IEEE difference of unequal numbers is never zero.
         """
         return self.value - quantity
 
@@ -72,7 +72,7 @@ class Hysteresis:
             )
 
     def margin(self, quantity, before):
-        """Return the signed distance to the current threshold, which is positive if the decision is "yes".
+        """Return a quantity's signed distance to the current threshold, positive if the decision is "yes".
 
         Args:
             quantity: computed value(s).

@@ -45,7 +45,7 @@ def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
     The fence is an exclusive-or of the bits of x with a zero whose value XLA does not know when it compiles.
     The fence also forces rounding to float16 and bfloat16, which XLA on a CPU may omit.
 
-    Source: optimization_barrier and reduce_precision do not prevent contraction (openxla/xla#41579).
+    XLA's optimization_barrier and reduce_precision do not prevent contraction (openxla/xla#41579).
     """
     return _through_integers(x, zero)
 
@@ -59,7 +59,7 @@ def _fence_jvp(primals, tangents):
 def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
     """Return dx² + dy² + dz² with the same bits as in numpy, because every operation is rounded.
 
-    Error: at most gamma_3 r² for exact dx, dy, dz, where gamma_n = n u / (1 - n u) (Higham 2002, 3.1).
+    The error is at most gamma_3 r² for exact dx, dy, dz, where gamma_n = n u / (1 - n u) (Higham 2002, 3.1).
     """
     return (fence(dx * dx, zero) + fence(dy * dy, zero)) + fence(dz * dz, zero)
 

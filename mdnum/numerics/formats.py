@@ -30,7 +30,7 @@ class FloatFormat:
 
     @property
     def emin(self) -> int:
-        """Exponent (of 2) of the smallest normal number of the format."""
+        """Binary exponent of the smallest normal number of the format."""
         return 2 - 2 ** (self.exponent - 1)
 
     @property
@@ -92,8 +92,8 @@ def round_to(
 ) -> Float[Array, "..."]:
     """Round x to the nearest number of a format, ties to even, in the dtype of x.
 
-    Subnormal numbers are kept (unlike in `lax.reduce_precision`), and numbers beyond the largest become
-    infinite. A float64 number is rounded once, whereas a cast may round twice. The derivative is 1.
+    Subnormal numbers are kept (unlike in `lax.reduce_precision`), and numbers beyond the format's range
+    become infinite. A float64 number is rounded once, whereas a cast may round twice. The derivative is 1.
 
     Args:
         x: float64 or narrower.

@@ -100,7 +100,7 @@ def _rounded(limbs: Int[Array, "limbs columns"], form: FloatFormat) -> UInt64[Ar
 class Exact(Reduction):
     """The exact sum, rounded once to nearest; the result has the same bits for every order of the terms.
 
-    Error: at most half an ulp of the result, for up to 2^31 terms; intermediate sums do not overflow.
+    The error is at most half an ulp of the result for up to 2^31 terms; intermediate sums do not overflow.
     Infinite and NaN terms give the result of IEEE addition.
     """
 
@@ -136,9 +136,9 @@ class Exact(Reduction):
 class FixedPoint(Reduction):
     """A fixed-point sum: every term is rounded to a multiple of 2^-bits, and the multiples are added.
 
-    The result has the same bits for every order of the n terms. Error: at most n * 2^(-bits - 1) plus the
-    rounding of the result. If a term exceeds 2^(62 - bits) / n, the sum could overflow, and the result is
-    NaN.
+    The result has the same bits for every order of the n terms. The error is at most n * 2^(-bits - 1) plus
+    the rounding error of the result. If a term exceeds 2^(62 - bits) / n, the sum could overflow, and the
+    result is NaN.
     """
 
     bits: int = 40  # binary digits after the point, from -1000 to 1000
@@ -156,7 +156,7 @@ class FixedPoint(Reduction):
         return jnp.where(fits, value, jnp.nan).astype(terms.dtype)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """Return the error bound: half a unit for each term, plus one rounding of the result."""
+        """Return the error bound: 2^(-bits - 1) for each term, plus one rounding of the result."""
         size = np.abs(terms.astype(np.float64)).sum(axis=0)
         return np.asarray(len(terms) * 2.0 ** (-self.bits - 1) + 2 * unit_roundoff(terms.dtype) * size)
 

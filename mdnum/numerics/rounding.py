@@ -78,9 +78,9 @@ class Reach:
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
         """Return the sum of |lattice-vector components| in all rounded results, and the number of roundings.
 
-        After the first subtraction, a component is d + n_1 a_1 + n_2 a_2 + n_3 a_3, where d is the final
-        displacement and each n is -1, 0 or 1. Each following subtraction of a lattice vector removes one of
-        the terms n_k a_k.
+        After the first subtraction, a component of the displacement is d + n_1 a_1 + n_2 a_2 + n_3 a_3, where
+        d is its final value and each n is -1, 0 or 1. Each further subtraction of a lattice vector removes
+        one of the terms n_k a_k.
         """
         sizes, most = np.zeros(3), 1
         for axis in range(3):
@@ -91,7 +91,7 @@ class Reach:
         return sizes, most
 
     def narrowed(self, dtype: DTypeLike) -> Float[np.ndarray, "3"]:
-        """Return, for each axis, the sum of the rounding errors of all lattice vectors in a dtype, length."""
+        """Return the sum of rounding errors (lengths) of all lattice vectors in a dtype, for each axis."""
         lattice = np.array(self.lattice, np.float64).reshape(-1, 3)
         return np.abs(lattice.astype(dtype).astype(np.float64) - lattice).sum(axis=0)
 
@@ -106,11 +106,11 @@ def displacement_bound(
 ):
     """Return a bound on the error (length of the error vector) of a computed displacement.
 
-    Each rounded result contributes at most u times its magnitude. If the dtype of the state has more digits
-    than `dtype`, the positions of both atoms are first rounded. If float64 has more digits than `dtype`, the
-    lattice vectors of the box are also rounded. The exact displacement is defined by the positions of the
-    state and the box of the system file. The nearest image found in `dtype` must be the true nearest image,
-    so r_cut must be below half the box width by more than the rounding error.
+    Each rounded result adds at most u times its magnitude to the error. If the dtype of the state has more
+    digits than `dtype`, the positions of both atoms are first rounded. If float64 has more digits than
+    `dtype`, the lattice vectors of the box are also rounded. The exact displacement is defined by the
+    positions of the state and the box of the system file. The nearest image found in `dtype` must be the true
+    nearest image, so r_cut must be below half the box width by more than the rounding error.
 
     Args:
         r: length(s) of the displacement.

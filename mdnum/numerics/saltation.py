@@ -1,9 +1,9 @@
 """Saltation: the change of a tangent vector (a perturbation) when the trajectory passes an event.
 
-A perturbed trajectory reaches a threshold at another time than the unperturbed trajectory; between the two
-times, only one trajectory follows the new equation of motion. To first order, the difference between the two
-times changes the tangent by a rank-one term. Derivatives of a time-stepping program lack the rank-one term,
-because time steps do not move with the event.
+A perturbed trajectory reaches a threshold at a different time than the unperturbed trajectory; between the
+two times, only one of them follows the new equation of motion. To first order, the difference between the two
+times changes the tangent vector by a rank-one term. Derivatives of a time-stepping program lack the rank-one
+term, because time steps do not move with the event.
 
 The functions accept numpy and jax arrays with any number of leading batch axes, also inside jit.
 """
@@ -37,7 +37,7 @@ def time_shift(
     normal: Float[Any, "*batch state"],
     threshold_rate: Any = 0.0,
 ) -> Float[Any, "*batch"]:
-    """Return the change -(n · dx + dc) / (n · F-) of the event time along the tangent dx.
+    """Return the change of the event time, -(n · dx + dc) / (n · F-), for a tangent vector dx.
 
     Args:
         tangent: dx, the perturbation just before the event.

@@ -53,7 +53,7 @@ _compiled = partial(jax.jit, static_argnums=0)(_summed)
 
 
 class Reduction:
-    """Base class of summation orders, for terms that arrive in blocks and for arrays (along the first axis).
+    """Base class of summation orders; terms arrive in blocks, or in one array that is summed over axis 0.
 
     A subclass defines the sum of a whole array; by default, blocks are stacked and summed at the end.
     """
@@ -115,7 +115,7 @@ def in_order(terms, add, start=None):
 
 @dataclass(frozen=True)
 class Sequential(Reduction):
-    """A sum in forward or reversed order. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4)."""
+    """A sum in forward or reversed order. The error bound is gamma_{n-1} * sum |terms| (Higham 2002, 4.4)."""
 
     # "forward" (left to right, as a loop does) or "reversed"
     order: Literal["forward", "reversed"] = "forward"
@@ -167,8 +167,8 @@ def _levels(terms, add, width: int):
 class Blocked(Reduction):
     """A summation tree: each node adds `width` adjacent terms from left to right, like GPU thread blocks.
 
-    Error: at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 gives the balanced tree; a width not
-    below the number of terms gives a sequential loop.
+    The error is at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 gives the balanced tree; a width
+    not below the number of terms gives a sequential loop.
     """
 
     width: int = 32  # children of a node, at least 2
@@ -191,7 +191,7 @@ class Blocked(Reduction):
 
 @dataclass(frozen=True)
 class Pairwise(Blocked):
-    """A balanced summation tree. Error: at most gamma_{log2 n} * sum |terms| (Higham 2002, 4.6)."""
+    """A balanced summation tree. The error is at most gamma_{log2 n} * sum |terms| (Higham 2002, 4.6)."""
 
     width: int = field(default=2, init=False)
 
@@ -220,7 +220,7 @@ class Halves(Reduction):
     """The sum of the first half of the terms plus the sum of the second half, each added sequentially.
 
     Two scatter operations over pairs, one for each atom of a pair, add the two halves one after the other.
-    Error: at most gamma_{n/2} * sum |terms|.
+    The error is at most gamma_{n/2} * sum |terms| for n terms.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -237,10 +237,10 @@ class Halves(Reduction):
 
 @dataclass(frozen=True)
 class Twice(Reduction):
-    """A sequential sum of all terms divided by 2, in which the halved terms are added twice, pass by pass.
+    """A sequential sum in two passes, each of which adds all terms divided by 2.
 
-    A scatter operation over a list that stores each pair for both atoms adds each halved term twice. Error:
-    at most gamma_{2n} * sum |terms|, if no halved term is subnormal.
+    A scatter operation over a list that stores each pair for both atoms adds each halved term twice. The
+    error is at most gamma_{2n} * sum |terms| for n terms, if no halved term is subnormal.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -289,8 +289,8 @@ class _Compensated(Reduction):
 class Kahan(_Compensated):
     """Compensated summation: the error of each addition is subtracted from the next term (Kahan 1965).
 
-    Error: at most (2u + O(n u²)) * sum |terms|. The compensation fails for a term that is much larger than
-    the partial sum. Source: Kahan, CACM 8, 40 (1965).
+    The error is at most (2u + O(n u²)) * sum |terms|. The compensation fails for a term that is much larger
+    than the partial sum. Source: Kahan, CACM 8, 40 (1965).
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -308,9 +308,9 @@ class Kahan(_Compensated):
 
 @dataclass(frozen=True)
 class Neumaier(_Compensated):
-    """Compensated summation that adds up all rounding errors separately and adds them at the end.
+    """Compensated summation that accumulates all rounding errors separately and adds them at the end.
 
-    Error: at most u |sum| + O(n² u²) * sum |terms|. Source: Neumaier, ZAMM 54, 39 (1974).
+    The error is at most u |sum| + O(n² u²) * sum |terms|. Source: Neumaier, ZAMM 54, 39 (1974).
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:

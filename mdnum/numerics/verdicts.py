@@ -4,10 +4,11 @@ A flip is a cutoff decision that differs between two runs. The verdict compares 
 counterfactual run, which has the arithmetic of the second run but the cutoff decisions of the first run. If
 the counterfactual run stays close to the first run, the flips caused the split. If the counterfactual run
 also splits from the first run, repeats of the pair of runs decide whether the flips accelerated the split or
-are bystanders. Repeats are evaluated by a sequential sign test. If a pair of runs is delayed with probability
-at most 1/2, the probability of k or more delays in n pairs of runs is at most that of k or more heads in n
-coin tosses, for any distribution of the delays. All repeats have displacements of the same size. If the
-majority differs at another displacement, the verdict is left open. Error rates: docs/verdict-calibration.md.
+are bystanders. Repeats are evaluated by a sequential sign test. If the probability that a pair of runs splits
+later without the flips is at most 1/2, the probability that k or more of n pairs do so is at most that of k
+or more heads in n coin tosses, for any delays. The initial displacements of all repeats have the same size.
+If the majority is different for displacements of another size, the verdict is left open. Error rates are
+listed in docs/verdict-calibration.md.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Delay:
 
     @classmethod
     def of(cls, free: Float[np.ndarray, "steps"], imposed: Float[np.ndarray, "steps"], tolerance: float):
-        """Create a `Delay` from separations (length or NaN) by step, without and with imposed decisions."""
+        """Create a `Delay` from the distance between two runs by step, without and with imposed decisions."""
         splits = (split_of(run, tolerance) for run in (free, imposed))
         return cls(*splits, free_until=_last_seen(free), imposed_until=_last_seen(imposed))
 
@@ -63,9 +64,9 @@ class Delay:
 def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
     """Return, for each stage of the sequential sign test, the number of run pairs and how many must agree.
 
-    The error probability is spent in proportion to the number of pairs (Lan and DeMets, Biometrika 70, 659,
-    1983). For fair coin tosses, the probability that the test has stopped with a given result by some stage
-    is at most the error probability times the fraction of pairs used.
+    The allowed error probability is used up in proportion to the number of pairs (Lan and DeMets, Biometrika
+    70, 659, 1983). For fair coin tosses, the probability that the test has stopped with a given result by
+    some stage is at most the error probability times the fraction of pairs used.
 
     Args:
         pairs: largest number of pairs of runs.
@@ -108,7 +109,7 @@ class Count:
 
     @property
     def needed(self) -> tuple[int, int] | None:
-        """Current or next stage of the sign test: number of run pairs, and how many must agree; or None."""
+        """Current or next stage of the sign test (if any): number of run pairs, and how many must agree."""
         return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
 
     @property
@@ -128,7 +129,7 @@ class Count:
 
     @property
     def wanted_for_majority(self) -> int:
-        """Number of further run pairs that decide the majority if all agree; 0 if unneeded or impossible."""
+        """Number of further run pairs that decide the majority if all agree; 0 if decided or impossible."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -185,7 +186,7 @@ _HALF = 3.0
 
 @dataclass(frozen=True)
 class Dates:
-    """The first steps at which bits and decisions of two runs differ, and at which the runs split."""
+    """The first steps at which two runs differ in bits of the state, differ in decisions, and split."""
 
     first_bit: int | None  # first step whose state bits differ
     fork: int | None  # first step whose decisions differ
@@ -194,7 +195,7 @@ class Dates:
 
 @dataclass(frozen=True)
 class Growth:
-    """Exponential growth of the separation of two runs, from a linear fit to its logarithm."""
+    """Exponential growth of the distance between two runs, from a linear fit to its logarithm."""
 
     rate: float  # per step; NaN where too few rows could be fitted
     r_squared: float  # of the fit
@@ -204,15 +205,15 @@ class Growth:
 
     @property
     def plain(self) -> bool:
-        """Whether the separation grows significantly, so that the fit is not a line through noise."""
+        """Whether the distance between two runs grows so clearly that the fit is not a fit of noise."""
         return bool(np.isfinite(self.rate) and self.rate > 0 and self.r_squared > FITS)
 
 
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
-    """Return the mean slope of a logarithm, its standard error, and whether growth is faster than linear.
+    """Return the growth rate of a quantity, its standard error, and whether growth is faster than linear.
 
-    The slope per row and its standard error are estimated from blocks of the later rows. The result is NaN,
-    NaN, False if there are too few rows, or if numbers are not finite.
+    The rate per row and its standard error are estimated from the logarithm of the quantity in blocks of the
+    later rows. The result is NaN, NaN, False if there are too few rows, or if numbers are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
@@ -230,22 +231,22 @@ def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
 
 
 def split_of(separation: Float[np.ndarray, "steps"], tolerance: float) -> int | None:
-    """Return the first step at which a separation exceeds the tolerance, or None if there is no such step."""
+    """Return the first step at which the distance between two runs exceeds the tolerance, or None."""
     beyond = separation > tolerance
     return int(beyond.argmax()) if beyond.any() else None
 
 
 def _last_seen(separation: Float[np.ndarray, "steps"]) -> int:
-    """Return the last step at which a separation is known, or -1 if there is no such step."""
+    """Return the last step at which the distance between two runs is known, or -1 if it is never known."""
     seen = np.flatnonzero(np.isfinite(separation))
     return int(seen[-1]) if len(seen) else -1
 
 
 def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
-    """Fit the exponential growth rate of the separation of two runs before saturation.
+    """Fit the exponential growth rate of the distance between two runs, before the distance saturates.
 
-    The fit uses steps before the split with a separation between 1e-12 and 0.1 times the tolerance, after the
-    last step with a smaller separation. A low r_squared indicates that noise was fitted.
+    The fit uses the steps before the split at which the distance is between 1e-12 and 0.1 times the
+    tolerance. Steps up to the last smaller distance are omitted. A low r_squared of the fit indicates noise.
 
     Args:
         separation: of each step, length; NaN after a run ended.
@@ -276,9 +277,8 @@ def expected(
 ) -> float | None:
     """Predict the number of further steps until two runs split, or return None if this is impossible.
 
-    A prediction requires that exponential growth continues after the first steps: in the later half of the
-    fitted steps, the separation must grow by several e-foldings, at a rate within a factor of 2 of the
-    overall rate.
+    A prediction requires continued exponential growth: in the later half of the fitted steps, the distance
+    between the runs must grow by several e-foldings, at a rate within a factor of 2 of the overall rate.
 
     Args:
         separation: of each step, length; NaN after a run ended.
@@ -396,9 +396,9 @@ def _counted(
     gained: float,
     reasons: tuple[Reason, ...],
 ) -> ForkVerdict:
-    """Return the verdict on runs that split even with imposed decisions, from the number of delayed pairs.
+    """Return the verdict on runs that split even with imposed decisions, from the count of delayed run pairs.
 
-    Repeats at another displacement can only withdraw a verdict, so they do not add to the error probability.
+    Repeats with a displacement of another size can only withdraw a verdict and thus add no false verdicts.
     """
     pair = delays[0][0]
     threshold = 0.0 if rate is None else E_FOLDINGS / rate
@@ -451,7 +451,7 @@ def _kept(
 
 
 def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason, ...]:
-    """Return reasons for the verdict on runs without a split: the last separation, and its growth."""
+    """Return reasons for the verdict on runs without a split: their last distance, and its growth."""
     seen = float(free[np.isfinite(free)][-1])
     now: Reason = ("outlook", {"steps": len(free) - 1, "separation": seen, "tolerance": tolerance})
     more = expected(free, tolerance)
@@ -461,7 +461,7 @@ def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason
 
 
 def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:
-    """Predict when a counterfactual run splits, or return None if its separation does not grow."""
+    """Predict when a counterfactual run splits from run A, or return None if their distance does not grow."""
     fit = growth(separation[: seen + 1], tolerance)
     now = float(separation[seen])
     if not (fit.plain and now > 0):
@@ -506,7 +506,7 @@ class SplitCell:
 
 @dataclass(frozen=True)
 class Share:
-    """Contribution of a difference (of decisions or arithmetic) to a split: how much earlier runs split."""
+    """Number of steps by which a difference in decisions, or in arithmetic, makes two runs split earlier."""
 
     what: What  # the difference that is taken away; the other one stays
     reference: Name  # the run that is compared with
@@ -516,7 +516,7 @@ class Share:
 
 
 def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:
-    """Return when each combination of arithmetic (of A or B) and decisions (of A or B) splits from A and B.
+    """Return when each combination of A's or B's arithmetic and decisions splits from run A and from run B.
 
     Args:
         series: separations at each step, length, by the names "B" and those in SERIES; NaN after a run ended.

@@ -1,4 +1,4 @@
-"""Reference results from ASE, from neighbor searches of libraries and from numpy; mdnum as an ASE calculator.
+"""Reference results from ASE, numpy and neighbor searches; also an ASE calculator that uses mdnum.
 
 Modules are imported at first use, since importing ASE, MDAnalysis or jax takes a second or more.
 """

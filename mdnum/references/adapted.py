@@ -43,7 +43,7 @@ class StepAtCutoff(ClassicalCalculator):
 
 
 class SpeciesSum(ClassicalCalculator):
-    """A mixture of single-species calculators; the a-b energy is that of all pairs minus a-a and b-b pairs.
+    """Mixture of single-species calculators; unlike pairs have the energy of all pairs minus like pairs.
 
     Args:
         parts: (calculator, species a, species b) for every pair of species in the structure.
@@ -122,7 +122,7 @@ def morse(form: PairForm, begin: float, end: float) -> Calculator:
 
 
 def short_listed_eam(file: Path) -> Calculator:
-    """Return ASE's EAM with a shorter neighbor list (its own list is slow: it reaches 2 (cutoff + skin))."""
+    """Return ASE's EAM with a shorter neighbor list (ASE's list is slow; it reaches 2 (cutoff + skin))."""
     from ase.calculators.eam import EAM
     from ase.neighborlist import NeighborList
 

@@ -174,13 +174,13 @@ def check_energy(
 
 
 def narrowest(simulation: Simulation, roles: Sequence[str] = ("state", "force", "accumulate")) -> str:
-    """Return the narrowest float type of several roles; the default roles are energy and force."""
+    """Return the narrowest float type of the given roles (default: state, force and accumulated sums)."""
     kinds = (carrier(getattr(simulation.policy, role)) for role in roles)
     return max(map(str, kinds), key=unit_roundoff)
 
 
 def _places(simulation: Simulation) -> str:
-    """Return the narrowest float type that affects positions; for 16-bit forces, of state and decision."""
+    """Return the narrowest float type that affects positions (of state and decision for 16-bit forces)."""
     wide = simulation.policy.force in WIDE
     return narrowest(simulation) if wide else narrowest(simulation, ("state", "decision"))
 
@@ -212,7 +212,7 @@ def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Eval
 
 
 def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:
-    """Return what the first atoms of a cluster contribute to mdnum's results for the whole system."""
+    """Return mdnum's results for chosen atoms of the whole system, with the pairs of their cluster."""
     edges = edges_of(cluster, r_cut)
     once = edges.i < edges.j
     pairs = edges.i[once], edges.j[once], edges.r[once]
@@ -266,7 +266,7 @@ def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
 
 
 def _over(difference: float, scale: float) -> float:
-    """Return the difference divided by the scale; 0 for a zero difference."""
+    """Return a difference divided by its scale; 0 for a zero difference, even if the scale is 0."""
     return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
 
 
@@ -274,8 +274,8 @@ def _over(difference: float, scale: float) -> float:
 class _Scales:
     """Scales by which differences of energy, force and stress are divided.
 
-    energy: sum of |energies|; force: largest force on an atom or along a pair; stress: sum of absolute virial
-    terms, divided by the volume; *_expected: differences expected from rounding.
+    Energy is scaled by the sum of |energies|, force by the largest force on an atom or along a pair, and
+    stress by the sum of absolute virial terms per volume; *_expected are differences expected from rounding.
     """
 
     energy: float
@@ -287,7 +287,7 @@ class _Scales:
 
     @classmethod
     def of(cls, simulation: Simulation, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]) -> _Scales:
-        """Return the scales of a frame: for a pair potential from sums over pairs, otherwise from totals."""
+        """Return the scales of a frame, from sums over pairs for a pair potential and else from totals."""
         unit, places = unit_roundoff(narrowest(simulation)), unit_roundoff(_places(simulation))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
@@ -344,7 +344,7 @@ def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
 
 
 def _rollout(simulation: Any, steps: int) -> Iterator[tuple[ndarray, ndarray, float]]:
-    """From step 0, yield unwrapped positions, velocities (atoms, 3) and potential energy at every step."""
+    """Yield unwrapped positions, velocities and potential energy at every step, starting at step 0."""
     from mdnum.rollout.engine import Engine, unwrapped
 
     for segment in Engine(simulation, steps).segments():
@@ -436,7 +436,7 @@ def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = 
 
 
 def _forces(simulation: Simulation) -> Reference:
-    """Return ASE's class as the reference if it is fast enough; plain numpy for Tersoff and mixtures."""
+    """Return the reference calculator: ASE's class or, if that is slow (Tersoff, mixtures), plain numpy."""
     judge = reference(simulation)
     slow = isinstance(simulation.model, Tersoff) or len(simulation.symbols) > 1
     return independent(simulation) if slow and not isinstance(simulation.potential, EmbeddedAtom) else judge
@@ -448,7 +448,7 @@ def _sudden(position: Sequence[float], floor: float) -> int | None:
 
 
 def _growth(position: Sequence[float]) -> float:
-    """Fit a line to the logarithm of the deviation; return the factor by which it grows per step."""
+    """Fit a line to the logarithm of deviations between trajectories; return their growth factor per step."""
     tail = np.array(position[len(position) // 2 :])
     if len(tail) < 3 or not (tail > 0).all():
         return 1.0
@@ -463,7 +463,7 @@ PLACES, ATOMS = 8, 32  # places at random, and atoms nearest to each whose energ
 def neighborhoods(
     atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
 ) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
-    """Yield free clusters at random positions: a group of atoms, and all atoms within `reach` of this group.
+    """Yield nonperiodic clusters around random positions: a group of atoms and all atoms within `reach`.
 
     For a pair potential with range `reach`, the atoms of the group have the same energies and forces in the
     cluster as in the whole system. Neighbors are found from distances between atoms and images, without

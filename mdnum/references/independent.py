@@ -1,7 +1,7 @@
 """Energies, forces and stress from the formulas alone, computed in plain numpy on ASE's neighbor list.
 
-The numpy code is independent of the code used in a run (each cutoff has its own numpy `reference`). This code
-is the reference if ASE has no class for a potential or a cutoff, and otherwise an additional one.
+The numpy code is independent of the code used in a run (each cutoff has its own numpy `reference`). The numpy
+code is the only reference if ASE has no class for a potential or a cutoff, and otherwise a second reference.
 
 A model takes directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
 the total energy with respect to every d. Forces and stress follow from the gradient g of the energy with
@@ -159,7 +159,7 @@ class PairForm:
 
     @property
     def at_cutoff(self) -> tuple[float, float]:
-        """Energy u and derivative u' of the potential without cutoff, at the cutoff distance."""
+        """Energy u and derivative u' at the cutoff distance, of the potential without cutoff."""
         u, du = self.bare(np.array([self.r_cut]))
         return float(u[0]), float(du[0])
 
@@ -228,7 +228,7 @@ class PairModel(Model):
         return max(form.r_cut for forms, _ in self.terms for form in forms.values())
 
     def groups(self, edges: Edges) -> Iterator[tuple[PairForm, ndarray, Any]]:
-        """Yield (interaction, edge indices, factors) for the edges inside the cutoff of each interaction."""
+        """Yield (interaction, edge indices, weights) of the edges inside the cutoff of each interaction."""
         first, second = edges.symbols[edges.i], edges.symbols[edges.j]
         for forms, weights in self.terms:
             for a, b in product(sorted(set(edges.symbols.tolist())), repeat=2):
@@ -285,7 +285,7 @@ class _OneSpecies(Model):
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:
-        """Return energies and gradient as for a `Model`, from edges within reach and their unit vectors."""
+        """Return atomic energies and gradient, as for a `Model`, from edges within reach and unit vectors."""
 
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
         gradient, inside = np.zeros_like(edges.d), edges.r < self.reach

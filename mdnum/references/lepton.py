@@ -176,7 +176,7 @@ class Lepton(ClassicalCalculator):
 
 
 def _ran(script: str, data: str) -> tuple[np.ndarray, np.ndarray]:
-    """Run LAMMPS; return the total energy, the pressures, and a table with a row for each atom."""
+    """Run LAMMPS; return the total energy, the pressure components, and a table with one row per atom."""
     with TemporaryDirectory() as place:
         folder = Path(place)
         (folder / "in.data").write_text(data)

@@ -38,7 +38,7 @@ class NamedObject:
 
     @property
     def name(self) -> str:
-        """Last part of the object's dotted name, without arguments; for no name, the stem of the file."""
+        """Last part of the dotted name without arguments; if there is no name, the file name's stem."""
         return self.call.partition("(")[0].rpartition(".")[2].strip() or Path(self.home).stem
 
     def find(self, defaults: Sequence[str] = (), anew: bool = False) -> Any:

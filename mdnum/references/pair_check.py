@@ -108,7 +108,7 @@ class Search:
 
 
 def all_searches(system: Simulation) -> tuple[Search, ...]:
-    """Return neighbor searches of libraries, and those of mdnum with the comparison (< or <=) of a system."""
+    """Return the neighbor searches of libraries, and of mdnum with the comparison (< or <=) of a system."""
     own = own_searches(system)
     return (*own, *(Search(one) for one in known() if not one.kept and one.package != "mdnum"))
 
@@ -245,7 +245,7 @@ def check_pairs(
 
     Each neighbor search is run once for each cutoff radius of the species pairs. Brute force uses the
     comparison (< or <=) of the system file, in rational arithmetic near the cutoff. If only decisions near
-    the cutoff differ, the search "differs at the cutoff", which is rounding or convention and not an error.
+    the cutoff differ, the result "differs at the cutoff" shows rounding or convention, not an error.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
@@ -300,7 +300,7 @@ def check_pairs(
 
 
 def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: float) -> tuple[int, int, int]:
-    """Compare with brute force; return the numbers of (missing, extra, borderline) pairs of a search.
+    """Return the numbers of missing, extra and borderline pairs in comparison with brute force.
 
     Args:
         i, j: pairs from the neighbor search, i <= j, one row per periodic image.
@@ -387,7 +387,7 @@ def effective_cutoff(
 
 
 def borderline_pairs(r_cut: float, count: int) -> ndarray:
-    """Return randomly oriented pairs, (count, 2, 3), with distances within 3 ulps of r_cut."""
+    """Return randomly oriented pairs, shape (count, 2, 3), whose distances are within 3 ulps of r_cut."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]

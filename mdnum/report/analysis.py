@@ -34,12 +34,12 @@ class Stays:
         return int(self.inside.sum() + self.outside.sum())
 
     def undone_within(self, steps: int) -> int:
-        """Return the number of flips that the same pair reverses within `steps` steps (chatter)."""
+        """Return the number of flips followed by the opposite flip of the pair within `steps` steps."""
         return int(self.inside[: steps + 1].sum() + self.outside[: steps + 1].sum())
 
 
 def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
-    """Return the median residence time, given the numbers of stays of 0, 1, 2, ... steps, or None."""
+    """Return the median residence time, given how many stays lasted 0, 1, 2, ... steps; None if none did."""
     total = int(counts.sum())
     if not total:
         return None
@@ -214,7 +214,7 @@ def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
 
 
 def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
-    """Return the expected number of ambiguous flips (ratio up to 1), for margins spread evenly near zero.
+    """Return the expected number of ambiguous flips (ratio up to 1) if margins are spread evenly near zero.
 
     Margins are spread evenly if atoms move freely through the cutoff distance. The density of margins is
     taken from the lower quarter of the margins. If many more flips are ambiguous than expected, pairs stay
@@ -249,7 +249,7 @@ class Conservation:
         kinetic: Float[np.ndarray, "rows"],
         least: float,
     ) -> Conservation | None:
-        """Compute the energy conservation from one energy per step, or None for few steps or atoms at rest.
+        """Compute the energy conservation from one energy per step; None for few steps or atoms at rest.
 
         The linear trend is removed before the fluctuation is computed, since the drift is reported
         separately. The first half of the run is omitted, because a run that starts from a lattice turns half

@@ -55,7 +55,7 @@ class Column:
         return [[float(f"{x:.{kept}g}") if np.isfinite(x) else None for x in values.astype(float).tolist()]]
 
     def text(self, row: Sequence[Any], at: int) -> str:
-        """Return the text of a table cell from its row and the index of its value in the row."""
+        """Return the text of a table cell, given its row and the index of its value in the row."""
         value = row[at]
         if self.kind == "pair":
             return f"{value}–{row[at + 1]}"

@@ -98,7 +98,7 @@ def line(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, label: str = "", 
 def envelope(
     x: np.ndarray, y: np.ndarray, most: int = POINTS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return (smallest, mean, largest, position) for at most `most` equally large groups of points."""
+    """Return (smallest, mean, largest, mean x) of points in at most `most` groups of equal size."""
     if len(y) <= most:
         return y, y, y, x
     starts = np.unique(np.linspace(0, len(y), most, endpoint=False).astype(int))
@@ -180,7 +180,7 @@ def _plot(plot: Plot, figure: Canvas) -> None:
 
 
 def _high(curves: list[Line2D], axes: Axes, x: float) -> bool:
-    """Return True if curves pass through the upper but not through the lower part of the axes near x."""
+    """Return True if, near x, curves pass through the upper but not the lower part of the axes."""
     to_axes = axes.transData + axes.transAxes.inverted()
     points = [to_axes.transform(np.asarray(one.get_xydata(), float)) for one in curves]
     at = np.concatenate(points or [np.zeros((0, 2))])

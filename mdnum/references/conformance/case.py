@@ -154,7 +154,7 @@ def sequence(
 
 
 def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
-    """Return the pairs among some of the atoms, with these atoms renumbered as in the smaller test case."""
+    """Return the pairs among some of the atoms, renumbered by each atom's index in `atoms`."""
     most = int(max(atoms.max(initial=-1), pairs.i.max(initial=-1), pairs.j.max(initial=-1))) + 1
     new = np.full(most, -1)
     new[atoms] = np.arange(len(atoms))

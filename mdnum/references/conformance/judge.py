@@ -33,7 +33,7 @@ SILENT = ("CRASHED", "NO_ANSWER", "RAISED")  # those of cases in which nothing c
 
 @dataclass(frozen=True)
 class Truth(PairSet):
-    """Exact pairs at one call of a test case: those inside the cutoff, and those up to a larger distance."""
+    """Exact pairs at one call of a test case: those inside the cutoff, and those somewhat farther apart."""
 
     # positions, cell: as the list was given them; rows of axes that do not repeat are zero
     positions: ndarray
@@ -46,11 +46,11 @@ class Truth(PairSet):
     reach: float  # pairs as far as this may be listed, length; the cutoff unless a list holds a skin
 
     def needed(self, unit: float) -> ndarray:
-        """Return a mask of the exact pairs that a list computed with a given roundoff must contain."""
+        """Return a mask of the exact pairs that a neighbor list with a given unit roundoff must contain."""
         return self.distance < self.r_cut - unit * self.scale
 
     def allowed(self, unit: float) -> ndarray:
-        """Return a mask of the exact pairs that a list computed with a given roundoff may contain."""
+        """Return a mask of the exact pairs that a neighbor list with a given unit roundoff may contain."""
         return self.distance <= self.reach + unit * self.scale
 
 
@@ -83,8 +83,8 @@ def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DO
 def conditioning(cell: ndarray, pbc: ndarray) -> float:
     """Factor, at least 1, by which conversion to fractional coordinates and back can amplify rounding errors.
 
-    Source: Higham, Accuracy and Stability, 2nd ed., section 7.1: the condition number of the periodic lattice
-    vectors, each scaled to length 1 because lengths alone have no effect.
+    Source: Higham, Accuracy and Stability, 2nd ed., section 7.1. The factor is the condition number of the
+    periodic lattice vectors, each scaled to length 1 because lengths alone have no effect.
     """
     if not pbc.any():
         return 1.0
@@ -309,7 +309,7 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """Return the rounding error of a result that is correct at least for float32; None for wrong results."""
+    """Return the rounding error of pairs that are correct at least for float32; None for wrong pairs."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))
@@ -382,7 +382,7 @@ class Failed:
 
 @dataclass
 class CaseAnswers:
-    """Results of all test cases, by number of the test case, and failures reduced to a few atoms.
+    """Results of all test cases by case number, and failures reduced to a few atoms.
 
     Test cases are not stored, because a resumed examination draws the same test cases from the same seed.
     """
@@ -512,7 +512,7 @@ class Report:
             tally.why[result.refused[1]] = tally.why.get(result.refused[1], 0) + 1
 
     def reach(self, case: Case) -> float:
-        """Return the largest distance (length) of pairs in a list that may include pairs beyond the cutoff.
+        """Return the largest allowed distance of pairs from a list that may include pairs beyond the cutoff.
 
         Both atoms of a pair may have moved as far as the skin allows since the neighbor list was built.
         """

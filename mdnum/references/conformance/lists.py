@@ -73,7 +73,7 @@ class ListLimits:
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
-        """Yield (whether a test case exceeds a limit, name of the limit), starting with the fastest tests."""
+        """Yield (whether a test case exceeds a limit, name of the limit); the fastest checks come first."""
         pbc, cells = np.array(case.pbc), [still.cell for still in case.stills]
         least = min(len(still.positions) for still in case.stills)
         yield least < self.atoms, f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"

@@ -4,9 +4,9 @@ If a pair is just beyond r_cut + padding when the list is built, it is inside th
 have approached by the padding; the smallest such motion is along the line between the two atoms. A rebuild
 criterion is sufficient if it tests whether any two atoms could have approached each other by the padding, in
 any direction and for any motion of other atoms. Each sequence of `motions` brings a pair closer by slightly
-more than the padding: along an axis, a diagonal or a random direction; by moving both atoms, in any
-proportion, or one; alone, among atoms at rest, among hundreds of atoms that move little, or among atoms with
-the same motion or a common drift; in one step, slowly, or back and forth.
+more than the padding. Sequences differ in direction (axis, diagonal, random), in how the motion is divided
+between the two atoms, in the other atoms (none, at rest, with small motions, with the same motion or a common
+drift), and in time (one step, slowly, back and forth).
 """
 
 from __future__ import annotations
@@ -205,7 +205,7 @@ def _reuse() -> Iterator[Case]:
 
 
 def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = None) -> Case:
-    """Return a test case that builds a new list at every step, or only at steps that have a skin."""
+    """Return a test case in which a new list is built at every step, or only at steps with a given skin."""
     case = sequence(name, "reuse", path, _L, _R, max(filter(None, skins)) if skins else _SKIN)
     starts = zip(case.stills, skins or [None] * len(path), strict=True)
     stills = (replace(still, fresh=skin is not None or not skins, skin=skin) for still, skin in starts)
@@ -275,7 +275,7 @@ def _ways() -> list[ndarray]:
 
 
 def _closing(room: float) -> float:
-    """Return by how much a pair distance decreases from just beyond r_cut + padding to inside the cutoff."""
+    """Return the decrease of a pair distance from just beyond r_cut + padding to just inside the cutoff."""
     return (1 + 2 * HAIR) * room
 
 
@@ -288,7 +288,7 @@ def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
 def _walk(
     room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float] = (0.0, 1.0)
 ) -> list[ndarray]:
-    """Return a path of two atoms; each makes a given fraction of the smallest motion toward the other."""
+    """Return a path of two atoms that approach; the first makes a given fraction of the smallest motion."""
     start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
@@ -308,8 +308,8 @@ def _squeezed(room: float, way: ndarray, edge: float, n: int, along: bool) -> li
 def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
     """Return a path on which two of many atoms approach each other; the others rest or move slightly.
 
-    The fraction of the motion that each of the two atoms makes depends on `n`. The atom that moves most has
-    each index equally often; the index of its partner is random.
+    The number `n` determines how the motion is divided between the two atoms. All atom indices are used
+    equally often for the atom that moves most; the index of its partner is random.
     """
     rng = np.random.default_rng(170 + n)
     most = int(count * (1.0 - (n + 1) * _GOLDEN % 1.0))
@@ -323,7 +323,7 @@ def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: f
 
 
 def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:
-    """Return a path of a pair among ten atoms that all drift across or along the motion of the pair."""
+    """Return a path of two approaching atoms among ten others; all drift across or along the approach."""
     start, end = _with(gas(12, edge, 180 + n), [4, 5], _walk(room, way, 0.5, edge, n))
     across = np.cross(way, np.roll(way, 1) + np.array([0.3, -0.2, 0.1]))
     across /= np.linalg.norm(across)

@@ -34,7 +34,7 @@ def _declared(name: str) -> dict[str, Any]:
 
 
 def peer(*names: str, helpers: Sequence[Any] = ()) -> Callable[[Any], Any]:
-    """Return a decorator that registers a function or a class of neighbor lists in `LISTS` under some names.
+    """Return a decorator that registers a function or a class of neighbor lists in `LISTS` by given names.
 
     Args:
         names: names listed in peers.toml.
@@ -94,7 +94,7 @@ def ase_neighbor_list(positions, cell, pbc, r_cut):
 
 @peer("ase-skin")
 class AseSkinList:
-    """The class ase.neighborlist.NeighborList of ASE, with a skin for each of the two atoms of a pair."""
+    """The class ase.neighborlist.NeighborList of ASE, which adds a skin to the radius of each atom."""
 
     kept = pbc = None
 

@@ -120,9 +120,9 @@ def _outside() -> Named:
 
 
 def _across_walls() -> ndarray:
-    """Return pairs along x: one atom just below a multiple of the cutoff, the other almost a cutoff lower.
+    """Return pairs along x: one atom is just below a multiple of the cutoff, its partner almost r_cut lower.
 
-    If the atom is assigned to the next cell (by rounding to float32), its partner is two cells away.
+    If rounding to float32 assigns an atom to the next cell, its partner is two cells away.
     """
     hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
     pairs = []
@@ -175,9 +175,9 @@ def vast() -> Iterator[Case]:
 
 
 def lattice(edge: int, seed: int = 0) -> Case:
-    """Return a cubic lattice with vacancies, at integer positions; atom order and images are random.
+    """Return atoms on a cubic integer lattice with vacancies, in random order and random periodic images.
 
-    The neighbors of each atom are on the 26 sites around it; indices modulo the edge give the neighbors
+    The neighbors of each atom are on the 26 sites around it. Index arithmetic modulo the edge finds them
     without search or rounding.
 
     Args:
@@ -299,7 +299,7 @@ def cases(draw: Any, most: int = 40) -> Case:
 
 
 def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
-    """Return how many lattice vectors apart, along each axis, a pair inside the cutoff can be."""
+    """Return the number of lattice vectors to search for pairs inside the cutoff."""
     if not any(pbc):
         return 1
     width = widths(completed(cell, np.array(pbc)))
@@ -357,9 +357,9 @@ def plan(
     far: bool = False,
     large: bool = False,
 ) -> list[tuple[int, Iterable[Case]]]:
-    """Return the test cases for a neighbor list in order, as tuples (number of test cases, test cases).
+    """Return groups of test cases for a neighbor list, in order, as tuples (number of cases, cases).
 
-    The first tuple has `BREADTH` test cases of each area, but no random test cases or thousands of atoms.
+    The first group has up to `BREADTH` named test cases of each area; random and large cases follow.
 
     Args:
         count: number of random cases.
@@ -398,7 +398,7 @@ def lattices() -> Iterator[Case]:
 
 
 def as_kept(tested: PairList, asked: Iterable[Case]) -> Iterator[Case]:
-    """Yield test cases with a single call; if the neighbor list is updatable, they have a skin."""
+    """Yield the given test cases, each with a skin of 0.3 cutoffs if the neighbor list is updatable."""
     for case in asked:
         yield replace(case, skin=0.3 * case.r_cut) if tested.kept else case
 

@@ -100,7 +100,7 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
 
 
 def _calls(case: Case) -> Iterator[tuple[Still, bool, float]]:
-    """Yield (positions and cell, whether the list is allocated, its skin) at every call of a test case."""
+    """Yield, for each call of a test case, positions and cell, whether a list is built, and its skin."""
     atoms = None
     for still in case.stills:
         count = len(still.positions)

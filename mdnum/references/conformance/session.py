@@ -59,7 +59,7 @@ class CallOutcome:
 
 
 class Session:
-    """Calls a neighbor list; if `reuse`, one object of the neighbor list is used for all test cases."""
+    """Calls a neighbor list; if `reuse` is True, a single list object is used for all test cases."""
 
     starts, deadline = 0, Deadline()  # of a process; calls in this one have none
 
@@ -342,7 +342,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Kill a process that does not answer within its time limit, and describe the delay in `late`."""
+    """Kill a process that exceeds its time limit, and append a description of the delay to `late`."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):

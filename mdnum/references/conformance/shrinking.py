@@ -130,8 +130,8 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 def deepest(failures: Failures, failed: Failed) -> Failed:
     """Move the two atoms of a missing pair closer together as long as the list still omits the pair.
 
-    The atoms continue their motion, so that the reported failure shows the smallest distance at which the
-    list omits the pair.
+    Both atoms continue along their path, so that the reported failure shows the smallest distance at which
+    the list omits the pair.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:

@@ -146,7 +146,7 @@ class Examiner:
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """Return the errors of a test case within the declared limits, at the first call with an error."""
+        """Return the errors at the first wrong call of a test case, or () if it exceeds a declared limit."""
         return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
@@ -184,7 +184,7 @@ class Examiner:
     def _judge(
         self, case: Case, step: int, answer: ListAnswer, how: Conventions
     ) -> tuple[list[Failure], tuple[float, float] | None, tuple[int, int]]:
-        """Return failures, the error of a result correct only in float32, and counts of pairs at r_cut."""
+        """Return failures, the error of results correct only in float32, and counts of pairs at r_cut."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
@@ -209,7 +209,7 @@ class Examiner:
 
 
 def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
-    """Return how many pairs exactly at the cutoff are listed and unlisted in a test case without rounding."""
+    """Return the numbers of listed and unlisted pairs exactly at r_cut in a case with small integers."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
         return 0, 0  # on small integers no arithmetic rounds
@@ -224,7 +224,7 @@ def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
 
 
 def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
-    """Return the exact pairs at a call, and those at earlier calls since the neighbor list was built."""
+    """Return the exact pairs at a call and at all earlier calls since the neighbor list was built."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
@@ -357,7 +357,7 @@ def examine(
 
 
 def _keeps_order(examiner: Examiner) -> bool | None:
-    """Return whether three identical calls list the same pairs in the same order; None without pairs."""
+    """Return whether three identical calls give the same pairs in the same order; None if one gives none."""
     for case in (once("order", "reuse", gas(40, 6.0, 120), 6.0), once("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
@@ -368,7 +368,7 @@ def _keeps_order(examiner: Examiner) -> bool | None:
 
 
 def _too_long(report: Report, case: Case) -> str | None:
-    """Return why a large test case would take too long (judged by the previous one); None if it would not."""
+    """Return why a large test case would take too long, estimated from the previous one; otherwise None."""
     if report.large is None:
         return None
     atoms, seconds = report.large
