@@ -1,7 +1,7 @@
 """LLVM instructions for vectors and for bits of integers that numba does not generate.
 
-numba caches a compiled function by its source file. After a change of this file, delete the caches of callers
-(`__pycache__`), which otherwise contain the old instructions.
+numba recompiles a cached function only if the file that contains the function changes. After a change of this
+file, delete the caches of callers (`__pycache__`), which otherwise contain the old instructions.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class _Vectors:
         return self.spread(self.builder.load(address, align=self.size))
 
     def larger(self, a: Any, b: Any) -> Any:
-        """Return the elementwise maximum of two vectors; where either element is NaN, return that of b."""
+        """Return the elementwise maximum of a and b; where either element is NaN, return the element of b."""
         return self.builder.select(self.builder.fcmp_ordered(">", a, b), a, b)
 
     def squares(self, parts: list[Any]) -> Any:
@@ -115,7 +115,7 @@ def moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any
 
 @intrinsic
 def kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: Any, at: Any) -> Any:
-    """Write those of eight labels that a mask selects to an array; return the next free position."""
+    """Append those of eight labels whose mask is true to an array; return the next free position."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits, to = (_Vectors(context, builder, one.dtype, EIGHT) for one in (mask, labels))

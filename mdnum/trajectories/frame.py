@@ -1,7 +1,7 @@
 """One frame of a trajectory in float64, and checks for values that no simulation can produce.
 
 Formats with plain floats (dcd, trr, netcdf) accept any bytes as coordinates; file damage often produces a
-huge coordinate. If the frame is not rejected, a huge coordinate increases the rounding bound of every pair.
+huge coordinate. A huge coordinate in an accepted frame increases the rounding bound of every pair.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Frame:
 
     @cached_property
     def furthest(self) -> float:
-        """Largest absolute coordinate (length); not finite if any coordinate is not; 0 without atoms."""
+        """Largest absolute coordinate of all atoms, in length units; not finite if any coordinate is not."""
         return furthest(self.positions)
 
     def furthest_of(self, atoms: AtomIndices) -> float:
@@ -200,9 +200,9 @@ def far_out(
     bits: int = 64,
     before: Float[np.ndarray, "some 3"] | None = None,
 ) -> tuple[int, int, str] | None:
-    """Return the most distant atom if its distance is impossibly large; for arguments, see `FrameCheck`.
+    """Return the atom farthest from the others if it is impossibly far away; for arguments, see `FrameCheck`.
 
-    The system size is also estimated from positions one frame earlier, since a frame may be damaged.
+    The system size is also estimated from the previous frame, since the current frame may be damaged.
 
     Returns:
         (the atom, the number of impossibly distant atoms, the reason in words), or None.
@@ -235,7 +235,7 @@ def far_out(
 
 
 def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, float] | None:
-    """Return the atom with the largest displacement since the previous frame if this is impossibly large.
+    """Return the atom that moved farthest since the previous frame if its displacement is impossibly large.
 
     A jump by a lattice vector, as when atoms are wrapped into the box, does not count as a displacement.
 
@@ -263,5 +263,5 @@ def furthest(x: Float[np.ndarray, "atoms 3"]) -> float:
 
 
 def _named(at: Any, atoms: AtomIndices) -> int:
-    """Return the number of an atom in the file from its index among the selected atoms."""
+    """Convert the index of an atom among the selected atoms to the number of the atom in the file."""
     return int(at if atoms is None else atoms[at])

@@ -1,6 +1,6 @@
-"""History of every pair over the frames: flips, contacts, and flips that are found at larger strides.
+"""Flips and contacts of every pair over the frames, and flips that remain if only every nth frame is used.
 
-From the counts at several strides, the module `lost` estimates the number of flips missed between frames.
+From the flips found with every nth frame, the module `lost` estimates the flips missed between frames.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _ROOM = 2**62
 
 
 class Sums:
-    """Counts for a subset of the pairs; the sum of two objects counts both subsets together."""
+    """Counts for a subset of the pairs, which can be added to the counts for another subset."""
 
     # what is the same for all pairs
     _common: tuple[str, ...] = ()
@@ -113,10 +113,10 @@ def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Contacts(Columns):
-    """Contacts (periods in which a pair is inside the cutoff), sorted by (i, j, rank, begin).
+    """Contacts (periods in which a pair is inside the cutoff), sorted by (i, j, image rank, first frame).
 
-    During a contact, the pair is inside at the frames `begin`, ..., `end - 1`. The pair entered between the
-    frames `begin - 1` and `begin`. Absences shorter than the time between two frames are not detected.
+    During a contact, the pair is inside the cutoff at the frames `begin`, ..., `end - 1`. A contact begins
+    between the frames `begin - 1` and `begin`. A break between two successive frames is not detected.
     """
 
     i: Int[np.ndarray, "stays"]  # the pair; see `ledger.Members`
@@ -184,7 +184,7 @@ class Strides(Sums):
 
     @classmethod
     def of_history(cls, history: History, strides: Sequence[int]) -> Strides:
-        """Count the flips found at each stride, where an odd number of flips of a pair counts as one flip."""
+        """Count flips at each stride; an odd number of flips of a pair in one stride counts as one flip."""
         found = []
         for stride in strides:
             rows = np.flatnonzero(history.frame <= (history.frames - 1) // stride * stride)
@@ -203,7 +203,7 @@ class Strides(Sums):
 
 
 def doublings(frames: int) -> list[int]:
-    """Return the strides 1, 2, 4, ... at which the frames span at least four intervals."""
+    """Return strides (in frames) 1, 2, 4, ..., each of which fits at least four times into the trajectory."""
     strides = [1]
     while (frames - 1) // (2 * strides[-1]) >= 4:
         strides.append(2 * strides[-1])
@@ -211,11 +211,11 @@ def doublings(frames: int) -> list[int]:
 
 
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:
-    """Count the decisions that change if all atoms move in straight lines for a short time.
+    """Count the pair decisions that change if all atoms move in straight lines for a short time.
 
-    The root mean square displacement is the length `move`, which should be small compared with the distance
-    over which the paths of atoms bend, but large enough that many pairs cross the cutoff. `count` returns the
-    number of flips between two frames.
+    The root mean square displacement of the atoms is `move`. Choose a length shorter than the distance over
+    which atomic paths bend, but long enough for many pairs to cross the cutoff. `count` returns the number of
+    flips between two frames.
 
     Returns:
         (number of flips, duration of the motion in the time unit of the velocities); None if no atom moves.

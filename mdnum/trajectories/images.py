@@ -23,7 +23,7 @@ _TOGETHER, _APART = 1_000_000, 256
 
 
 def pair_keys(i: np.ndarray, j: np.ndarray, shifts: np.ndarray, atoms: int) -> Int[np.ndarray, "pairs"]:
-    """Return an integer key for each pair (i, j) or, if `shifts` has columns, each image (i, j, shift)."""
+    """Return an integer key for each pair (i, j), or for each image (i, j, shift) if there are shifts."""
     keys = i * np.int64(atoms) + j
     for column in shifts.T:
         keys = keys * _APART + column % _APART
@@ -31,7 +31,7 @@ def pair_keys(i: np.ndarray, j: np.ndarray, shifts: np.ndarray, atoms: int) -> I
 
 
 def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """Return (lattice vectors as rows, with unit normals for nonperiodic axes; the inverse matrix)."""
+    """Return a matrix whose rows are the lattice vectors (unit normals if nonperiodic), and its inverse."""
     from ase.geometry import complete_cell
 
     matrix = complete_cell(np.where(frame.box.pbc[:, None], frame.box.matrix, 0.0))
@@ -39,7 +39,7 @@ def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
 
 
 def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
-    """Return the lattice shifts of images given by rank: the image of j is at x[j] + shift @ box.
+    """Return the lattice shift of the image of j with `rank` nearer images, which is at x[j] + shift @ box.
 
     ASE, vesin and jax-md define shifts in the same way. Of the two opposite images of an atom itself, the
     shift with a positive first nonzero component is returned.
@@ -70,7 +70,7 @@ class ImageFlips:
         self._before: tuple[Frame, np.ndarray] | None = None
 
     def step(self, frame: Frame, pairs: Members) -> dict[str, Any] | None:
-        """Return table columns of a frame's flips, or None; `pairs` are neighbors by a symmetric rule."""
+        """Return the flips since the previous frame as table columns, or None; the rule must be symmetric."""
         matrix, inverse = cell_of(frame)
         now = np.column_stack([pairs.i, pairs.j, image_shifts(frame, pairs)])
         known, self._before = self._before, (frame, now)

@@ -2,13 +2,13 @@
 
 Lattice vectors are reduced first, so that a search in a skewed box is as fast as in the compact box with the
 same lattice. Every decision is based on the length of (x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2, computed in
-this order from stored coordinates x, i < j, integers s and reduced vectors a. A pair decision does not depend
-on the search algorithm that found the pair.
+this order with i < j. Here, x are stored coordinates, s integers and a reduced vectors. A pair decision does
+not depend on the search algorithm that found the pair.
 
 For a search, the reduced box is divided into bins. Coordinates along a nonperiodic direction are folded onto
-a limited number of bins, so that a distant atom does not enlarge the grid. For each bin, the atoms of all
-bins within reach are gathered at their nearby images (several per atom in a small box). Every atom of a bin
-is then compared with all atoms gathered for this bin.
+a limited number of bins, so that a distant atom does not enlarge the grid. For each bin, images of the atoms
+in all nearby bins are gathered (several images per atom in a small box). Every atom of a bin is then compared
+with all atoms gathered for this bin.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ INSIDE, DIRECTED = 0, 2
 
 
 class ReducedLattice(NamedTuple):
-    """Properties of a box that a neighbor search needs, in a tuple that compiled loops accept."""
+    """Lattice vectors of a box in reduced form, and derived quantities, for compiled neighbor searches."""
 
     vectors: Float[np.ndarray, "3 3"]  # reduced, as rows, length; zero along directions that do not repeat
     periodic: Bool[np.ndarray, "3"]  # which rows repeat
@@ -104,7 +104,7 @@ def _reduced(rows: bytes, periodic: bytes) -> ReducedLattice:
 def shortest(
     moved: Float[np.ndarray, "atoms 3"], box: Box
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """Return displacements to nearest images, and the numbers of lattice vectors subtracted.
+    """Return displacements by the minimum-image convention, and the numbers of lattice vectors subtracted.
 
     Displacements are correct for atoms that moved by less than half the width of the box. If the box is
     invalid, displacements are returned unchanged.
@@ -145,11 +145,11 @@ def square_of(x, i, j, s0, s1, s2, vectors):
 
 @njit(inline="never")
 def near_squares(x, i, j, lattice, y, squares):
-    """Compute squared distances of pairs to the images found by rounding; y: work array of shape (3, block).
+    """Compute squared pair distances by rounding of fractional coordinates; `y`: scratch of shape (3, block).
 
-    The loop needs no branch: a zero shift changes no squared distance, and lattice vectors are zero along
-    nonperiodic directions. Coordinates are gathered first, so that all other operations are vector
-    instructions; the lattice is loaded only once.
+    The loop has no branches: a zero shift changes no squared distance, and lattice vectors along nonperiodic
+    directions are zero. Coordinates are gathered first, so that all other operations are vector instructions.
+    The lattice vectors are loaded only once.
     """
     vectors, inverse = lattice.vectors, lattice.inverse
     y0, y1, y2 = y[0], y[1], y[2]
@@ -175,7 +175,7 @@ def near_squares(x, i, j, lattice, y, squares):
 
 @njit
 def image_square(x, i, j, rank, lattice):
-    """Return the squared distance to the image of j that has `rank` nearer images; inf if it is missing.
+    """Return the squared distance from i to the image of j with `rank` nearer images; inf if there is none.
 
     Indices satisfy i < j, or i == j for images of an atom itself; of two opposite images, one is counted.
     """
@@ -248,7 +248,7 @@ class Participants:
 
     @property
     def both(self) -> Bool[np.ndarray, "atoms"]:
-        """Mask of the atoms in both groups, whose own images can be their neighbors."""
+        """True for atoms in both groups; only such atoms can be neighbors of their own images."""
         return self.centers & self.others
 
     @cached_property
@@ -277,7 +277,7 @@ class SearchLimits(NamedTuple):
 
     @classmethod
     def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> SearchLimits:
-        """Return limits of squared distances for pairs inside a radius, with a band around the radius."""
+        """Return the lower and upper squared distance of a band of half width `band` around each radius."""
         low = np.where(radii >= 0, np.maximum(radii - band, 0.0) ** 2, np.inf)
         high = np.where(radii >= 0, (radii + band) ** 2, -1.0)
         return cls(kind, low, high, float((radii.max(initial=0.0) + band) ** 2))
@@ -436,7 +436,7 @@ def lattice_vector(code):
 
 @njit
 def _run(d0, d1, d2, b0, b1, b2, bins, last):
-    """Return a run of adjacent bins at offset d from a bin: lattice vector, first and last bin, next d2."""
+    """Return contiguous bins at offset d from bin b: lattice vector, first bin, last bin, and next d2."""
     n0, n1, n2 = (b0 + d0) // bins[0], (b1 + d1) // bins[1], (b2 + d2) // bins[2]
     c0, c1, low = b0 + d0 - n0 * bins[0], b1 + d1 - n1 * bins[1], b2 + d2 - n2 * bins[2]
     high = min(bins[2] - 1, low + last - d2)
@@ -446,7 +446,7 @@ def _run(d0, d1, d2, b0, b1, b2, bins, last):
 
 @njit
 def _most_around(bins, reach, start):
-    """Return upper limits of the numbers of atoms, and of runs of contiguous bins, around any bin."""
+    """Return upper limits for the atoms, and for the runs of contiguous bins, within reach of one bin."""
     atoms, runs = 0, 0
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
@@ -467,7 +467,7 @@ def _most_around(bins, reach, start):
 # candidate, and the loop its vector instructions.
 @njit(inline="never")
 def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
-    """Compute squared distances from x to near[:, first:last]; list and count atoms up to `largest`."""
+    """List and count the atoms in near[:, first:last] whose squared distance from x is up to `largest`."""
     near0, near1, near2 = near[0, first:last], near[1, first:last], near[2, first:last]
     for k in range(near0.shape[0]):
         y0, y1, y2 = near0[k] - x0, near1[k] - x1, near2[k] - x2
@@ -484,7 +484,7 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
 
 @njit
 def meet(atoms, limits, found):
-    """Record the neighbor pairs of all centers; return the numbers of certain and of undecided pairs.
+    """Record the neighbor pairs of all central atoms; return the numbers of certain and of undecided pairs.
 
     Pairs within one group are visited once, by examining half of the bins around each bin. For two groups,
     all bins around a center are examined; a pair of atoms in both groups is visited twice and counted once.

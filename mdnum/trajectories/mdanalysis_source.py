@@ -2,8 +2,8 @@
 
 MDAnalysis's readers of dcd, trr and some text formats take a truncated or damaged frame for the end of the
 file, and silently skip the remaining data. If the last number of a text file is truncated, the remaining
-digits are read as a different number. If a run is killed, its Amber NetCDF file has fewer records than the
-header states; MDAnalysis rejects such a file, and this module reads it (ambermd.org/netcdf/nctraj.xhtml).
+digits are read as a different number. If a run is killed, its Amber NetCDF file has fewer records than its
+header states. MDAnalysis rejects such a file; this module reads it (ambermd.org/netcdf/nctraj.xhtml).
 """
 
 from __future__ import annotations
@@ -252,7 +252,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factors(trajectory: Any) -> tuple[float, float]:
-    """Return ratios of DCD time steps: file value / MDAnalysis's value, byte-swapped value / file value."""
+    """Return two ratios of DCD time steps: the file's to MDAnalysis's, and the byte-swapped to the file's."""
     read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
     if not read:
         return 1.0, math.nan

@@ -1,8 +1,8 @@
 """Detection of frames that repeat the data or the times of earlier frames, for example after a restart.
 
-A run continued from a checkpoint writes some frames again, concatenated files may share frames, and a stopped
-simulation or a rejected Monte Carlo move repeats the previous frame, not always with equal times. After a
-restart with different rounding, times repeat but data differ; of frames with equal times, the first is kept.
+A run continued from a checkpoint writes some frames again, and concatenated files may share frames. A stopped
+simulation or rejected Monte Carlo move repeats the previous frame, at the same or a later time. If a restart
+rounds differently, times repeat but data differ; of frames with equal times, the first is kept.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class RepeatedFrames:
         return digested if before == mine else known
 
     def had(self, number: int, time: float) -> bool:
-        """Return True if the latest frame has the time of an earlier frame, although times had advanced."""
+        """Return True if an earlier frame has the latest frame's time and some frame has another time."""
         of = self._times.setdefault(f"{time:.12g}", number)
         if of == number or len(self._times) < 2:
             return False

@@ -1,8 +1,8 @@
 """Contacts between residues: two residues are in contact if any pair of their atoms is within the cutoff.
 
 Decisions are made for pairs of atoms; the ledger contains the smallest atom distance of two residues.
-Hydrogens and virtual sites are excluded by default: their positions depend on constraints and on the program
-that wrote the file, and customary contact cutoffs are defined for heavy atoms.
+Hydrogens and virtual sites are excluded by default, because their positions depend on constraints and on the
+program that wrote the file. Customary contact cutoffs are defined for heavy atoms.
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarr
 class ResidueTracker:
     """Tracker of contacts between residues, with the same interface as `Tracker` for pairs of atoms.
 
-    Pairs of atoms within one residue are ignored. `near` counts pairs of atoms, at least one for each pair of
-    residues within the error bound of the cutoff. The attribute `min_margin` is always inf.
+    Pairs of atoms within one residue are ignored. `near` counts atom pairs: at least one per residue pair
+    whose distance equals the cutoff within error. The attribute `min_margin` is always inf.
 
     Args:
         rule: membership rule for atoms.
@@ -138,7 +138,7 @@ class ResidueTracker:
 
     @property
     def near(self) -> int:
-        """Number of atom pairs at the last frame whose |margin| is at most the error bound."""
+        """Number of atom pairs whose distance equals the cutoff within the error bound at the last frame."""
         return self._atoms.near
 
     @property
@@ -212,7 +212,7 @@ class ResidueTracker:
 
 
 def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the atoms sorted by residue, and the index of each residue's first atom, then of the end."""
+    """Return the atoms sorted by residue, and the index at which each residue starts, plus the end index."""
     atoms = np.arange(len(of)) if atoms is None else atoms
     order = atoms[np.argsort(of[atoms], kind="stable")]
     return order, np.searchsorted(of[order], np.arange(count + 1))
@@ -252,7 +252,7 @@ class ResidueNames(Columns):
 def contacts_over_time(
     stays: Contacts, residues: int, frames: int
 ) -> tuple[Int[np.ndarray, "moments"], Float[np.ndarray, "residues moments"]]:
-    """Return the first frames of up to `MOMENTS` intervals, and each interval's mean contacts per residue."""
+    """Return first frames of up to `MOMENTS` intervals, and each residue's mean contacts per interval."""
     edges = np.unique(np.linspace(0, frames, min(frames, MOMENTS) + 1).astype(np.int64))
     found = np.zeros((residues, len(edges) - 1))
     for k, (low, high) in enumerate(pairwise(edges)):

@@ -5,11 +5,11 @@ whether a pair is inside the cutoff is uncertain if pair distance and cutoff dif
 error of a distance. `infer` finds the decimal grid of the coordinates, so that no documented precision is
 needed.
 
-Rounding of coordinates shifts a crossing to another frame, hides a short visit, or creates a crossing of a
-pair near the cutoff. The affected flips cannot be identified from one file, but their number is estimated by
-`grid_effect`. Random pairs near the cutoff are moved by displacements found in the file; their flips are
-counted with and without rounding. For nearest neighbors, a flip exchanges two atoms at about the same
-distance from a third atom, so triples of atoms are drawn.
+Rounding of coordinates can move a cutoff crossing to another frame, hide a short contact, or create a
+crossing of a pair near the cutoff. The affected flips cannot be identified from one file, but their number is
+estimated by `grid_effect`. Random pairs near the cutoff are moved by displacements found in the file; their
+flips are counted with and without rounding. If the nearest atoms are the neighbors, a flip exchanges two
+atoms at similar distances from a third, so random triples of atoms are moved.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ class Resolution:
     def bound(self, frame: Frame, atoms: AtomIndices = None) -> float:
         """Return the largest error of a distance in a frame due to rounding of the data in the file.
 
-        The bound, in length units, is the worst case: rounding moves both atoms by half a step along every
-        axis in opposite directions; for pairs across the boundary, the box error is added. For float64
+        The bound, a length, is the worst case: rounding moves both atoms in opposite directions by half a
+        grid step along every axis. For pairs across the boundary, the error of the box is added. For float64
         positions, the bound is the rounding error of the distance. A margin to a cutoff has the same error
-        bound as a distance; a margin among nearest neighbors (a difference of two distances) has twice the
+        bound as a distance. A margin among nearest neighbors (a difference of two distances) has twice the
         bound. If `atoms` are given, the bound is valid for distances between the given atoms.
 
-        Error: the bound holds for pairs across one period of the box; each further period adds the box error.
+        Error: valid for pairs across at most one period of the box; each further period adds the box error.
         """
         if atoms is not None or not np.isfinite(frame.furthest):
             x = frame.positions if atoms is None else frame.positions[atoms]
@@ -303,7 +303,7 @@ def grid_effect(
     before, after = _drawn(random, one, other, radius, steps, draws, ranked)
 
     def decided(places: Places) -> np.ndarray:
-        """Return True if a pair is inside the cutoff, or a triple's second atom is nearer than the third."""
+        """True if a pair is inside the cutoff or, in a triple, atom 2 is nearer to atom 1 than atom 3 is."""
         squares = [((place - places[0]) ** 2).sum(axis=1) for place in places[1:]]
         return squares[0] < (squares[1] if ranked else radius**2)
 
@@ -326,7 +326,7 @@ def _drawn(
     draws: int,
     ranked: bool,
 ) -> tuple[Places, Places]:
-    """Draw random pairs near the radius, or triples with two equal distances; return their two positions."""
+    """Draw random pairs near the radius, or triples with equal distances; return old and new positions."""
     moved = [moves[random.integers(len(moves), size=draws)] for moves in (one, other, other)[: 2 + ranked]]
     # the distance of the middle one of three counts twice where the others are on opposite sides
     spread = float(np.sqrt((1 + ranked) * (one**2).mean() + (1 + ranked) * (other**2).mean()))
@@ -371,8 +371,8 @@ def unrounded(variance: float, size: float) -> float:
     """Return the variance that displacements had before positions were rounded to multiples of `size`.
 
     If a displacement is n + f steps with integer n and 0 <= f < 1, rounding adds size² f (1 - f) to the mean
-    square over all starting points. For normally distributed displacements of variance v, the mean of this
-    term is, by a Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
+    square over all starting points. For normally distributed displacements of variance v, the mean of size² f
+    (1 - f) is, by a Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
     """
     low, high, k = 0.0, variance, np.arange(1, 200)
     for _ in range(60):

@@ -52,7 +52,7 @@ class _Membership:
 
     @property
     def shortest(self) -> float:
-        """Smallest cutoff radius, in length units; infinite if the order of distances defines neighbors."""
+        """Smallest cutoff radius, in length units; infinite if the neighbors are the k nearest atoms."""
         return self.reach
 
     def table(
@@ -82,7 +82,7 @@ class CutoffRule(_Membership):
 
 @dataclass(frozen=True)
 class SpeciesCutoffs(_Membership):
-    """Rule with a cutoff radius per pair of species, in either order; other pairs are never neighbors."""
+    """Rule with a cutoff radius for each listed pair of species; all other pairs are never neighbors."""
 
     radii: Mapping[tuple[str, str], float]
 

@@ -151,7 +151,7 @@ def _settle(x, atoms, kind, square, radius, bound, found):
 
 
 def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float) -> float:
-    """Return the expected number of pairs of uniformly distributed atoms; 0 for a nonperiodic box."""
+    """Return the number of pairs within `radius` at uniform density; 0 if the box is not fully periodic."""
     if not lattice.periodic.all():
         return 0.0
     images = (4.0 / 3.0 * np.pi * radius**3) / lattice.volume
@@ -214,7 +214,7 @@ class Chosen(NamedTuple):
 def nearest(
     placed: Placed, who: Participants, rule: Nearest | Capped, *, band: float, bound: float
 ) -> Chosen:
-    """Find the number of nearest neighbors of each center that the membership rule sets; see `search`."""
+    """Find the nearest neighbors of each center, as many as the membership rule sets (see `search`)."""
     positions, lattice = placed.positions, placed.lattice
     atoms, reach, centers = len(positions), rule.reach, who.centers
     # a distance that no pair exceeds: a lattice has no end
@@ -254,7 +254,7 @@ def nearest(
 def _choose(
     rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
 ):  # fmt: skip
-    """Sort the neighbors in each row and keep the nearest; return (written, close, smallest, lacking)."""
+    """Keep each row's nearest neighbors; return (number, number close, smallest |margin|, rows too short)."""
     written, close, smallest, short = 0, 0, np.inf, 0
     for i in range(rows.first.shape[0]):
         if not centers[i]:
@@ -350,7 +350,7 @@ def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
 
 @njit
 def _compared(old, new, made):
-    """Write pairs whose decision differs; count those beyond the capacity. seen[j] = (images before, now)."""
+    """Write the pairs whose decision differs, up to the capacity, and return the number of all such pairs."""
     atoms = old.first.shape[0]
     seen = np.zeros((atoms, 2), np.int32)
     total, room = 0, made.i.shape[0]

@@ -1,4 +1,4 @@
-"""Comparison of two frames of the same atoms: separation, common shift, velocities, and growth in time."""
+"""Comparison of two frames of the same atoms: distances and their growth, common shift, and velocities."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Separation:
 def displacements(
     start: Frame, end: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | float = 0.0
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """Return displacements between two frames minus a common shift, and counts of lattice vectors removed."""
+    """Return atomic displacements between two frames minus `shift`, and the lattice vectors removed."""
     x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
     shared = np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool)
     return shortest(y - x - shift, Box(end.box.matrix, shared))
@@ -68,7 +68,7 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
 def separation(
     one: Frame, other: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | None = None
 ) -> Separation:
-    """Return the separation of two frames minus a common shift, for some or all of the atoms."""
+    """Return the largest and typical distance of atoms between two frames, minus a common shift."""
     moved, whole = displacements(one, other, atoms, 0.0 if shift is None else shift)
     square = np.sum(moved**2, axis=1)
     at = int(np.argmax(square))
@@ -134,8 +134,8 @@ class FreeFlight(NamedTuple):
 def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
     """Compare displacements between two frames with velocities; None if there is no velocity or motion.
 
-    The ratio `moved` is near 1 for straight atomic paths and below 1 if atoms turn around, but never far
-    above 1. The ratio `factor` is near 1 if velocities keep their directions and have the right unit.
+    `moved` (measured over predicted displacement) is at most about 1, and less if atoms turn around. `factor`
+    (the same, by least squares) is about 1 if velocities have the right unit and keep their directions.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None
@@ -157,7 +157,7 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
 
 
 def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
-    """Return the inconsistency between displacements, velocities and times, or None, from medians of frames.
+    """Describe a contradiction between displacements, velocities and times (medians over frames), if any.
 
     If atoms turn around between two frames, displacements are smaller than predicted from velocities, but not
     inconsistent. Smaller displacements are inconsistent only if velocities kept directions and are parallel
@@ -180,7 +180,7 @@ def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class GrowthLaw:
-    """Fits of a growing separation: log separation against time, and against log time."""
+    """Fits of an exponential and of a power law to the growing distance between two trajectories."""
 
     frames: int  # used
     rate: float  # of an exponential, per time
@@ -196,10 +196,10 @@ def growth(
     limit: float,
     began: tuple[float, float],
 ) -> GrowthLaw | None:
-    """Fit an exponential and a power law to a separation that grows in time.
+    """Fit an exponential and a power law to the growing distance between two trajectories.
 
     A constant error of a force or a velocity makes the separation of two runs grow as a low power of time;
-    chaos makes the separation grow exponentially. Zero lengths, and lengths above `limit`, are left out.
+    chaos makes the separation grow exponentially. Fits exclude distances that are zero or above `limit`.
 
     Args:
         began: earliest and latest possible time at which the separation began, as the origin of a power law.

@@ -85,7 +85,7 @@ class Survival:
     longest: int  # frames for which any was followed: nothing is known beyond
 
     def at(self, share: float) -> int | None:
-        """Return after how many frames at most a fraction of contacts survives (0.5: median), or None."""
+        """Return the duration exceeded by at most a fraction `share` of contacts (0.5: median), or None."""
         below = np.flatnonzero(self.share <= share)
         return int(self.frames[below[0]]) if len(below) else None
 
@@ -114,9 +114,9 @@ def survival(found: Durations) -> Survival:
 
 
 def mean_by_rate(found: Durations) -> tuple[float, float]:
-    """Return the contact frames per departure, over all contacts, and its standard error; inf if none left.
+    """Return total frames in contact per departure, and the standard error; inf if no pair ever left.
 
-    The error is valid for independent departures; with repeated crossings, the true error is larger.
+    The standard error is valid for independent departures; repeated crossings make the true error larger.
     """
     if not found.leaves:
         return float("inf"), float("nan")
@@ -142,8 +142,8 @@ def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.nd
 def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
     """Count pairs that are inside at a frame and at a later frame, even if they are outside in between.
 
-    The ratio of the two results is the intermittent counterpart of `residence`. Counts for disjoint subsets
-    of the pairs can be added. Lags are between 0 and frames - 1.
+    The ratio of the two returned arrays is like `residence`, but includes interrupted contacts. Counts for
+    disjoint subsets of the pairs can be added. Lags are between 0 and frames - 1.
 
     Returns:
         two arrays by lag, summed over frames: numbers of pairs inside at both frames, and at the first frame.
@@ -230,7 +230,7 @@ class ClassTally(Sums):
     def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> ClassTally:
         """Count flips and frames in contact by the classes of both atoms, over the given number of frames.
 
-        For a directed rule, i -> j and j -> i are counted separately; otherwise, i is in the lower class.
+        For a directed rule, i -> j and j -> i are counted separately; else, the lower class index is first.
         """
         first, second = classes.of[stays.i], classes.of[stays.j]
         if not directed:
@@ -327,7 +327,7 @@ class Busiest(Columns):
 
 @dataclass(frozen=True)
 class Residues(Sums):
-    """Numbers of flips of each group of atoms (such as a residue), with other groups and within the group."""
+    """Numbers of flips of pairs between each group of atoms (such as a residue) and others, and within it."""
 
     between: Int[np.ndarray, "groups"]
     within: Int[np.ndarray, "groups"]
@@ -347,7 +347,7 @@ class Residues(Sums):
 
 @dataclass(frozen=True)
 class AgainSums(Sums):
-    """Sums, over a sample of the contacts, of the counts that `again` returns."""
+    """Counts returned by the function `again`, summed over a sample of the contacts."""
 
     both: Int[np.ndarray, "lags"]
     once: Int[np.ndarray, "lags"]
@@ -374,7 +374,7 @@ class Statistics(Sums):
     def of(
         cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
     ) -> tuple[Statistics, Contacts]:
-        """Add statistics of a subset of the pairs to `before`; return the sum, and the subset's contacts.
+        """Add the statistics of some pairs to `before`; return the sum, and the contacts of these pairs.
 
         A flip reversed within `window` frames is counted as chatter. Intermittent contacts include absences
         of up to `window` frames.

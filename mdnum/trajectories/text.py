@@ -5,8 +5,8 @@ tests/trajectories/test_source.py):
 
 - LAMMPS's `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org/dump.html,
   Howto_triclinic). MDAnalysis would reduce coordinates of dumps to float32 and ignore the tilt of the box.
-- GROMACS's gro files with any number of frames, whose column width is the distance of two decimal points
-  (manual.gromacs.org, reference manual, file formats). MDAnalysis and ASE read only the first frame.
+- GROMACS's gro files with any number of frames; the distance between decimal points is the column width
+  (manual.gromacs.org, reference manual, file formats). MDAnalysis and ASE read only the first gro frame.
 - Extended XYZ, with ASE called for each frame: otherwise, ASE scans the whole file before the first frame.
 """
 
@@ -139,8 +139,8 @@ def format_of(path: Path) -> str:
 def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
     """Reject a last line that ends within its last number, which would be read as a different number.
 
-    A missing newline is not sufficient evidence, since some programs omit the last newline. The number counts
-    as truncated if it has fewer digits than the numbers in the same column of earlier lines.
+    A missing newline at the end does not prove truncation, since some programs omit the last newline. The
+    number counts as truncated if it has fewer digits than the numbers in the same column of earlier lines.
 
     Args:
         lines: lines of a frame, each of which ends with a number.
@@ -194,7 +194,7 @@ def _digits(word: str) -> tuple[int, int, int] | None:
 
 
 class TextTrajectory(Trajectory):
-    """Base class of text readers; a subclass defines the end of a frame and its decoding."""
+    """Base class of text readers; a subclass defines where a frame ends and how a frame is decoded."""
 
     def __init__(self, path: Path, topology: Topology | None, frames: slice):
         super().__init__(path, topology, frames)
@@ -402,7 +402,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
 
 
 def _bounds(items: dict[str, list[str]]) -> Box:
-    """Return the box of a dump frame; the origin of the box is a corner, which moves with the volume."""
+    """Return the box of a dump frame with a corner as its origin; the corner moves if the volume changes."""
     head, *rows = items["BOX BOUNDS"]
     names, words = head.split(), [row.split() for row in rows[:3]]
     pbc, values = np.array([name == "pp" for name in names[-3:]], bool), np.array(words, np.float64)
@@ -489,7 +489,7 @@ def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray,
 
 
 def _gro_box(line: str) -> Box:
-    """Return the box from three diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; no box if zero."""
+    """Return the box from 3 diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; no box if all are 0."""
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
         raise ValueError(f"the line with the box of a frame has {len(values)} numbers; expected 3 or 9")
@@ -500,5 +500,5 @@ def _gro_box(line: str) -> Box:
 
 
 def _box_words(line: str) -> list[str]:
-    """Split a box line into numbers with five decimals, which in boxes above 10 µm no space separates."""
+    """Split a box line into numbers with five decimals; above 10 µm, no space separates the numbers."""
     return _TOUCHING.findall(line) if max(map(len, line.split())) > _LONG else line.split()

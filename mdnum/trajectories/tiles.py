@@ -2,9 +2,9 @@
 
 Atoms are sorted into clusters of sixteen by bisecting space. A tile consists of two clusters, the lattice
 vector between the clusters and, for each atom of the first cluster, sixteen decisions as bits. At each frame,
-the decisions of near clusters are computed in float32 and compared with the previous frame; only changed
-decisions are processed further. If float32 cannot decide a pair, or the margin of a pair is needed, the exact
-squared distance is computed (`search.exact_square`).
+the pairs of near clusters are decided in float32; only decisions that changed since the previous frame are
+processed further. If float32 cannot decide a pair, or the margin of a pair is needed, the exact squared
+distance is computed (`search.exact_square`).
 
 Tiles remain valid as long as all atoms of each cluster stay inside an enlarged bounding box of the cluster.
 Coordinates are unwrapped from frame to frame, so that wrapping in the file does not invalidate tiles.
@@ -37,7 +37,7 @@ _UNIT = 2.0**-24
 
 
 class Tiled(NamedTuple):
-    """Tiles of pairs with the same cutoff radius, and their decisions at the last frame."""
+    """Tiles of atom pairs with the same cutoff radius, with the decision on each pair at the last frame."""
 
     first: Int[np.ndarray, "tiles"]  # clusters
     second: Int[np.ndarray, "tiles"]
@@ -83,7 +83,7 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Update tiles to a frame; return True if they contain all pairs within `clear` of the radius."""
+        """Update the tiles to a frame; return True if the tiles contain every pair up to radius + `clear`."""
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
@@ -163,7 +163,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if at most one image per pair can be inside the cutoff after atoms approach by `moved`."""
+    """Return True if each pair has at most one image inside the cutoff even if atoms approach by `moved`."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
@@ -175,7 +175,7 @@ def tiles_of(
     """Build tiles that are valid at two successive frames, with the decisions of the first frame.
 
     No tiles are built if atoms move too far, or the box is too narrow. `pairs` is the approximate number of
-    pairs inside; the memory of discarded tiles, `spare`, is reused.
+    pairs inside the cutoff. The memory of the old tiles `spare` is reused.
     """
     radius, lattice, x = who.radius, before.lattice, before.positions
     if not _one_image(before, now, radius, 0.0):
@@ -313,7 +313,7 @@ def _halved(x, order):
 
 @njit
 def _nodes(boxes, runs):
-    """Return a tree of bounding boxes: of each run of clusters, of both halves of a run, and so on.
+    """Return a binary tree of bounding boxes for each run of clusters: of the run, of its halves, and so on.
 
     The first half of the clusters of node n is node n + 1; the second half is node n + 2 c, where c is the
     number of clusters in the first half.
@@ -446,7 +446,7 @@ def _box(columns, boxes):
 
 @njit
 def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count):
-    """Decide the pairs of tiles from tile `begin`; return (next tile, flips, close, smallest |margin|)."""
+    """Decide pairs of tiles from `begin` on; return (next tile, flips, number within bound, min |margin|)."""
     close, smallest, room = 0, np.inf, flips.i.shape[0]
     first, second, vector, rows, inside = tiled.first, tiled.second, tiled.vector, tiled.rows, tiled.inside
     order, low, high, scratch = numbers.order, limits.low, limits.high, np.empty(4 * CLUSTER, np.float32)

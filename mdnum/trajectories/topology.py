@@ -4,7 +4,7 @@ MDAnalysis stores three lengths and three angles of a box, and assumes (like mos
 vector is along x and the second in the xy plane. For a box in another orientation, the periodic images
 computed from MDAnalysis's box are silently wrong:
 
-- CHARMM (since version 22) writes symmetric box matrices to dcd files, which do not record this.
+- CHARMM (since version 22) writes symmetric box matrices to dcd files, which do not state the orientation.
 - HOOMD's boxes have tilt factors, which MDAnalysis interprets as cosines of angles (in gsd files).
 - Boxes in H5MD files and DL_POLY's HISTORY files may have vectors in any direction.
 
@@ -191,7 +191,7 @@ class Topology:
 
 
 def topology_universe(topology: str | Path) -> Any:
-    """Return a Universe of a topology, without coordinates, since their reader might write index files.
+    """Return a Universe of a topology; coordinates are not read, since a reader might write index files.
 
     Raises:
         InputError: MDAnalysis cannot read the file.
@@ -233,7 +233,7 @@ def file_of(trajectory: Any) -> Path | None:
 
 
 class Boxes:
-    """Boxes of an MDAnalysis reader, oriented as the file's coordinates are.
+    """Boxes of an MDAnalysis reader, in the same orientation as the coordinates in the file.
 
     Attributes:
         notes: sentences for the user on the interpretation of the boxes.

@@ -157,7 +157,7 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return threshold distances of a directed rule at the last frame, for each center; nan for others.
+        """Return the threshold distances of a directed rule at the last frame, per atom; nan if not a center.
 
         Returns:
             (distance below which a neighbor stays one, distance below which another atom becomes a neighbor).

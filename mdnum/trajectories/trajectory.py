@@ -238,7 +238,7 @@ class Trajectory(ABC):
 
 
 def chosen(frames: slice, total: int | None) -> Iterator[int]:
-    """Return the frame numbers of a slice, ascending; without end if slice and `total` have no end."""
+    """Return the ascending frame numbers of a slice; the sequence is infinite if no end is known."""
     if total is not None:
         return iter(range(*frames.indices(total)))
     return islice(count(), frames.start, frames.stop, frames.step)

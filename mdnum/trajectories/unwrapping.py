@@ -33,7 +33,7 @@ _GROUPS = 8
 
 @dataclass
 class Unwrapping:
-    """Unwrapped paths of up to `_PAIRS` pairs of successive atoms, for frames with a fully periodic box."""
+    """Unwrapped paths of up to `_PAIRS` pairs of atoms adjacent in the file, in fully periodic boxes."""
 
     atoms: AtomIndices
     _first: np.ndarray | None = None
@@ -42,7 +42,7 @@ class Unwrapping:
     _lengths: list[np.ndarray] = field(default_factory=list)  # distances in pairs at the first frames
 
     def see(self, frame: Frame) -> dict[str, Any] | None:
-        """Return the next frame's row of the motion table; None if the box is not fully periodic."""
+        """Return the row of the table of atomic motion for a frame; None unless the box is fully periodic."""
         x, cell = frame.positions if self.atoms is None else frame.positions[self.atoms], frame.box.matrix
         if not frame.box.pbc.all() or len(x) < 2:
             return None
@@ -68,7 +68,7 @@ class Unwrapping:
         }  # fmt: skip
 
     def _pairs(self, here: np.ndarray, there: np.ndarray, cell: np.ndarray) -> dict[str, Any]:
-        """Return relative length changes of stiff pairs across the box boundary, and of other stiff pairs."""
+        """Return relative changes of nearly constant pair distances across the box boundary and elsewhere."""
         images = np.rint(there - here)
         split = images.any(axis=1) | (np.floor(here) != np.floor(there)).any(axis=1)
         lengths = np.linalg.norm((there - here - images) @ cell, axis=1)
@@ -84,7 +84,7 @@ class Unwrapping:
 
 
 def told(rows: Mapping[str, np.ndarray], atoms: int, timed: bool) -> dict[str, Any] | None:
-    """Summarize the motion table as plain values, for a given number of atoms; None if frames are too few."""
+    """Summarize the table of atomic motion as plain values; None if there are fewer than three frames."""
     if len(rows["frame"]) < 3:
         return None
     # before the first frame nothing moved

@@ -459,7 +459,7 @@ def _judge(view: AuditView) -> Verdict:
 
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
-    """Return the headline of an audit: both conclusions, missing checks, and the most severe finding."""
+    """Return an audit's headline: both conclusions (run, differentiate), missing checks, worst finding."""
     shown, early = state.shown, conclusion.to_come(state.shown, state.checks)
     said, begun = conclusion.answers(shown, state.checks), {one.name for one in shown}
     name = TEXTS("on", name=state.name, formula=state.atoms.get_chemical_formula())

@@ -70,7 +70,7 @@ def bounce(
 
 
 def command(system: str | None = None, *, demo: str | None = None, **given: Any) -> Outcome | Reply:
-    """Execute `mdnum ball`: simulate a ball or run a demonstration; without a name, list all names.
+    """Execute `mdnum ball`: run a system or a demonstration; without a name, list the names of both.
 
     Raises:
         InputError: a demonstration was requested together with options of a ball.
@@ -143,7 +143,7 @@ def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun,
 def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return summary entries on the loss, its derivatives and variants, and a table of separations."""
+    """Return loss, derivatives and variants for the summary, and a table of height differences by variant."""
     from mdnum.ball.rollout import first_difference
     from mdnum.verbs import ball_record
 

@@ -77,8 +77,8 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
     """Return a table with one row per stop decision of the solver, for all steps that needed the solver.
 
-    If one solver handles all balls and histories of residuals were kept, all decisions are included;
-    otherwise, only the last two decisions of each solve.
+    All decisions are included if one solver handles all balls and residual histories were kept. Otherwise,
+    the table contains the last two decisions of each solve.
     """
     rule = rule_of(run)
     if rule is None:
@@ -142,7 +142,7 @@ def heights(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
-    """Return a table with, for each step, the separation in height between a variant and the run."""
+    """Return a table with the largest height difference between a variant and the run at each step."""
     size = len(found.separation)
     return {"variant": np.full(size, name), "step": np.arange(size), "separation": found.separation}
 
@@ -182,7 +182,7 @@ def compared(
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Return the step and the decision at which a variant diverges from the run, and its gradient.
+    """Return the step and decision at which a variant diverges from the run, and the variant's gradient.
 
     Args:
         found: the difference between the two runs.
@@ -206,8 +206,8 @@ def compared(
 def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """Return the run's deviations from the closed form, or None if no closed form exists.
 
-    The motion of a ball has a closed form if the ball starts above the floor, the acceleration is constant
-    and downward, and the contact is an impact, a projection or a sharp penalty (a spring).
+    A closed form exists if the ball starts above the floor and the acceleration is constant and downward. The
+    contact must be an impact, a projection or a sharp penalty (a spring).
 
     Args:
         gradient: derivatives by each method; they are compared if the loss is a height.
@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step; of balls solved separately, the ball with the least margin."""
+    """Residual and stop margin at each step; if balls are solved separately, those of the least |margin|."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

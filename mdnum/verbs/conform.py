@@ -481,7 +481,7 @@ def page(view: View, verdict: Verdict) -> Page:
 
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
-    """Yield two tables with one row per subject: for lists built once, and for lists updated in a run."""
+    """Yield two tables of results by subject: for lists built once, and for lists updated during a run."""
     columns: dict[str, Any] = {
         "area": "area", "tested": "asked", "right": "passed",
         "wrong": lambda row: row["failed"] - row["silent"] or None,

@@ -116,7 +116,7 @@ def _alike(a: Trajectory, b: Trajectory) -> bool:
 
 
 class ComparisonView(FlipsView):
-    """Read access to the folder of a comparison of two trajectories, with values for its sentences."""
+    """Read access to the folder of a comparison of two trajectories, and values for the page's sentences."""
 
     @property
     def certain(self) -> bool:
@@ -131,7 +131,7 @@ class ComparisonView(FlipsView):
 
     @property
     def largest(self) -> tuple[str, str]:
-        """Largest separation of any atom in any frame, and the separation that rounding can explain there."""
+        """Largest distance of an atom between trajectories, and the distance that rounding can explain."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
@@ -149,7 +149,7 @@ class ComparisonView(FlipsView):
 
     @property
     def shift(self) -> dict[str, Any]:
-        """Displacement common to all atoms between the trajectories: vector, and range of its length."""
+        """Displacement common to all atoms between trajectories: a vector, and the range of its length."""
         table, at = self.table("apart"), self.summary["shift"]
         vectors = np.stack([table[f"shift_{one}"] for one in "xyz"], axis=1)
         sizes = np.sqrt((vectors**2).sum(axis=1))
@@ -220,7 +220,7 @@ def _in_short(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _evidence(view: ComparisonView) -> Iterator[str]:
-    """Yield sentences on differences of positions and neighbor sets, and on which differed first."""
+    """Yield sentences on differences in positions and in neighbor sets, and on which of them came first."""
     summary, (one, *others) = view.summary, view.summary["rules"]
     seed, beyond, first, values = summary["seed"], summary["beyond"], one["first"], view.values(one)
     if seed is not None:
@@ -248,7 +248,7 @@ def _evidence(view: ComparisonView) -> Iterator[str]:
 
 
 def _certain(one: Mapping[str, Any]) -> str:
-    """Classify when neighbor sets differ by more than rounding: at the first difference, later, or never."""
+    """Classify when neighbor-set differences exceed rounding: at the first difference, later, or never."""
     if one["first"]["pairs"] > one["first"]["ambiguous"]:
         return "some"
     return "never" if one["certain"] is None else "later"
@@ -269,7 +269,7 @@ def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _leap(view: ComparisonView, first: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a sentence on whether the separation grows faster after the neighbor sets differ than before."""
+    """Yield a sentence on whether trajectories diverge faster once their neighbor sets differ than before."""
     table, at = view.table("apart"), int(first["frame"])
     furthest = table["furthest"]
     # a difference that has just begun grows fast, whatever began it

@@ -146,7 +146,7 @@ class HeldRows:
 
 
 class FlipsView(View):
-    """Read access to a folder of flips, with formatted numbers: frames as times, lengths with units."""
+    """Read access to a folder of flips; formats frames as times, and lengths with units."""
 
     @property
     def timed(self) -> bool:

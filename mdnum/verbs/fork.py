@@ -326,7 +326,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """Draw a line for each choice, with marks at the first differing bit, at the fork and at the split."""
+    """Draw a line per choice; mark the first differing bit, the first differing decision, and the split."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (

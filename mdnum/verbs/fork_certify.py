@@ -1,4 +1,4 @@
-"""`mdnum fork certify` (runs against exact arithmetic) and `mdnum fork processes` (program variants)."""
+"""`mdnum fork certify` (comparison with exact arithmetic) and `mdnum fork processes` (program variants)."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def fork_certify(
 
 
 def _ranking(answer: Answer) -> list[dict[str, Any]]:
-    """Return the ranking of precisions for the summary; add tables of the ranking and the separations."""
+    """Return the ranking of precisions for the summary; tabulate it, and distances from the exact run."""
     ranking, rows, table = answer.result.ranking, [], []
     for row in ranking:
         decision, growth, separation = row.decision, row.growth, row.separation
@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """Yield, for each run with another precision in one role, a sentence on the steps gained or lost."""
+    """Yield sentences on how many correct steps a run gains or loses by another precision in one role."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip

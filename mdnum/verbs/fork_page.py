@@ -84,7 +84,7 @@ def _has(table: Mapping[str, np.ndarray], name: str) -> bool:
 
 
 def _separation(view: View) -> Iterator[Plot | str]:
-    """Yield figures of the separation of runs A and B, where B uses its own or A's decisions."""
+    """Yield figures of the distance between runs A and B, where B uses its own decisions or those of A."""
     s, table = view.summary, view.table("separation")
     if not _has(table, "free"):
         return
@@ -159,7 +159,7 @@ def _decision(view: View) -> Iterator[Any]:
 
 
 def _around(view: View) -> Iterator[Any]:
-    """Yield a figure of the atoms around the pair, or of the heights of the ball, at the fork."""
+    """Yield a figure of the first differing decision: atoms around the pair, or heights of the ball."""
     d = view.summary["decision"]
     if d is None:
         return
@@ -222,7 +222,7 @@ def _atoms(view: View, figure: Canvas) -> None:
 
 
 def _two_by_two(view: View) -> Iterator[Any]:
-    """Yield a two-by-two table: the step of the split for either arithmetic with either run's decisions."""
+    """Yield a table of the step at which runs split, for each run's arithmetic with each run's decisions."""
     s, unit = view.summary, view.units.length
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for cell in s["table"]:
@@ -356,7 +356,7 @@ def _growth(view: View) -> Iterator[Any]:
 
 
 def _after(view: View) -> Iterator[Plot]:
-    """Yield figures of the numbers of differing and overridden decisions, and of energy differences."""
+    """Yield figures of how many decisions differ or are overridden, and of energy differences from run A."""
     s, table = view.summary, view.table("separation")
     step, dates, length = table["step"], _dates(s, "fork", "split"), view.units.length
     named = [("cross", "decisions that differ"), ("overridden", "decisions overridden")]

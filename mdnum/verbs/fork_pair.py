@@ -159,7 +159,7 @@ def followed(
 
 
 def _numbers(made: Fork) -> dict[str, Any]:
-    """Return summary entries of a pair of runs: steps of divergence, verdict, growth of the separation."""
+    """Return summary entries of two runs: steps of divergence, verdict, and growth of their distance."""
     step, verdict, growth = made.twin.a.timestep, made.verdict, made.growth["B"]
     dates = {"first_bit": made.dates.first_bit, "fork": made.dates.fork, "split": made.dates.split}
     free, imposed, overridden = (
@@ -217,7 +217,7 @@ def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
-    """Return the fit separation = exp(intercept + rate * step), with the first and last fitted step."""
+    """Return the fit distance = exp(intercept + rate * step) for two runs, with its first and last step."""
     if not np.isfinite(fit.rate):
         return dict.fromkeys(("rate", "r_squared", "first", "last", "intercept"))
     step = np.arange(fit.first, fit.last + 1)
@@ -226,7 +226,7 @@ def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
 
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Predict, from the observed growth or the Lyapunov exponent, the step of a split that did not occur."""
+    """Predict when runs that did not split would split, from their distance or the Lyapunov exponent."""
     from mdnum.numerics.verdicts import expected
 
     exponent = summary.get("lyapunov")
@@ -408,7 +408,7 @@ def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
 
 
 def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
-    """Return, if found, the smallest set of decisions that, when overridden, keep the runs together."""
+    """Return, if found, a minimal set of decisions that must be overridden to keep runs from splitting."""
     from mdnum.forks.replays import disagreements, minimal_cause
 
     try:

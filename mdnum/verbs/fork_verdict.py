@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """Return a phrase on the number of repeats in which runs split later if decisions are imposed."""
+    """Return a phrase: in how many repeats the runs split later if A's decisions are imposed on B."""
     said: list[str] = []
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -114,7 +114,7 @@ def decided(decision: Mapping[str, Any]) -> str:
 
 
 def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the first differing decisions of A and B, and which run decided yes and which decided no."""
+    """Return how runs A and B made the first differing decision, and which of them decided yes."""
     yes = "A" if decision["decided"]["A"] > decision["decided"]["B"] else "B"
     return {"yes": yes, "no": "B" if yes == "A" else "A", "a": decision["decided"]["A"],
             "b": decision["decided"]["B"]}  # fmt: skip

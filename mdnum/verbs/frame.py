@@ -94,7 +94,7 @@ class View:
         return self._tables[name]
 
     def kept(self, codes: Mapping[str, Any]) -> list[Finding]:
-        """Return the stored findings of other modules, whose codes are not in `codes`."""
+        """Return the stored findings whose codes are not in `codes`; they come from other modules."""
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
 
@@ -128,7 +128,7 @@ class Interrupted(KeyboardInterrupt):
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns True after control-C; a second control-C raises KeyboardInterrupt.
 
-    Python delivers signals only to the main thread; in other threads the function always returns False.
+    Python delivers signals only to the main thread; in others, the yielded function always returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -176,8 +176,8 @@ class UnknownKeyword(InputError, TypeError):
 def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
     """Wrap a public function to reject unknown keyword arguments before any file is read or written.
 
-    Otherwise, misspelled keywords in `**keep` would raise an error only when the output folder is made, after
-    the function has used default values in place of the given values.
+    Without this check, a misspelled keyword in `**keep` would raise an error only when the output folder is
+    made. Until then, the function would use the default value.
 
     Args:
         more: names of keywords that the verb passes on in addition to those of `Keep`.

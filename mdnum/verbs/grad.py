@@ -126,7 +126,7 @@ def grad(
 def _problem(
     simulation: Simulation, of: str | None, names: Sequence[str], steps: int | None
 ) -> tuple[Problem, tuple[str, ...]]:
-    """Return the problem and the full names of its parameters; raise an error for invalid names."""
+    """Return the problem to differentiate and the full parameter names; raise an error for invalid names."""
     from mdnum.gradients import Problem, parameters
     from mdnum.gradients.losses import LOSSES, NOT_REAL, parse
 

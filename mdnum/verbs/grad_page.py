@@ -31,7 +31,7 @@ _GROWN = {"forward bounded, gradient not": "growing", "forward not bounded": "un
 
 
 def by(summary: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
-    """Return the stored result of a gradient method (or of the closed form, if it is the reference)."""
+    """Return the stored result of a gradient method, or of the closed form if used as the reference."""
     if summary.get("exact") and method == summary["reference"]:
         exact = {"gradient": summary["exact"], "details": {}, "error": {}}
         return {"method": method, "description": TEXTS("exact"), **exact}
@@ -48,12 +48,12 @@ def magnitude(value: Any, missing: float | None = None) -> float:
 
 
 def digits_of(summary: Mapping[str, Any], name: str) -> int | None:
-    """Return how many digits of a derivative do not change at half the time step; None if unknown."""
+    """Return how many digits of a derivative stay the same if the time step is halved; None if unknown."""
     return ((summary.get("trust") or {}).get("digits") or {}).get(name)
 
 
 def digits_note(summary: Mapping[str, Any], name: str) -> str:
-    """Return a note if no digit of a derivative is valid, or it is unknown which are valid; otherwise ""."""
+    """Return a note if no digits of a derivative are valid or the valid digits are unknown; otherwise ""."""
     known = digits_of(summary, name)
     if summary.get("trust") and known is None:
         return TEXTS("digits_unknown")
@@ -120,7 +120,7 @@ def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
 
 
 def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, Any]]:
-    """Group parameters that have the same judgment on trust; if there is only one group, its key is empty."""
+    """Group parameters by the judgment on their derivatives; if there is only one group, its key is empty."""
     trust = summary.get("trust")
     if not trust:
         return {}
@@ -143,7 +143,7 @@ def trust_sentence(summary: Mapping[str, Any], names: tuple[str, ...], one: Mapp
 
 
 def trust_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on whether and up to which step derivatives can be trusted, and on the limit."""
+    """Yield sentences on whether derivatives can be trusted, up to which step, and for which reasons."""
     for names, one in judgments(summary).items():
         yield trust_sentence(summary, names, one)
         yield from (limit_sentence(summary, limit) for limit in one["limits"] if limit["reached"])
@@ -269,7 +269,7 @@ def _horizons(view: View) -> Iterator[Any]:
 
 
 def _limits(view: View) -> Iterator[tuple[float, str]]:
-    """Yield the steps from which derivatives cannot be trusted, each with the limit that was reached."""
+    """Yield the step from which each derivative cannot be trusted, with the reason as a label."""
     for names, one in judgments(view.summary).items():
         if one["limited_by"]:
             yield one["horizon"], ", ".join([f"limit: {one['limited_by']}", *names])

@@ -150,8 +150,8 @@ def run(
 def _compile_beside() -> None:
     """If the compilation cache is empty, start a second process that compiles the simulation's functions.
 
-    The first command after an installation finds an empty cache and spends most of its time on compilation,
-    and a single process uses only one processor for compilation.
+    After an installation, the cache is empty, and the first command spends most of its time on compilation. A
+    single process compiles on one processor only.
     """
     kept = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     with contextlib.suppress(OSError):

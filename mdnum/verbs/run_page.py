@@ -73,7 +73,7 @@ class RunView(View):
 
     @property
     def cutoff(self) -> Mapping[str, Any]:
-        """Kind and radius of the cutoff, comparison, and jumps at the cutoff; empty if there is no cutoff."""
+        """Cutoff: kind, radius, comparison of distances, and jumps at the radius; empty without a cutoff."""
         return self.summary.get("cutoff") or {}
 
     @property
@@ -123,10 +123,10 @@ class RunView(View):
     def time_step(self) -> dict[str, float | None]:
         """Indicators of whether the time step is small enough; unknown indicators are None.
 
-        `per_period`: number of steps per period of the fastest vibration in the first and the last frame;
-        `fluctuation`: fluctuation of the conserved energy (without the jumps of flips) over the fluctuation
-        of the kinetic energy; `drift`, `drift_error`: drift of the conserved energy and its error, k_B T per
-        atom.
+        `per_period` is the number of steps per period of the fastest vibration in the first and the last
+        frame. `fluctuation` is the fluctuation of the conserved energy (without the jumps of flips) over that
+        of the kinetic energy. `drift` and `drift_error` are the drift of the conserved energy and its error,
+        in k_B T per atom.
         """
         period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
         atoms = self.summary.get("atoms") or 0
@@ -146,13 +146,13 @@ class RunView(View):
 
     @property
     def residual(self) -> Measured:
-        """Residual of the energy budget: the run's value, or else max |E(t) - E(0) - sum of jumps|."""
+        """Residual of the energy budget, as stored by the run or as max |E(t) - E(0) - sum of jumps|."""
         stated = self.summary.get("energy_budget_residual")
         left = float(np.max(np.abs(self.budget["residual"]))) if stated is None else abs(float(stated))
         return Measured(left, self.units.energy, self.summary.get("energy_budget_tolerance"))
 
     def total(self, key: str, column: str | None = None) -> int:
-        """Return a count, from the summary or, if there is no summary, from the table of neighbor lists."""
+        """Return a total of the run, from the summary or, if missing there, as a sum over neighbor lists."""
         return int(self.summary.get(key) or self.epochs[column or key].sum())
 
     def step(self, row: int | np.integer) -> int:
@@ -443,7 +443,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
 
 
 def _ranges(run: RunView) -> Iterator[Any]:
-    """Yield a table of extreme magnitudes, and of steps at which narrower number formats fail."""
+    """Yield a table of each quantity's extremes, and of steps at which narrower number formats fail."""
     examined, series, units = run.table("ranges"), run.series, vars(run.units)
     sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
     sums["step"] = series["step"]

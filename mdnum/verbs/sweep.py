@@ -137,7 +137,7 @@ def _assignments(name: str, texts: Sequence[str]) -> Any:
 
 
 def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
-    """Return the plan of a sweep, without a run: points, missing points, estimated time and disk space."""
+    """Return the plan of a sweep without running it: points, missing points, expected time and disk space."""
     from mdnum.verbs import Reply
 
     where = given.pop("points_in", None) or Path(given.get("out") or "runs/x").parent / "sweep-points"
@@ -246,7 +246,7 @@ def _compute(
 def _after_a_loss(
     place: Workspace, one: Task, wanted: Mapping[str, Planned], error: BaseException, counts: dict[str, Any]
 ) -> list[list[Planned]]:
-    """Handle a task whose process died repeatedly: mark the current point as failed; return the others."""
+    """After repeated crashes of a task, mark its current point as failed and return its remaining points."""
     from mdnum.sweeps.points import write_result
 
     again = []
