@@ -1,4 +1,4 @@
-"""Import of the names of a package when they are first used (PEP 562)."""
+"""Import the names of a package when they are first used (PEP 562)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def on_first_use(
     """Return `__getattr__`, `__dir__` and `__all__` for a package that imports its names on first use.
 
     The names are taken from the imports under `if TYPE_CHECKING` in the source of the package, which must use
-    full module names. Type checkers and Python thus use one list of names.
+    full module names. Type checkers and the Python interpreter therefore use the same list of names.
 
     Args:
         package: `__name__` of the package.

@@ -225,7 +225,7 @@ class FiniteDifferences(Method):
 
 
 def _counter(progress: Progress | None, runs: int, phase: str) -> Callable[[], None]:
-    """Return a function that must be called once per run; it counts the runs and reports progress."""
+    """Return a function that counts runs and reports progress; this function must be called once per run."""
     done = 0
 
     def count() -> None:
@@ -241,7 +241,7 @@ def _counter(progress: Progress | None, runs: int, phase: str) -> Callable[[], N
 class ShadowDifferences(Method):
     """Gradient method: finite differences in float64 for a run in a narrower format.
 
-    For runs in float64 no wider format is practical; use finite differences, which estimate their own noise.
+    For runs in float64, no wider format is practical. Use `FiniteDifferences`, which estimates its own noise.
     """
 
     relative: float = 1e-4  # the largest step as a share of the parameter
@@ -434,9 +434,9 @@ class SmoothedDifferences(Method):
     """Gradient method: mean over replicas of central differences with steps that span many flips.
 
     The two runs of a difference use the same random numbers. Differences with steps h and h/2 are
-    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees, within twice the
-    standard error, with the extrapolations from all narrower steps: narrower steps have more noise from
-    single flips.
+    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with the
+    extrapolations from all narrower steps within twice the standard error. Narrower steps have more noise
+    from single flips.
     """
 
     relative: float = 0.002  # the widest step as a share of the parameter

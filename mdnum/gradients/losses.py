@@ -2,8 +2,8 @@
 
 A loss computes observations from each frame (and the first frame), sums the observations over frames, and
 computes a number from these sums. Averages, correlations with the start and histograms are losses of this
-form. The derivatives of a loss also require only one frame at a time. Each loss of the command line is a
-class in this module with a name, a label and a unit.
+form. The derivatives of a loss also require only one frame at a time. Each loss that the command line offers
+is a class in this module with a name, a label and a unit.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Loss(eqx.Module):
         """Return the observations of a frame, to be summed over frames; `origin` is the frame of step 0."""
 
     def value(self, total: Any, frames: Int[Array, ""] | int) -> Inexact[Array, ""]:
-        """Compute the loss from the sum of observations and the number of frames; the default is the mean."""
+        """Compute the loss from the sum of observations and the number of frames (default: the mean)."""
         return total / frames
 
     def reason_unavailable(self, around: LossContext) -> str | None:
@@ -171,7 +171,7 @@ class MeanSquaredDisplacement(_OfLast):
 
 
 class VelocityAutocorrelation(_OfLast):
-    """Mean of v(0) · v(t) over atoms at the last step, (length / internal time)²."""
+    """Mean of v(0) · v(t) over atoms at the last step, in units of (length / internal time)²."""
 
     # inside, time is length * sqrt(mass / energy)
     name, label, unit = "vacf", "mean of v(0) · v(t) at the last step", "{energy}/{mass}"
@@ -191,7 +191,7 @@ class MeanPotential(Loss):
 
 
 class MeanTemperature(Loss):
-    """Kinetic temperature 2 K / (3 N kB), averaged over frames, kelvin (or reduced units of temperature)."""
+    """Kinetic temperature 2 K / (3 N kB), averaged over frames, in kelvin (or reduced units)."""
 
     name, label, unit = "temperature", "kinetic temperature, averaged over steps", "{temperature}"
     of_single_frames = True
@@ -221,7 +221,7 @@ class MeanVolume(Loss):
 
 
 class MeanDensity(MeanVolume):
-    """Mass density (mass of all atoms divided by the volume), averaged over frames, mass/length³."""
+    """Mass density (total mass divided by volume), averaged over frames, in units of mass/length³."""
 
     name, label, unit = "density", "mass over volume, averaged over steps", "{mass}/{length}³"
 
@@ -266,8 +266,8 @@ class GreenKuboDiffusion(Loss):
     D is a third of the integral of v(0) · v(t), averaged over atoms, from step 0 to step `until`. The
     integral is computed by the trapezoidal rule with a spacing of `every` steps.
 
-    Error: of order (every × timestep)² times the slope of the autocorrelation at `until`.
-    Source: the same as for `EinsteinDiffusion`.
+    Error: the integration error is of order (every × timestep)² times the autocorrelation's slope at `until`.
+    Source: Allen and Tildesley (2017), section 2.7, as for `EinsteinDiffusion`.
     """
 
     name, unit = "diffusion-green-kubo", "{length}²/{time}"

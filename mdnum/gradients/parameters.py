@@ -49,7 +49,7 @@ class Cotangents:
 
 
 class Direction(NamedTuple):
-    """Derivatives of all inputs with respect to one number, or to several (along the first axis)."""
+    """Derivatives of all inputs with respect to one parameter entry, or to several (along the first axis)."""
 
     # x, v: of the positions and velocities of step 0, user's order
     x: Float[Array, "*columns 3 atoms"]
@@ -76,8 +76,8 @@ def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce 
 
 
 def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Array, Array]:
-    """Propagate cotangents of the integrator's initial extra state (such as a thermostat's) backward, to the
-    parameters of the integrator and the initial positions and velocities.
+    """Propagate cotangents of the integrator's initial extra state (for example, of a thermostat) backward to
+    the integrator's parameters and to the initial positions and velocities.
 
     Args:
         start: the state of step 0.
@@ -127,7 +127,7 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any], Any]]:
-    """Return the inputs that a parameter changes, as pairs (function that selects the input, derivative)."""
+    """For each input that a parameter changes, return a function that selects it, and the derivative."""
     if name in ("initial.positions", "initial.velocities"):
         return [((lambda of: of.x) if name == "initial.positions" else (lambda of: of.v), None)]
     v = simulation.velocities.T
@@ -186,7 +186,7 @@ def moved(simulation: Simulation, still: Direction, column: ParameterEntry) -> D
 
 @dataclass(frozen=True)
 class ParameterEntry:
-    """One number to differentiate with respect to: a scalar parameter, or one entry of an array parameter."""
+    """Variable of differentiation: a scalar parameter, or one entry of an array parameter."""
 
     name: str  # full name of the parameter
     index: tuple[int, ...] = ()  # which of its entries; empty for a scalar

@@ -209,7 +209,7 @@ def method(name: str) -> Method:
 
 
 def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: bool) -> dict[str, str]:
-    """Return, by parameter, notes on derivatives that are exactly zero or omit the effect of flips."""
+    """For each parameter, return a note if its derivative is exactly zero or omits the effect of flips."""
     notes = {}
     missing = problem.jumps and not saltation
     for name, value in gradient.items():

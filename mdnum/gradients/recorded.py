@@ -298,7 +298,7 @@ class Surrogate(Method):
 
 
 def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
-    """Return how many crossings and how many grazing crossings occur, and those with the largest weights."""
+    """Return how many crossings occur and how many graze, and the crossings with the largest weights."""
     speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
     flips = {name: joined(crossings, name, ledger=True) for name in ("step", "i", "j", "entered")}
     key, heavy = -np.abs(weight), np.arange(len(weight))
@@ -320,7 +320,7 @@ def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
 
 
 def joined(crossings: Sequence[Crossings], name: str, *, ledger: bool = False) -> np.ndarray:
-    """Concatenate one column of the crossings (or of their flips) in several stretches of steps."""
+    """Concatenate one column of all cutoff crossings (or of their flips) from several stretches of steps."""
     return np.concatenate([getattr(one.ledger if ledger else one, name) for one in crossings])
 
 

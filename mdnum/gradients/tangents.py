@@ -74,8 +74,8 @@ def tangents(
 ) -> Iterator[StretchTangents]:
     """For each stretch of steps of a recorded run, yield the tangents with respect to named parameters.
 
-    If saltation is False, the contribution of flips to a derivative is the sum over crossings of weight times
-    (dr_cut - dr), where an event-aware reverse pass gives the weights.
+    If saltation is False, the tangents omit flips. The contribution of flips is then the sum over crossings
+    of weight times (dr_cut - dr); an event-aware reverse pass gives the weights.
 
     Args:
         tape: the run; recorded with flips if crossings are needed. names: full names of parameters.

@@ -1,9 +1,9 @@
 """A run recorded for gradients: its steps, in forward or reverse order, and the sums of the loss.
 
-Recorded stretches of steps are kept in memory as long as there is room. Other stretches are run again from
-their first states: the same compiled program with the same state and neighbor list gives the same bits. A run
-with a fixed-point integer state need not be stored: its steps are reversed, and the reversed steps must lead
-back to the start bit for bit.
+Recorded stretches of steps are kept in memory as long as there is room. Stretches that do not fit into memory
+are run again from their first states: the same compiled program with the same state and neighbor list gives
+the same bits. A run with a fixed-point integer state need not be stored: its steps are reversed, and the
+reversed steps must lead back to the start bit for bit.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class TapeStretch:
         return sum(array.nbytes for array in jax.tree.leaves(kept))
 
     def cut(self, room: int | None = None) -> TapeStretch:
-        """Return a copy with arrays of `room` rows; the default is one row for each recorded step."""
+        """Return a copy whose arrays have `room` rows; by default, one row for each recorded step."""
 
         def copied(rows: np.ndarray) -> np.ndarray:
             kept = np.zeros((room or self.rows, *rows.shape[1:]), rows.dtype)
@@ -77,7 +77,7 @@ class TapeStretch:
         return replace(self, **{name: jax.tree.map(copied, getattr(self, name)) for name in _COLUMNS})
 
     def roomy(self) -> TapeStretch:
-        """Return a copy padded to one of a few standard numbers of steps, for fewer compilations."""
+        """Return a copy padded to a standard number of steps, which reduces the number of compilations."""
         columns = jax.tree.leaves([getattr(self, name) for name in _COLUMNS])
         per_row = sum(column[0].nbytes for column in columns)
         return self.cut(room_for(self.rows - 1, per_row))
@@ -89,7 +89,7 @@ class TapeStretch:
 
     @property
     def columns(self):
-        """Arrays of step, x, v, images, potential, virial and cell, and the recorded inputs of each step."""
+        """Recorded arrays: step, x, v, images, potential, virial, cell, and the inputs of each step."""
         return (self.steps, *(getattr(self, name) for name in ("x", "v", "images", *_COLUMNS[4:])))
 
     def cell_of(self, row: int, cell: Cell) -> Cell:
@@ -126,8 +126,8 @@ class Pace(NamedTuple):
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the number of frames per unit of time near a step: if a jump just before the step occurs
-        earlier by dt, then on average dt times this number of frames change.
+        """Return the number of frames per unit of time near a step. If a jump of the energy occurs earlier by
+        dt, dt times this number of frames change on average.
         """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
@@ -222,9 +222,9 @@ class RunTape:
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
-        """Derivatives of the loss with respect to the energy and virial of a frame, for gradients that do not
-        include jumps of energy and virial at flips (as for losses of a single frame). For equally spaced
-        frames, whose gradients include the jumps, both derivatives are set to 0.
+        """Derivatives of the loss with respect to the energy and virial of a frame, if gradients omit jumps
+        of energy and virial at flips (as for losses of a single frame). If the frames are equally spaced,
+        gradients include these jumps, and both derivatives are set to 0.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0
@@ -303,11 +303,11 @@ class ReversibleTape(RunTape):
 
     @property
     def nbytes(self) -> int:
-        """Memory, in bytes, for the bits that friction discarded; it grows with the number of steps."""
+        """Memory (bytes) of the bits that friction discarded; the memory grows with the number of steps."""
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:
-        """Run the steps again, whose states were not stored, and yield the stretches in order."""
+        """Run the steps again, because their states were not stored, and yield the stretches in order."""
         return RunTape(self.simulation, self.loss, self.steps, flips=self.flips).forward()
 
     def backward(self) -> Iterator[TapeStretch]:

@@ -1,9 +1,9 @@
 """Let JAX differentiate all operations of the steps in reverse mode, like `jax.grad` of the whole run.
 
 A chunk is a scan over a fixed number of steps with one neighbor list, which limits the memory of reverse
-mode. When the list expires, the remaining steps of the chunk do nothing, and the host builds the next list at
-the current positions. States between chunks are stored; if memory is insufficient, every second state is
-dropped, and the steps between stored states are run again.
+mode. When the neighbor list expires, the remaining steps of the chunk are skipped, and the host builds the
+next list at the present positions. The states between chunks are stored; if memory is insufficient, every
+second state is dropped, and the steps between the remaining states are run again.
 
 The forward pass of the differentiated program may round differently from an ordinary run, and therefore make
 other decisions; the gradient then belongs to another trajectory. Therefore, the states and decisions of all

@@ -110,7 +110,7 @@ class Barostat(Integrator):
     @property
     @abstractmethod
     def box(self) -> str:
-        """Type of box changes, an element of `boxes`."""
+        """Kind of box change, such as "isotropic" or "full"; an element of `boxes`."""
 
     @property
     def anisotropic(self):
@@ -137,7 +137,7 @@ class Barostat(Integrator):
         return symmetric(products(v, masses * v))
 
     def excess(self, motion: Rate, at: AtStep) -> Rate:
-        """Return the tensor Π - p V at the target pressure p; for an isotropic box, the diagonal's mean."""
+        """Return the tensor Π - p V at the target pressure p, or its diagonal's mean for an isotropic box."""
         virial = at.tensor if self.anisotropic else at.virial / 3
         assert virial is not None
         return motion + 0.5 * (virial + virial.T) - self.pressure * volume(at.cell) * unit(motion)
@@ -309,8 +309,8 @@ class CellRescaling(Barostat):
     def _forces(self, v, at):
         """Return √V, the force on √V, and the traceless part of the excess pressure tensor (see `excess`).
 
-        The force on √V is the derivative of k_B T times the logarithm of the density of √V, √V exp(-(U + K +
-        p V) / k_B T).
+        The force on √V is k_B T times the derivative of the logarithm of the density of √V, which is
+        proportional to √V exp(-(U + K + p V) / k_B T).
         """
         root, excess = jnp.sqrt(volume(at.cell)), self.excess(self.motion(v, at.masses), at)
         part = trace(excess) / 3

@@ -91,15 +91,15 @@ class Cell(eqx.Module):
 
     @property
     def volume(self) -> float:
-        """Volume of the three lattice vectors, length³; NaN if a vector is missing (ASE's convention)."""
+        """Volume spanned by the three lattice vectors, length³; NaN if a lattice vector is missing (zero)."""
         volume = float(abs(np.linalg.det(np.asarray(self.matrix))))
         return volume if volume > 0 else float("nan")
 
     def reach(self, positions: Float[np.ndarray, "atoms 3"]) -> Reach:
         """Return the largest coordinates and lattice vectors, from which rounding bounds are computed.
 
-        The largest coordinates along periodic axes follow from the box. Along nonperiodic axes, the result
-        allows every atom to move by the present extent of all atoms.
+        The largest coordinates along periodic axes follow from the box. Along nonperiodic axes, the returned
+        coordinates allow every atom to move by the present extent of all atoms.
 
         Args:
             positions: initial positions of the atoms, length.
@@ -125,7 +125,7 @@ class Cell(eqx.Module):
     def minimum_image(self, x, y, z):
         """Return the components of the minimum image of a displacement.
 
-        The result is correct for every vector whose nearest image is shorter than half the smallest
+        The minimum image is correct for every vector whose nearest image is shorter than half the smallest
         perpendicular width; calling functions reject longer cutoffs.
         """
         if not any(self.pbc):
@@ -137,7 +137,7 @@ class Cell(eqx.Module):
     def deformation(self, now: Cell):
         """Return the deformation F from this box to another, shape (3, 3): new lattice rows = old rows @ F.
 
-        Directions along nonperiodic axes do not change. The deformation is exactly one for equal boxes.
+        Directions along nonperiodic axes do not change. For equal boxes, the deformation is the identity.
         """
         return np.eye(3) + self.inverse @ (now.matrix - self.matrix)
 
@@ -160,9 +160,9 @@ class Cell(eqx.Module):
         return Cell(matrix, rows.T @ crossed.T / (square[0] @ crossed[0]), self.pbc, self.orthorhombic)
 
     def spent(self, x, reference: Cell, home, r_list):
-        """Return the largest displacement relative to the box plus half the strain loss (inside jit).
+        """Return the largest displacement relative to the box plus half of `strain_loss` (inside jit).
 
-        A neighbor list is complete as long as the returned length is at most half the skin thickness.
+        A neighbor list is complete as long as the sum returned by `spent` is at most half the skin.
 
         Args:
             x, home: present positions, in this box, and positions when the list was built, in the box
@@ -244,7 +244,7 @@ def stacked(cells: Sequence[Cell], dtype: DTypeLike = np.float64):
 def box_of(boxes, row):
     """Return one of several stacked boxes: lattice vectors, inverse, periodicity and orthorhombic flag.
 
-    The result consists of tuples: arrays would slow down a compiled loop by reference counting.
+    The function returns tuples, because reference counts of arrays would slow down a compiled loop.
     """
     numbers, pbc, orthorhombic = boxes
     a, m = numbers[row % len(numbers), 0], numbers[row % len(numbers), 1]
@@ -278,8 +278,8 @@ def wrap_positions(
     """Wrap positions, even from far outside the box; return wrapped positions and numbers of shifts.
 
     Error: the first pass subtracts n lattice vectors at once and rounds n*L; a second pass wraps positions
-    that are still outside due to this rounding. A wrapped coordinate may equal the edge length L after L is
-    added to a tiny negative number.
+    that are still outside the box due to this rounding. A wrapped coordinate may equal the edge length L
+    after L is added to a tiny negative number.
     """
     wrapped = np.array(positions, np.float64, copy=True)
     images = np.zeros(wrapped.shape, np.int64)
@@ -307,16 +307,16 @@ def transformed(x, by):
 
 
 def strain_loss(reference: Cell, now: Cell, r_list):
-    """Return an upper bound on the decrease of a distance r_list that a deformation of the box can cause.
+    """Return an upper bound on how much a deformation of the box can shorten a distance of r_list.
 
     The deformation F maps a vector of length r_list to a vector of at least length sigma_min(F) * r_list. A
-    neighbor list is complete as long as the bound plus twice the largest displacement relative to the box is
-    at most the skin. The function works on the host and inside jit.
+    neighbor list is complete as long as `strain_loss` plus twice the largest displacement relative to the box
+    is at most the skin. `strain_loss` works on the host and inside jit.
 
-    The bound uses sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|, where S is the symmetric part of F,
-    t a third of the trace of F, and |.| the Frobenius norm. The bound requires no matrix decomposition. The
-    bound is exact if the box keeps its shape; otherwise its error is at most 0.41 |S - t| plus the square of
-    the rotation angle.
+    The upper bound follows from sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|, where S is the
+    symmetric part of F, t a third of the trace of F, and |.| the Frobenius norm. The upper bound requires no
+    matrix decomposition. If the box keeps its shape, the upper bound is exact; otherwise its error is at most
+    0.41 |S - t| plus the square of the rotation angle.
 
     Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
     """

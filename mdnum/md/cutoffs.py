@@ -7,7 +7,7 @@ A cutoff is a class with a formula `cut`, a name and a smoothness. All other par
 class by its name in `CUTOFFS`. A class may also define the independent implementation `reference` and the
 interval version `enclose`; by default, both are derived from `cut`.
 
-The functions work with numpy and jax arrays; this module does not import jax.
+All formulas work with numpy and jax arrays; this module does not import jax.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ class Cutoff(ABC):
         """
 
     def energy_jump(self, at: AtCutoff):
-        """Return the energy jump when a pair enters: the limit of the pair energy as r approaches r_cut."""
+        """Return the energy jump when a pair enters the cutoff: the limit of the pair energy at r_cut."""
         return self._limits(at)[0] if self.smoothness < 0 else 0 * at.energy
 
     def force_jump(self, at: AtCutoff):
-        """Return the jump of the radial force when a pair enters, in energy/length; positive if repulsive."""
+        """Return the radial force jump (energy/length) as a pair enters the cutoff; positive if repulsive."""
         return -2 * at.r_cut * self._limits(at)[1] if self.smoothness < 1 else 0 * at.slope
 
     def jumps(self, at: AtCutoff):
@@ -161,7 +161,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
 
 
 def _ends(made: Cutoff, power: int) -> bool:
-    """Check a cutoff for u = r^(-2 power); return True if a derivative that is allowed to jump jumps."""
+    """Check a cutoff of u = r^(-2 power); return True if a derivative jumps that is allowed to jump."""
     import jax
     import jax.numpy as jnp
 

@@ -44,7 +44,7 @@ CONVENTIONS = ("r2 <", "r2 <=", "r <", "r <=")
 
 @dataclass(frozen=True)
 class PairDecider:
-    """Comparison that decides on a pair: `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
+    """Decision on a pair by the comparison `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
 
     r_cut: tuple[float, ...]  # cutoff of each pair type, length
     compare: str = "r2 <"  # quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <="
@@ -84,9 +84,9 @@ class PairDecider:
         """Bounds on |computed margin - exact margin| by pair type, in units of the compared r or r².
 
         The exact margin follows from the stored positions, and from the box and the threshold in double
-        precision (error analysis: numerics.rounding). The bound is evaluated at 1.001 r_cut, and holds for
-        every pair up to this distance; for more distant pairs, the decision is correct, or the margin is
-        within the bound. The bound is valid for atoms within `reach`; otherwise, use `bounds_at`.
+        precision (error analysis: numerics.rounding). The bound is evaluated at a distance of 1.001 r_cut,
+        and holds for every pair up to this distance. For more distant pairs, the decision is correct, or the
+        margin is within the bound. If atoms are beyond `reach`, use `bounds_at` instead.
         """
         return tuple(float(bound) for bound in self._bounds(None))
 
@@ -138,7 +138,7 @@ class PairDecider:
         return np.sqrt(r2) if self.space == "r" else r2
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
-        """Return margins (threshold minus r or r²; positive inside) on the host, bitwise as in decisions.
+        """Return, on the host, margins (threshold minus r or r²) with the same bits as in the decisions.
 
         Args:
             displacement: three components, in the dtype of the decision. kind: pair type of each pair.
@@ -241,7 +241,7 @@ class SlotJudge:
         return d, quantity, self.decider.inside(quantity, threshold), threshold
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return decisions on a group of slots, as low bits of a byte per atom, and the least |margin|."""
+        """Return the decisions on a group of slots, one bit each, and the smallest |margin| of each atom."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         margin = jnp.abs(threshold - quantity)
         for k in range(GROUP):
@@ -294,7 +294,7 @@ class Changes(NamedTuple):
         return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(3, np.int64))
 
     def emptied(self) -> Changes:
-        """Return the buffers after removal of all changes."""
+        """Return the same buffers, with the number of changes set to zero."""
         return self._replace(count=jnp.zeros_like(self.count))
 
     @property

@@ -129,7 +129,7 @@ class Spline(eqx.Module):
 
     @property
     def end(self) -> float:
-        """Argument of the last entry of the table."""
+        """Value of x at the last entry of the spline's table."""
         return self.start + self.intervals * self.step
 
     def __call__(self, x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -166,8 +166,8 @@ class EmbeddedAtom(ManyBody):
     neighbor lists of jax-md contain each atom as its own neighbor, which adds the density at r = 0. The
     splines of jax-md round the table to float32 and return 0 outside its range.
 
-    Error: if a density is outside the embedding table, energy and forces are NaN. The deviation of the spline
-    from the tabulated function is not considered an error.
+    Error: energy and forces are NaN if the electron density of an atom is outside the embedding table. The
+    deviation of the spline from the tabulated function is not considered an error.
 
     The implementation was checked against ase.calculators.eam and a plain evaluation in extended precision
     (tests/support/oracles_manybody.py). Source: Daw and Baskes, Phys. Rev. B 29, 6443 (1984).

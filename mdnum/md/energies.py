@@ -1,4 +1,4 @@
-"""User-defined energies over a neighbor list, called in a uniform way for any calling convention.
+"""Call user-defined energy functions over a neighbor list in a uniform way, whatever their arguments are.
 
 Functions written for jax-md differ in the order of the arguments, the form of the box, real or fractional
 positions, neighbor lists with or without images, and the return value. The signature determines the order of
@@ -38,7 +38,7 @@ ENERGIES: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class Convention:
-    """Calling convention of an energy function; trial calls determine the fields after `keywords`."""
+    """Calling convention of an energy function; the fields after `keywords` are determined by trial calls."""
 
     native: bool = False  # (parameters, positions, neighbor, cell)
     parameters: bool = False  # they come first
@@ -78,7 +78,7 @@ class Call:
     name: str = "energy function"
 
     def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
-        """Return the energy in the units of the function; if `returns` is empty, return the unchanged result.
+        """Return the energy in the function's own units, or its unchanged result if `returns` is empty.
 
         Args:
             given: the keywords of the convention; for mdnum's own convention, "cell".
@@ -202,9 +202,9 @@ def energy_function(
     Supported forms are `energy_fn(R, neighbor, **kw)`, `energy_fn(params, R, neighbor, **kw)`, `energy_fn(R,
     *, box=, neighbor=, perturbation=)`, and mdnum's own form `f(parameters, positions, neighbor, cell)`. A
     function may be given alone or with its neighbor functions, as returned by jax-md's `*_neighbor_list`, and
-    may use multi-image lists. The energy function returns a number, a number per atom, or a dictionary with
-    key "total" or "energy". Properties that the signature does not determine (box vectors in rows or columns,
-    real or fractional positions) are determined by trial calls when a simulation is made.
+    may use neighbor lists with several images. The energy function returns a number, a number per atom, or a
+    dictionary with key "total" or "energy". Properties that the signature does not determine (box vectors in
+    rows or columns, real or fractional positions) are determined by trial calls when a simulation is made.
 
     Example:
         >>> made = jax_md.energy.lennard_jones_neighbor_list(displacement, box)

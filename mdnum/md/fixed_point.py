@@ -150,7 +150,7 @@ class FixedPointUnits:
 
 
 def _depth(model: CutPotential) -> float:
-    """Return an energy scale of a pair potential: its depth, or the energy near 0.6 r_cut if repulsive."""
+    """Return an energy scale of a pair potential: its depth or, if repulsive, its value near 0.6 r_cut."""
     r_cut = np.asarray(model.r_cut, np.float64)
     r = r_cut * np.linspace(0.2, 1.0, 400)[:, None]
     energy = np.asarray(model.potential.evaluate(jnp.asarray(r * r))[0])
@@ -166,8 +166,8 @@ class FixedPointDecider(PairDecider):
     """Decision whether a pair is inside the cutoff, by comparison of two integers.
 
     The squared distance is an integer in units of the squared spacing. Every comparison is converted to the
-    form `r2 < limit` with an integer limit. The threshold of a margin is half a unit below the limit, so that
-    margins are never zero and have no rounding error.
+    form `r2 < limit` with an integer limit. For margins, the threshold is half a unit below this limit, so
+    that margins are never zero and have no rounding error.
     """
 
     spacing: float = 1.0  # of positions, length
@@ -187,7 +187,7 @@ class FixedPointDecider(PairDecider):
 
     @property
     def thresholds(self) -> tuple[Threshold, ...]:
-        """Thresholds of squared distances by pair type, as doubles: half a squared spacing below `limits`."""
+        """Thresholds of r² by pair type, as doubles: half a squared position spacing below `limits`."""
         unit = self.spacing * self.spacing
         return tuple(Threshold((limit - 0.5) * unit, "<", "r2") for limit in self.limits)
 
@@ -257,7 +257,7 @@ class FixedPointStep(Integrator):
 
     @abstractmethod
     def drift(self, x, v, extra, masses, step, order):
-        """Make the part of `begin` after the kick: advance positions, velocities and extra state."""
+        """Advance positions, velocities and extra state in the part of `begin` that follows the kick."""
 
     @abstractmethod
     def undrift(self, x, v, extra, masses, step, order):
@@ -268,7 +268,7 @@ class FixedPointStep(Integrator):
         return self.units.total(0.5 * (masses * squared_norm(v[0], v[1], v[2], self.zero)))
 
     def glide(self, x, p, masses, share: float, direction: int):
-        """Move positions at constant momenta for a `share` of a step, backward if direction is -1."""
+        """Move atoms for a `share` of a step at constant momenta, backward in time if direction is -1."""
         moved = jnp.round(p * (share * self.stride / masses))
         return x + direction * self.units.spacing * moved
 
@@ -431,11 +431,11 @@ class FixedPointJudge(SlotJudge):
         self.value = limits
 
     def start(self) -> jax.Array:
-        """Return the initial value of the smallest |margin| of each atom, in squared spacings."""
+        """Return the initial smallest |margin| of each atom, in units of the squared position spacing."""
         return jnp.full(self.atoms, jnp.iinfo(jnp.int64).max, jnp.int64)
 
     def group(self, j, types):
-        """Return displacement, squared distance, decision and limit for neighbors j, in grid spacings."""
+        """Return displacements, squared distances, decisions and limits of neighbors j, in grid units."""
         d = displacements(self.components, self.cell, j)
         edge = float(2**REACH_BITS)
         # what is further away than any listed pair is outside; its square might not fit
@@ -450,7 +450,7 @@ class FixedPointJudge(SlotJudge):
         return d, r2, r2 < limit, limit
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return decisions on a group of slots, as low bits of a byte per atom, and the least |margin|."""
+        """Return the decisions on a group of slots, one bit each, and the smallest |margin| of each atom."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         left = threshold - quantity
         away = jnp.maximum(left, 1 - left)
@@ -569,7 +569,7 @@ class FixedPointForce(PairForce):
 
 
 def _closest(model: CutPotential, units: FixedPointUnits) -> float:
-    """Return the least squared distance at which energy, force and virial of a pair are below 2^50 units."""
+    """Return the smallest r² at which energy, force and virial of a pair are all below 2^50 units."""
     r_cut, atom = np.asarray(model.r_cut, np.float64), model.at_cutoff()
     r = r_cut * np.geomspace(1, 1e-3, 4000)[:, None]
     energy, slope = (

@@ -81,7 +81,7 @@ def _layered(x, start, bins):
 
 @njit
 def _runs(b0, b1, box, run, shift):
-    """Find runs of bins near a column of bins in a layer, with the lattice vector that shifts each run.
+    """Find the runs of bins near a column of bins in a layer, and the lattice vector that shifts each run.
 
     Returns:
         number of runs, and the run that contains the column. run: index along the first axis, first and last
@@ -191,7 +191,7 @@ def _compressed(mask, label, first, atoms, out, place):
 
 @njit
 def _transposed(rows, table, first, begin, end):
-    """Copy the neighbors of consecutive atoms to the table, many atoms at once to write whole cache lines."""
+    """Copy the neighbors of many consecutive atoms to the table at once, to write whole cache lines."""
     room, n = table.shape
     if end - begin == _TOGETHER and room % EIGHT == 0:
         for k in range(0, room, EIGHT):
@@ -350,7 +350,7 @@ _using = threading.Lock()
 def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
     """Return aligned memory for a table of neighbors, which XLA on a CPU can use without making a copy.
 
-    For a million atoms, the table needs half a gigabyte, whose allocation takes longer than a search.
+    For a million atoms, the table needs half a gigabyte, and its allocation takes longer than a search.
     """
     size = 4 * room * atoms + 64
     with _using:

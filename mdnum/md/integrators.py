@@ -39,7 +39,7 @@ def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Arra
 
 
 class ByAtom(NamedTuple):
-    """Per-atom array in an extra state, sorted like the atoms along its last axis."""
+    """Array in an extra state with one entry per atom along its last axis, sorted like the atoms."""
 
     value: Array
 
@@ -77,13 +77,13 @@ def quantity(
 ) -> Any:
     """Declare a field of an integrator that has a unit in system files, such as a time or a temperature.
 
-    A temperature (an energy inside mdnum) has the key `temperature`; a random key has the key `seed`.
+    In system files, a temperature (energy in mdnum) has the key `temperature`, a random key the key `seed`.
     """
     return eqx.field(metadata={"unit": unit}, **options)
 
 
 class AtStep(NamedTuple):
-    """Input of an integrator: data of a step after the evaluation of forces, with sorted atoms."""
+    """Data of a time step that an integrator receives after the force evaluation, with sorted atoms."""
 
     acceleration: Vector  # force/mass, in the dtype of the state
     virial: Number  # sum over pairs of r_ij · F_ij, energy, float64
@@ -144,13 +144,13 @@ class Integrator(eqx.Module):
 
     @property
     def random(self) -> Any:
-        """Random key, as an array; None without noise; inside eqx.tree_at, the key may be any object."""
+        """Random key, as an array; None if there is no noise; inside eqx.tree_at, any object is allowed."""
         field = self.keys().get("seed")
         return None if field is None else getattr(self, field.name)
 
     @property
     def noise_belongs_to(self) -> tuple[str, ...]:
-        """Permutation symmetries ("atoms", "axes") that noise breaks by depending on atom or axis indices."""
+        """Symmetries ("atoms", "axes") that are broken because noise depends on atom or axis indices."""
         return () if self.random is None else ("atoms", "axes")
 
     def number(self, key: str, units: Units) -> float:
@@ -186,7 +186,7 @@ class Integrator(eqx.Module):
 
     @abstractmethod
     def begin(self, x: Vector, v: Vector, extra: Any, at: AtStep) -> tuple[Vector, Vector, Any, Number]:
-        """Begin a step; return the positions, velocities and extra state of the next step, and heat absorbed.
+        """Begin a step; return positions, velocities and extra state of the next step, and the absorbed heat.
 
         Args:
             x, v: sorted positions and full-step velocities.
@@ -333,7 +333,7 @@ class KickDrift(Integrator):
     def drift(
         self, x: Vector, v: Vector, masses: Masses, step: Step, order: Order
     ) -> tuple[Vector, Vector, Number]:
-        """Make the part of `begin` after the kick, which must be linear in positions and velocities."""
+        """Advance the state after the kick; the map must be linear in positions and velocities."""
 
 
 def without_kick(integrator: Integrator) -> str | None:

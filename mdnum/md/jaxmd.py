@@ -92,7 +92,7 @@ def neighbor_vectors(
     cell: Float[Array, "3 3"],
     pbc: tuple[bool, bool, bool],
 ) -> Float[Array, "atoms slots 3"]:
-    """Return minimum-image vectors from each atom to its neighbors; vectors of padding entries are finite."""
+    """Return minimum-image vectors from each atom to its neighbors; padding entries give finite vectors."""
     toward = displacement(cell, pbc)
     others = positions[jnp.where(idx < positions.shape[0], idx, 0)]
     return jax.vmap(lambda here, there: jax.vmap(lambda point: toward(point, here))(there))(positions, others)
@@ -152,7 +152,7 @@ def as_neighbor_list(
     self_edges: bool = False,
     code: Any = 0,
 ) -> NeighborList:
-    """Make a jax-md NeighborList from the list of another program, for use with jax-md energy functions.
+    """Make a jax-md NeighborList, for jax-md energy functions, from the neighbor list of another program.
 
     The conversion also works inside jit; padding entries keep their places in the arrays.
 
@@ -345,7 +345,7 @@ def dense_pairs(
     pbc: tuple[bool, bool, bool],
     r_list: float,
 ) -> Int[np.ndarray, "atoms slots"]:
-    """Return neighbors within r_list found by jax-md; the most recent `PairSearch` objects are reused."""
+    """Return neighbors within r_list, found by jax-md; recently used `PairSearch` objects are reused."""
     rows = np.ascontiguousarray(cell, np.float64)
     return _kept_search(rows.tobytes(), pbc, float(r_list))(np.asarray(positions))
 
