@@ -68,7 +68,7 @@ def plain(value: Any) -> Any:
 
 @dataclass_transform(frozen_default=True)
 def result(kind: type[T]) -> type[T]:
-    """Class decorator: frozen dataclass with a short repr (numbers, short texts, types of other fields)."""
+    """Class decorator: frozen dataclass whose repr shows numbers, short texts, and types of other fields."""
 
     def __repr__(self: Any) -> str:
         values = ((one.name, getattr(self, one.name)) for one in dataclasses.fields(self))

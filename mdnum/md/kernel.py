@@ -213,7 +213,7 @@ _SHAPES = ("broadcast_in_dim", "reshape", "squeeze", "copy", "stop_gradient")
 
 
 def _number(value: Any, kind: str = "VEC") -> str:
-    """Return a constant as LLVM text, for a vector with equal elements."""
+    """Return LLVM text of a constant vector in which all elements are equal."""
     if kind != "VEC":
         return f"ALL[{'i1' if kind == 'BOOL' else 'i64'} {int(value)}]"
     return f"ALL[double 0x{struct.unpack('>Q', struct.pack('>d', float(value)))[0]:016X}]"
@@ -386,7 +386,7 @@ def _written(
         each.append("br i1 %distant.WIDE, label %far.WIDE, label %near.WIDE")
 
     def body(program: Any, place: str, totals: int) -> list[str]:
-        """Write a function of a pair as a block of LLVM text; return the names of the updated sums."""
+        """Write the pair function as a block of LLVM text; return the names of the sums that it updates."""
         nonlocal lines
         before, lines = dict(made), []
         quotients.clear()

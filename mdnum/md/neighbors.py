@@ -133,7 +133,7 @@ class ListBuilder(Protocol):
 
 @dataclass(frozen=True)
 class HostBuilder:
-    """List builder with mdnum's own cell list, compiled by numba, on the host."""
+    """List builder that runs mdnum's own cell list on the host, compiled by numba."""
 
     name: str = "host"
 

@@ -203,7 +203,7 @@ class PairForce(eqx.Module):
         return terms
 
     def weights(self, tables: Tables) -> list[Float[Array, "atoms"]]:
-        """Per-atom weights of all weighted terms, in the order of the tables."""
+        """Per-atom weights of all weighted terms, with atoms in the order of the neighbor tables."""
         return [one[tables.order] for one in self.model.weights if one is not None]
 
     def in_blocks(
@@ -397,11 +397,11 @@ class Guarded(eqx.Module):
     how: Callable[..., Any] = eqx.field(static=True)
 
     def at_cutoff(self) -> AtCutoff:
-        """Return the constants of the potential at its cutoff, computed in modified arithmetic (`how`)."""
+        """Return the constants of the potential at its cutoff, with arithmetic modified by `how`."""
         return self.how(self.model.at_cutoff, self.zero)()
 
     def evaluate(self, r2, types, at: AtCutoff):
-        """Return energy and slope of the potential for pairs, computed in modified arithmetic (`how`)."""
+        """Return energy and slope of the potential for pairs, with arithmetic modified by `how`."""
         return self.how(self.model.evaluate, self.zero)(r2, types, at)
 
 

@@ -441,7 +441,7 @@ class Channels(eqx.Module):
 
     @classmethod
     def of_terms(cls, terms: Mapping[str, CutPotential], *, apart: bool = False) -> CutPotential | Channels:
-        """Combine terms given by name; terms with equal radii share a channel, unless `apart` is true.
+        """Combine terms given by name; terms with equal cutoff radii share a channel, unless `apart` is true.
 
         Raises:
             InputError: the name of a term cannot be used in a key of a system file.

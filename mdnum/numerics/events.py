@@ -129,7 +129,7 @@ class Ledger:
         return np.abs(self.margin) <= self.bound
 
     def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:
-        """Return the number of decisions that changed to yes, and to no, for each step from 0 to `steps`."""
+        """Return, for each step from 0 to `steps`, how many decisions changed to yes and how many to no."""
         entered = np.bincount(self.step[self.entered], minlength=steps + 1)
         left = np.bincount(self.step[~self.entered], minlength=steps + 1)
         return entered, left

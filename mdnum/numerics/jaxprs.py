@@ -42,7 +42,7 @@ def narrows(closed: Any) -> bool:
 
 
 def held_numbers(closed: Any, least: int = 10) -> int:
-    """Count the entries of large constant arrays in a jaxpr, such as weights that a function closed over."""
+    """Count the entries of large constant arrays in a jaxpr, such as model weights captured by a function."""
     consts = [one for program in _programs(closed) for one in getattr(program, "consts", ())]
     return sum({id(one): one.size for one in consts if is_inexact(one) and one.size >= least}.values())
 

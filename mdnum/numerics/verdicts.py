@@ -541,7 +541,7 @@ def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -
 
 
 def shares(cells: tuple[SplitCell, ...], rate: float) -> tuple[Share, ...]:
-    """Return how much decisions and arithmetic contribute to a split, in comparison with run A and run B.
+    """Return how much decisions and arithmetic contribute to a split, with run A and run B as references.
 
     Args:
         cells: result of `table`.

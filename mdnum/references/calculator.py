@@ -133,7 +133,7 @@ class MdnumCalculator(ClassicalCalculator):
         return None if self._evaluator is None else self._evaluator.simulation
 
     def set(self, **changes: Any) -> dict[str, Any]:
-        """Reject any change of parameters; create another calculator for another potential.
+        """Raise an error if a parameter is changed; for another potential, create another calculator.
 
         Raises:
             TypeError: a parameter was given.

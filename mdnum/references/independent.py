@@ -261,7 +261,7 @@ def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
 
 
 def _cosines(edges: Edges, e: ndarray, f: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Return cosines of the angles between edges e and f, and gradients with respect to d_e and d_f."""
+    """Return cosines of the angles between edges e and f, and their gradients with respect to d_e and d_f."""
     re, rf = edges.r[e], edges.r[f]
     ne, nf = edges.d[e] / re[:, None], edges.d[f] / rf[:, None]
     cosine = np.einsum("ta,ta->t", ne, nf)

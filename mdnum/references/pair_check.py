@@ -241,7 +241,7 @@ def check_pairs(
     searches: Sequence[Search] | None = None,
     effective: bool = True,
 ) -> PairsReport:
-    """Find pairs inside the cutoff by every neighbor search, and compare these with brute force.
+    """Find the pairs inside the cutoff with every neighbor search, and compare them with brute force.
 
     Each neighbor search is run once for each cutoff radius of the species pairs. Brute force uses the
     comparison (< or <=) of the system file, in rational arithmetic near the cutoff. If only decisions near
@@ -347,7 +347,7 @@ def effective_cutoff(
     """Find the largest distance (double) of two atoms that a neighbor search counts as inside r_cut.
 
     The two atoms differ only in x, and the first has x = 0: their distance is exactly the x coordinate of the
-    second atom. In a periodic box (5 r_cut wide), the result includes wrapping by the search.
+    second atom. In a periodic box (5 r_cut wide), the result also depends on how the search wraps atoms.
 
     Args:
         periodic: use a periodic box, as in a simulation; otherwise atoms without a box.

@@ -217,8 +217,8 @@ def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
     """Return the expected number of ambiguous flips (ratio up to 1) if margins are spread evenly near zero.
 
     Margins are spread evenly if atoms move freely through the cutoff distance. The density of margins is
-    taken from the lower quarter of the margins. If many more flips are ambiguous than expected, pairs stay
-    near the cutoff, for example because a neighbor shell of a crystal is at this distance.
+    estimated from the smallest quarter of the margins. If many more flips are ambiguous than expected, pairs
+    stay near the cutoff, for example because a neighbor shell of a crystal is at this distance.
     """
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) < 4:

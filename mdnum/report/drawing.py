@@ -218,7 +218,7 @@ def _coincide(one: Series, other: Series) -> bool:
 def _apart(
     marks: tuple[tuple[float, str], ...], base: float, limits: tuple[float, float]
 ) -> list[tuple[float, str]]:
-    """Return marked values with their labels; the labels of values that are too close are joined."""
+    """Return marked values with their labels; the labels of values that are too close together are joined."""
     kept: list[tuple[float, str]] = []
     near = 0.025 * abs(limits[1] - limits[0])
     for value, word in sorted((value - base, word) for value, word in marks):

@@ -31,7 +31,7 @@ _LINES = beside(__file__)  # parts of a script
 def script(
     tested: PairList, failed: Failed, how: Conventions, superset: bool = False, reach: float | None = None
 ) -> str:
-    """Return a script that calls the neighbor list for a failing test case and compares with brute force.
+    """Return a script that calls the neighbor list for a failing test case and checks it by brute force.
 
     The script requires only numpy and the neighbor list. The script prints the error and exits with status 1,
     or with 0 if the list is correct. Exceptions raised by the neighbor list are not caught by the script.

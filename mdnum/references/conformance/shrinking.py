@@ -32,7 +32,7 @@ Failures = Callable[[Case], Sequence[Failure]]
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
     """Return the smallest test case, among those tried before the deadline, that fails with the same code.
 
-    `failures` runs a test case on the neighbor list; an updatable list gets a new object.
+    `failures` runs a test case on the neighbor list; a new object is created for an updatable list.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)
