@@ -1,4 +1,4 @@
-"""Import the names of a package when they are first used (PEP 562)."""
+"""Deferred import: the names of a package are imported when they are first used (PEP 562)."""
 
 from __future__ import annotations
 
