@@ -14,7 +14,7 @@ if __name__ == "__main__" and not sys.flags.safe_path and sys.path[:1] == [os.ge
 def main() -> None:
     """Run the command line and exit.
 
-    Before results exist, and after they are saved, control-C ends the process at once, because an
+    Control-C ends the process immediately before results exist and after they are saved, because an
     interrupted import of a package fails in unpredictable ways.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):

@@ -17,7 +17,7 @@ from mdnum.vectors import lowest_bit
 
 @njit
 def _scan(before, rows, columns, row, slot, column, values):
-    """Record all bits that change from row to row, up to the buffer size; return the number of changes."""
+    """Record bits that differ in successive rows, up to the buffer size; return the number of changes."""
     at, room = 0, row.shape[0]
     for r in range(rows.shape[0]):
         # the eight slots that the scan is in, and the places of their bytes
@@ -43,7 +43,7 @@ def changes_in_time(
 ) -> tuple[
     Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]
 ]:
-    """Find all changes of decisions (packed bits, one row per time step) for one neighbor list.
+    """Find all decisions of a neighbor list that change in time, given packed bits with one row per step.
 
     Args:
         before: decisions before the first row.
@@ -92,7 +92,7 @@ def count_set(packed: UInt8[np.ndarray, "..."]) -> int:
 def digit_order(room, count, most):
     """Sort integer keys (0 <= key < `most`) by a stable radix sort, and return the sorting order.
 
-    The keys are in the first row of `room`, int64, shape (4, count or more); `room` is overwritten.
+    The keys are in the first row of `room`, an int64 array of shape (4, count or more) that is overwritten.
     """
     keys, numbers, other_keys, other_numbers = room[0], room[1], room[2], room[3]
     bits = 1

@@ -26,7 +26,7 @@ class TimeUp(Exception):
 class Deadline:
     """A deadline, after which a command does not start further work.
 
-    The evidence for a verdict is counted in function calls, not in time that depends on the machine. A
+    The amount of evidence for a verdict is counted in function calls, because time depends on the machine. A
     deadline can only reduce the number of function calls; the command then reports the reduced number.
 
     Args:
@@ -50,7 +50,7 @@ class Deadline:
         return max(0.0, self._end - time.monotonic())
 
     def part(self, share: float) -> Deadline:
-        """Return an earlier deadline, at which only a fraction of the remaining time has passed."""
+        """Return an earlier deadline, before which only a fraction of the remaining time passes."""
         sooner = Deadline()
         sooner._end = time.monotonic() + share * self.left
         return sooner
@@ -63,9 +63,9 @@ class Deadline:
 
 @contextmanager
 def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
-    """Raise `TimeUp` in the main thread if the block is still running `grace` seconds after the deadline.
+    """Raise `TimeUp` in the main thread if the `with` block still runs `grace` seconds after the deadline.
 
-    The exception is raised repeatedly, in case the block catches `TimeUp`. Compiled code is not interrupted.
+    `TimeUp` is raised repeatedly, because code in the block may catch it. Compiled code is not interrupted.
     """
     if math.isinf(deadline.left) or threading.current_thread() is not threading.main_thread():
         yield

@@ -5,8 +5,8 @@ faulty are also reported, but no version is assumed correct.
 
 Error bounds require that +, -, *, / and sqrt are each correctly rounded, and that sums are not reordered. On
 CPUs, XLA rounds correctly and does not reorder sums, but contracts a*b+c and rewrites divisions by constants.
-Contractions and rewritten divisions change the last bits of results. Therefore two builds of a program may
-disagree on whether a pair is inside the cutoff, if its distance from the cutoff is below the error bound.
+Contractions and rewritten divisions change the last bits of results. Two builds of a program may therefore
+decide differently on a pair whose distance differs from the cutoff by less than the error bound.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
 
 
 def _row(test: str, status: Status | bool, **values: Any) -> DoctorRow:
-    """Return the result of a test with a descriptive text; status True means "ok", False "unsafe"."""
+    """Return a test result with its text; the status may be True for "ok" and False for "unsafe"."""
     if not isinstance(status, str):
         status = "ok" if status else "unsafe"
     words = _WORDS[test]
@@ -236,7 +236,7 @@ def functions() -> DoctorRow:
 
 
 def reassociation() -> DoctorRow:
-    """Test that sums are not reordered: (x + c) - c is not simplified, and error-free sums remain exact."""
+    """Test that sums are not reordered: that (x + c) - c is not simplified and error-free sums are exact."""
     x, c = _numbers(5) * 1e-3, np.full(_COUNT, 1e3)
 
     def two_sum(a: Any, b: Any) -> tuple[Any, Any]:
@@ -274,8 +274,8 @@ def subnormals() -> DoctorRow:
     """Test whether numpy and jax keep numbers below 2.2e-308, or flush them to zero.
 
     XLA flushes subnormal numbers to zero on CPUs, and a loaded library can make the processor flush all
-    subnormal numbers. The test also uses arrays so large that XLA uses its own threads. Results are compared
-    as integers, because a processor that treats subnormals as zero considers them zero.
+    subnormal numbers. The test also uses arrays large enough for XLA to split the work among its own threads.
+    Results are compared as integers, because a processor that treats subnormals as zero considers them zero.
     """
 
     def power(exponent: int, count: int) -> np.ndarray:
@@ -346,9 +346,9 @@ def pair_energy(r2: jax.Array) -> jax.Array:
 def crystal() -> DoctorRow:
     """Compare distances and energy of a tilted crystal in jax (jitted and eager) with exact sums in numpy.
 
-    On CPUs, jax 0.10.2 compiles a vmapped matrix-vector product that is followed by a reduction incorrectly
-    (jax-ml/jax#39103), without a warning: one coordinate of every displacement in a tilted box is wrong. The
-    bug affects only arrays with more than 16,384 rows, so tests of smaller arrays pass.
+    On CPUs, jax 0.10.2 silently miscompiles a vmapped matrix-vector product that is followed by a reduction
+    (jax-ml/jax#39103). One coordinate of every displacement in a tilted box is then wrong. The bug affects
+    only arrays with more than 16,384 rows, so tests of smaller arrays pass.
     """
     cell, fractional, slots = tilted_crystal()
     used = slots[:, 0] < len(fractional)

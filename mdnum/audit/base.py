@@ -1,4 +1,4 @@
-"""Base classes shared by the calculator checks: limits on calls and time, findings, results, `AuditCheck`."""
+"""Base classes of calculator checks: `AuditCheck`, results, findings, limits on calculator calls and time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def idle(done: int, total: int, info: dict[str, Any]) -> None:
 
 
 class CallsUp(TimeUp):
-    """Raised when a check has made all calculator calls allowed to it; the check then ends unfinished."""
+    """Raised when a check has reached its limit on calculator calls; the check then ends unfinished."""
 
     why = "the calls of this check were used up"
 
@@ -57,8 +57,8 @@ class CalculatorError(MdnumError):
 class Meter:
     """Counts the calls to a calculator, and enforces limits on the number of calls and on the elapsed time.
 
-    Checks are limited by a number of calculator calls, so that results do not depend on the load of the
-    machine; only a deadline ends a check earlier.
+    The number of calculator calls of each check is limited, so that results do not depend on the load of the
+    machine. Only a deadline ends a check earlier.
     """
 
     calls: int = 0
@@ -79,7 +79,7 @@ class Meter:
 
     @property
     def up(self) -> type[TimeUp] | None:
-        """The exception class for an exceeded limit on calls or time; None if no limit is exceeded."""
+        """Exception class for a limit on calls or time that has been reached; None if no limit is reached."""
         return TimeUp if self.deadline.passed else CallsUp if self.calls >= self.most else None
 
     @contextmanager
@@ -106,7 +106,7 @@ class Meter:
 
 @dataclass(frozen=True)
 class Observed:
-    """One finding of a check: a code, and the values inserted into this code's text in audit.toml."""
+    """One finding of a check: a code, and the values that are inserted into the text for this code."""
 
     code: str  # short stable name
     severity: Severity  # info (nothing to do), warning (look at it), error (the numbers are wrong)
@@ -118,7 +118,7 @@ class Observed:
 def finding(
     code: str, severity: Severity, *variants: str | None, tests: Collection[str] = (), **values: Any
 ) -> Observed:
-    """Return a finding with the given text variants; variants that are None are left out.
+    """Return a finding whose text consists of the named variants; a variant that is None is ignored.
 
     Args:
         tests: names (keys of `causes.TESTS`) of the tests that were made and that leave this cause possible.
@@ -171,9 +171,9 @@ class CheckResult:
 class AuditCheck:
     """Base class of calculator checks; each subclass is one check, in `mdnum.audit.checks` or in a plugin.
 
-    A subclass defines a name, a title, a one-line docstring and `ask`. The texts of a check's findings are in
-    mdnum/verbs/audit.toml, under the codes of the findings. To add a check, add the file `checks/NAME.py`
-    with the class `NameCheck`.
+    A subclass defines a name, a title, a one-line docstring and the method `ask`. The texts of a check's
+    findings are in mdnum/verbs/audit.toml, under the codes of the findings. To add a check, add the file
+    `checks/NAME.py` with the class `NameCheck`.
 
     Args:
         timestep: time step of a run, internal time; None for a fraction of the fastest vibration's period.
@@ -226,7 +226,7 @@ class AuditCheck:
 
 
 def _above_limits(result: CheckResult) -> Iterator[Observed]:
-    """Yield a finding for each number that exceeds its limit, unless the check has already reported it."""
+    """Yield a finding for each number of a result that exceeds its limit, unless the check reported it."""
     codes = {one.code for one in result.findings}
     for name, (limit, reports) in result.limits.items():
         value = result.numbers.get(name)
@@ -263,7 +263,7 @@ class Ways:
         tolerant: bool = False,
         most: int | None = None,
     ) -> dict[int, T]:
-        """Call `ask` for each item and return results by item index; items after the deadline are skipped.
+        """Call the function `ask` for each item until the deadline; return the results by item index.
 
         Args:
             subject: calculator whose limits on calls and time apply.

@@ -50,12 +50,12 @@ _SAME = 1e-9  # of the energy: a second element that changes it by less is none 
 def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None) -> Atoms:
     """Return a test structure for a calculator: the calculator's own structure, a crystal, or rigid water.
 
-    The crystal consists of an element for which the calculator is intended; if the calculator distinguishes a
-    second element, half of the atoms are of the second element. The lattice constant is the one at which the
-    calculator's energy is lowest. The crystal is repeated until the cell is two cutoffs wide (at most 500
-    atoms, fewer for a slow calculator), and its atoms are displaced slightly. `info["origin"]` describes the
-    structure. If the calculator fails on atoms without neighbors, a denser crystal is built; the failure is
-    reported later.
+    The crystal consists of an element for which the calculator is intended. If the calculator distinguishes
+    this element from a second one, half of the atoms are of the second element. The lattice constant is the
+    one at which the calculator's energy is lowest. The crystal is repeated until the cell is two cutoffs wide
+    (at most 500 atoms, fewer for a slow calculator), and its atoms are displaced slightly. `info["origin"]`
+    of the returned structure describes how the structure was built. If the calculator fails on atoms without
+    neighbors, a denser crystal is built; the failure is reported later.
 
     Args:
         deadline: time limit for building; at the deadline, or after `BUILDING_CALLS` calls, the best
@@ -83,7 +83,7 @@ def _labeled(atoms: Atoms, origin: str) -> Atoms:
 
 
 class _Builder:
-    """Builds a test structure for a calculator, and keeps the best structure evaluated so far."""
+    """Builds a test structure for a calculator, and keeps the best structure that it has built so far."""
 
     def __init__(self, loaded: LoadedCalculator, meter: Meter):
         self.name, self.calculator, self.meter = loaded.name, loaded.make(), meter
@@ -131,7 +131,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return the crystal of the first supported element; if `paired`, test a pair of its atoms first."""
+        """Return the crystal of the first supported element; if `paired`, test two atoms of each element."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():
@@ -141,7 +141,7 @@ class _Builder:
         return None
 
     def _mixed(self, made: Atoms) -> Atoms:
-        """Add a second element to a crystal if the calculator distinguishes two, and return the crystal."""
+        """Return the crystal, with a second element added if the calculator distinguishes two elements."""
         from ase.data import atomic_numbers
 
         self.best, symbol = made, str(made.symbols[0])
@@ -207,7 +207,7 @@ def meant_for(calculator: Any, words: str) -> list[str]:
 
 
 def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]:
-    """Yield element symbols in a value or its attributes; use dictionary keys only if all are symbols."""
+    """Yield the chemical symbols in a value or its attributes; use dictionary keys if all are symbols."""
     from ase.data import chemical_symbols
 
     value = value.tolist() if hasattr(value, "tolist") else value
@@ -229,7 +229,7 @@ def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]
 
 
 def water(edge: int = 4) -> Atoms:
-    """Return rigid water molecules on a cubic grid, in fixed random orientations; atom order O, H, H."""
+    """Return rigid water molecules on a cubic grid, in fixed random orientations, with atom order O, H, H."""
     from ase.calculators.tip3p import angleHOH, rOH
     from scipy.spatial.transform import Rotation
 
@@ -243,7 +243,7 @@ def water(edge: int = 4) -> Atoms:
 
 
 def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Return the processor time of an energy and force calculation, the smaller of two measurements, s.
+    """Return the smaller of two measured processor times (s) of an energy and force calculation.
 
     This time includes the time of the calculator's child processes. The time of other programs is not
     included, so that the chosen structure does not depend on the load of the machine.
@@ -264,7 +264,7 @@ def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """Estimate the cutoff of a pair interaction and the distance of lowest energy; None if there is none.
+    """Estimate the cutoff and the distance of lowest energy of a pair interaction; each may be None.
 
     If the calculator fails on atoms without neighbors, the cutoff is the distance at which it begins to fail.
     """
@@ -299,7 +299,7 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
 
 
 def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
-    """Return whether the atoms interact: a force is not zero, or displacing the atoms changes the energy."""
+    """Return whether the atoms interact: some force is nonzero, or displacing atoms changes the energy."""
     (energy, forces), moved = subject.both(atoms), atoms.copy()
     moved.rattle(_RATTLE * nearest_distance(atoms), seed=1)
     other = subject.try_both(moved)
@@ -310,7 +310,7 @@ def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
 def _grown(
     subject: CalculatorSubject, cell: Atoms, kind: str, scale: float, relaxed: bool, cutoff: float | None
 ) -> Atoms | None:
-    """Return the largest crystal, up to two cutoffs wide, that is evaluated fast enough, or None."""
+    """Return the largest crystal, up to two cutoffs wide, that is evaluated fast enough; None if all fail."""
     at = "at the calculator's own least energy" if relaxed else _tabulated(scale)
     if cutoff and scale * _least_distance(cell) > _BARELY * cutoff:
         # nothing holds it together: a crystal in which nothing is felt would tell nothing
@@ -350,7 +350,7 @@ def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, r
 
 
 def _unit_cell(symbol: str, *others: str) -> tuple[Atoms, str]:
-    """Return a rectangular fcc, bcc or diamond unit cell of an element; fcc for other crystal structures.
+    """Return a rectangular fcc, bcc or diamond unit cell; an element with another structure is built as fcc.
 
     If a second element is given, half of the atoms are of this element.
     """
@@ -376,7 +376,7 @@ def _least_distance(cell: Atoms) -> float:
 def _least_energy(
     subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
 ) -> tuple[float, bool]:
-    """Find the lattice scale factor of minimum energy, starting at `start`, and whether a minimum exists."""
+    """Return the lattice scale factor of lowest energy, found from `start`, and whether a minimum exists."""
 
     def energy(scale: float) -> float:
         try:

@@ -42,16 +42,16 @@ _SEVERITIES = ("info", "warning", "error")
 
 
 def cause(code: str) -> Cause:
-    """Return the row of the cause table for a finding code; an empty row for codes of other packages."""
+    """Return the row of the cause table for a finding code; codes of other packages have an empty row."""
     return CAUSES.get(code, Cause())
 
 
 def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
-    """Return, for each finding, the index of the finding that explains it; its own index if there is none.
+    """For each finding, return the index of the finding that explains it, or its own index if none does.
 
-    A finding is listed under the finding that causes it, if this one is at least as severe (of several
-    causes, under the deepest), or under the first finding with the same code. A common cause of several
-    findings is likely but not proven: correct the finding listed first, and repeat the audit.
+    A finding is listed under its cause if the cause is at least as severe (of several causes, under the
+    deepest), and otherwise under the first finding with the same code. A common cause of several findings is
+    likely but not proven. Correct the finding that is listed first, and then repeat the audit.
 
     Args:
         findings: code and severity of each finding, in the order in which the findings were made.

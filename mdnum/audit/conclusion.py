@@ -65,7 +65,7 @@ def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
 
 
 def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
-    """Return those variants of findings' texts that depend on the results of more than one check.
+    """Return, for findings whose text depends on the results of several checks, the variant of the text.
 
     Incorrect forces that do no work around closed loops are the gradient of another energy; forces that do
     work around closed loops are not the gradient of any energy.

@@ -81,7 +81,7 @@ def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
 
 
 def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
-    """Estimate rounding noise of energy and force (columns), just below `low` and just above `high` (rows).
+    """Estimate the noise of energy and force (two columns) just below `low` and just above `high` (two rows).
 
     Several spacings are tried and the largest estimate is used: float32 values at close points can be equal.
     """
@@ -99,7 +99,7 @@ def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndar
 
 
 def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> tuple[float, float]:
-    """Return the one-sided derivative dF/dx of the force at `start`, and its error, for the best spacing."""
+    """Return the one-sided derivative dF/dx at `start`, and its error, for the spacing of smallest error."""
     best = (0.0, np.inf)
     for relative in _WIDTHS:
         width = max(abs(start), 1.0) * relative
@@ -159,12 +159,12 @@ def find_jumps(
     expected: Sequence[float] = (),
     calls: float = np.inf,
 ) -> tuple[list[Jump], int]:
-    """Find jumps of the energy or of its first three derivatives that exceed the scatter of a scan.
+    """Find jumps of the energy or of its first three derivatives that exceed the noise of a scan.
 
-    The smallest detectable jump depends on the curvature of the curve; for jumps of the force,
-    `smallest_steps` returns it. At a spacing of 0.025 Å, 199 of 200 force jumps of 1e-6 eV/Å at random
-    distances in five potentials are found, and all larger jumps. The smallest energy jumps found are 3e-6 eV
-    on a repulsive wall of ε = 1 eV, and 1e-8 eV on a soft wall.
+    The smallest detectable jump depends on the curvature of the curve. The function `smallest_steps` returns
+    the smallest detectable jump of the force. At a spacing of 0.025 Å, the scan finds 199 of 200 force jumps
+    of 1e-6 eV/Å at random distances in five potentials, and all larger jumps. The smallest energy jumps found
+    are 3e-6 eV on a repulsive wall of ε = 1 eV, and 1e-8 eV on a soft wall.
 
     Args:
         curve: energy and force, which must be defined slightly beyond both ends.
@@ -200,10 +200,10 @@ def find_jumps(
 
 
 def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
-    """Measure the jumps between `low` and `high`, and bound the jumps that a smooth curve would show.
+    """Measure the jumps between `low` and `high`, and estimate the apparent jumps of a smooth curve.
 
-    Energy and force on either side are medians of values at the four nearest coordinates, which excludes
-    single rounding errors. The curvature is computed from one-sided differences of the force.
+    Energy and force on either side are medians over the four nearest coordinates, so that a single rounding
+    error has no effect. The curvature is computed from one-sided differences of the force.
 
     Args:
         room: length, on either side, within which the curve may be evaluated.
@@ -231,7 +231,7 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
-    """Return the power law by which the force vanishes at the end of its range; None if no law is clear.
+    """Return the exponent with which the force vanishes at the end of its range; None if it is unclear.
 
     Args:
         edge: end of the interaction, approached from smaller distances; no other threshold is within `room`.
@@ -270,7 +270,7 @@ def smallest_steps(
 def _outliers(
     curve: Curve, places: Float[np.ndarray, "points"]
 ) -> tuple[list[tuple[float, float, float]], Float[np.ndarray, "intervals"]]:
-    """Return intervals in which predictions from left and right differ unusually, and detection limits.
+    """Return intervals in which predictions from both sides disagree, and smallest detectable force steps.
 
     Returns:
         (relative difference, left, right) of each outlier, the largest first; and the smallest detectable
@@ -303,11 +303,11 @@ def _outliers(
 
 
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
-    """Mismatch, for each interval, of the energy, of the force, and of energy change plus work of the force.
+    """Return three mismatches for each interval: of the energy, of the force, and of energy change and work.
 
-    The mismatches of energy and force are |prediction from the left minus prediction from the right| at the
-    midpoint. The mismatch of energy change and work falls with the fifth power of the spacing if the curve is
-    smooth, and is much more sensitive to a jump of the energy alone.
+    The mismatch of energy or force is the absolute difference at the midpoint between the predictions from
+    left and right. The mismatch of energy change and work falls with the fifth power of the spacing if the
+    curve is smooth, and is the most sensitive of the three to jumps of the energy alone.
     """
     values = curve.many(places)
     windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
@@ -319,7 +319,7 @@ def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.nda
 
 
 def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
-    """Find the jumps between left and right; jumps of energy or force are located to adjacent doubles."""
+    """Find the jumps between `left` and `right`; locate jumps of energy or force to two adjacent doubles."""
     room = right - left
     left, right = left - 1.5 * room, right + 1.5 * room
     noise = np.maximum(scatter(curve, left, right, room).max(axis=0), 1e-300)
@@ -374,7 +374,7 @@ def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, fl
 
 
 def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float], float]:
-    """Return a function that is constant except for jumps: force minus a line, or energy minus the work."""
+    """Return a function that is constant except for jumps: force minus a line, or energy plus the work."""
     if row == 1:
         back = left - (right - left)
         slope_before = (curve(left)[1] - curve(back)[1]) / (left - back)
@@ -396,7 +396,7 @@ def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
 
 
 def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int) -> np.ndarray:
-    """Difference of the polynomials fitted to the force at seven points above and seven below a point."""
+    """Difference between polynomials fitted to the force at seven points above and seven below `middle`."""
     steps = reach + width * np.arange(7)
     before = np.polyfit(-steps, curve.many(middle - steps)[1], degree)
     return np.polyfit(steps, curve.many(middle + steps)[1], degree) - before
@@ -405,7 +405,7 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """Locate a jump of the energy's third derivative, using the force's second derivative on both sides.
 
-    Of several fit widths, the one is used at which halving the width changes the result least.
+    The fit uses the one of several widths at which halving the width changes the result least.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

@@ -3,8 +3,8 @@
 If the force is minus the gradient of the energy, a step's energy change plus the work of the forces along the
 straight line is zero for every integrator. If an energy change at a distance threshold is not explained by
 the work of the forces, it is the energy jump of a flip. An unexplained change at another single point is due
-to a limit on the number of neighbors or a selection of nearest neighbors. A distributed unexplained change
-means that the force is not minus the gradient of the energy.
+to a limit on the number of neighbors or a selection of nearest neighbors. An unexplained change that is
+spread over many points means that the force is not minus the gradient of the energy.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class RunCrossing:
 
     @property
     def sign(self) -> float:
-        """1 if the pair distance falls below the threshold at this crossing, -1 if it rises above it."""
+        """Crossing direction: 1 if the pair distance falls below the threshold, -1 if it rises above it."""
         return 1.0 if self.entered else -1.0
 
 
@@ -128,7 +128,7 @@ def _furthest(moved: Float[np.ndarray, "atoms 3"]) -> float:
 
 
 def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
-    """Return the fraction s in [0, 1] at which |start + s way|² equals `square`."""
+    """Return the fraction s in [0, 1] at which the vector start + s way has the squared length `square`."""
     a, b, c = float(way @ way), 2 * float(start @ way), float(start @ start) - square
     inside = b * b - 4 * a * c
     if a == 0 or inside < 0:
@@ -140,7 +140,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy and force along the line between two steps; if `ends`, end values are those of the run."""
+    """Energy and force on the line between two time steps; if `ends`, the ends have the values of the run."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:
@@ -156,7 +156,7 @@ def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = 
 def account(
     subject: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], smooth: int = 2
 ) -> tuple[list[float], float]:
-    """Compute the work of the forces along the straight line of a step, piecewise between crossings.
+    """Compute the work of forces along a time step's straight line, in pieces between threshold crossings.
 
     Args:
         subject: a calculator object separate from the run's; called three times per crossing, plus once.
@@ -210,7 +210,7 @@ class HiddenJump:
 
 @dataclass(frozen=True)
 class HiddenJumps:
-    """Energy jumps found in time steps with an energy change that nothing else explains."""
+    """Energy jumps found in those time steps whose energy change has no other explanation."""
 
     jumps: tuple[HiddenJump, ...] = ()  # found in the steps that were searched
     steps: Mapping[int, float] = field(default_factory=dict)  # those, with what they left unexplained, eV
@@ -228,7 +228,7 @@ class HiddenJumps:
         return sum(jump.energy for jump in self.jumps if jump.step == step)
 
     def energies(self, rest: Steps) -> Steps:
-        """Energy change (eV) due to hidden jumps at each step; at unsearched steps, `share` is used."""
+        """Energy change (eV) per step due to hidden jumps; estimated with `share` at steps not searched."""
         found = np.zeros(len(rest))
         for step in self.candidates:
             found[step] = self.brought(step) if step in self.steps else self.share * rest[step]
@@ -320,7 +320,7 @@ class EnergyBalance:
 
     @property
     def filled(self) -> Steps:
-        """Energy change (eV) at each step that jumps do not explain; for unmeasured steps, the mean."""
+        """Energy change (eV) of each step that jumps do not explain; unmeasured steps have the mean value."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 
@@ -333,7 +333,7 @@ class EnergyBalance:
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
 
     def by_means(self, crossed: Sequence[RunCrossing], steps: int) -> Steps:
-        """From this run's mean jumps, estimate the energy change (eV) due to another run's flips by step."""
+        """Estimate the energy change (eV) per step due to another run's flips from mean jumps of this run."""
         jumps, means = np.zeros(steps), self.means
         for one in crossed:
             jumps[one.step] += one.sign * means.get(one.threshold, 0.0)
@@ -415,7 +415,7 @@ def drift(time: Steps, values: Steps) -> Drift:
     """Return the slope of a straight line fitted to block averages, with its standard error.
 
     Values at neighboring time steps are correlated. Blocks are longer than the correlation time, so that
-    averages of different blocks are independent if the run is long enough. At least 16 values are required.
+    averages of different blocks are independent if the run is long enough. The fit needs at least 16 values.
     """
     blocks = np.array_split(np.arange(len(values)), _BLOCKS)
     x, y = ([float(row[block].mean()) for block in blocks] for row in (time, values))

@@ -1,7 +1,7 @@
-"""Check with computed values how smooth a user's pair function is between close contact and the cutoff.
+"""Check numerically how smooth a user's pair function is between close contact and the cutoff.
 
-A run records the flips at the cutoff. If a pair function itself has a discontinuity, for example where two
-pieces do not join, a run records no flip there, and no derivative of the run includes the discontinuity.
+A run records the flips at the cutoff. If a pair function itself is discontinuous, for example where two
+pieces do not join, the run records no flip there. Derivatives of the run do not include this discontinuity.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _ORDERS = ("energy", "force", "curvature", "third derivative")
 
 
 def examined(simulation: Simulation) -> dict[str, Any] | None:
-    """Find the discontinuities of a user's pair functions from the closest initial pair to the cutoff.
+    """Find discontinuities of a user's pair functions, from the smallest initial distance to the cutoff.
 
     Returns:
         None if all potentials belong to mdnum, else plain values: `from` and `to`, length; `smoothness`, the
@@ -97,7 +97,7 @@ def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
 
 
 def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
-    """Return a function for the energy with cutoff and its first derivatives just inside given distances."""
+    """Return a function that computes the cut energy and its first derivatives just below given distances."""
 
     @jax.jit
     def evaluate(own, r_cut, r_onset, r):
@@ -172,7 +172,7 @@ def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float
 
 
 def _share(four: np.ndarray, width: float) -> np.ndarray:
-    """Relative difference of energy change and work of the force; cubics are fitted to four points."""
+    """Relative difference between the energy change and the force's work, from cubics through four points."""
     u, f = np.moveaxis(four, -1, 1)
     with np.errstate(invalid="ignore"):
         change, work = u[2] - u[1], (13 * (f[1] + f[2]) - f[0] - f[3]) * width / 24
@@ -180,7 +180,7 @@ def _share(four: np.ndarray, width: float) -> np.ndarray:
 
 
 def _poles(curve: Curve, grid: np.ndarray, force: np.ndarray) -> list[float]:
-    """Return distances at which the force diverges: it grows each time the point spacing is reduced."""
+    """Return distances at which the force diverges, that is, grows each time the point spacing is reduced."""
     inner = force[1:-1]
     peaks = 1 + np.flatnonzero((inner >= force[:-2]) & (inner >= force[2:]) & (inner > 0))
     found, usual = [], np.median(force[np.isfinite(force)])

@@ -68,7 +68,7 @@ class NoiseFloor:
     freedom: float = math.inf  # independent values that the standard deviations were estimated from
 
     def louder(self, other: NoiseFloor) -> NoiseFloor:
-        """For each quantity, return the larger of two noise levels and the smaller degrees of freedom."""
+        """Return the larger noise of each quantity, with the smaller of two numbers of degrees of freedom."""
         return NoiseFloor(
             max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical),
             min(self.freedom, other.freedom),
@@ -130,7 +130,7 @@ class Staircase:
 def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     """Detect discrete steps in energies and forces: values that stay constant to the last bit, then change.
 
-    In single or double precision, every smooth energy or force changes within a move of 1e-4 Å. Points at
+    If an atom moves by 1e-4 Å, every smooth energy or force changes, even in single precision. Points at
     which energy and forces are identical to those of the previous point are ignored: they may be cached.
     """
     key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
@@ -195,7 +195,7 @@ def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "c
 def order_change(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, rng: np.random.Generator
 ) -> tuple[float, NoiseFloor]:
-    """Largest energy change (eV) when the atoms are reordered, and the noise level if rounding explains it.
+    """Return the largest energy change (eV) when atoms are reordered, and the noise if rounding explains it.
 
     The noise level is 0 if rounding does not explain the energy change, or if no change exceeds the noise
     measured along a line. While atoms move along a line, the rounding error of a sum varies randomly, but an
@@ -365,7 +365,7 @@ class Digits:
         return 0.0 if self.decimals is None else 10.0**-self.decimals
 
     def grain(self, values: np.ndarray) -> float:
-        """Return the spacing between numbers with the given digits, at the largest of some values."""
+        """Return the spacing of the rounded numbers at the largest absolute value of the given values."""
         return max(self.quantum, 2.0**-self.bits * largest(values))
 
     @property
@@ -375,7 +375,7 @@ class Digits:
 
 
 def digits(values: np.ndarray) -> Digits:
-    """Return the decimal places and bits used by values; full precision if few values are distinct."""
+    """Return the decimal places and bits that values use; full precision for too few distinct values."""
     found = np.unique(np.asarray(values, dtype=np.float64))
     found = found[np.isfinite(found) & (found != 0.0)]
     if len(found) < _FEWEST:

@@ -1,4 +1,4 @@
-"""Detect errors that occur at certain indices in the list of atoms, such as the last or every eighth."""
+"""Detect errors at certain indices in the list of atoms, such as at the last atom or at every eighth atom."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class WrongPlaces:
 
 
 def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) -> WrongPlaces | None:
-    """Find atom indices with wrong results by exchanging atoms of the same species between two indices.
+    """Find atom indices at which results are wrong, by exchanging atoms of one species between two indices.
 
     Exchanging two atoms of the same species between two correct indices changes nothing. An error tied to an
     index appears at this index for any order of the atoms. An error that depends on the whole order of atoms,

@@ -21,7 +21,7 @@ _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked abou
 
 
 class SequenceStep(NamedTuple):
-    """A structure in a sequence, its difference from the previous one, and whether its energy is compared."""
+    """A structure of a sequence, its change from the previous structure, and whether results are compared."""
 
     what: str
     atoms: Atoms
@@ -67,7 +67,7 @@ def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]
 
 
 def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures in which all atoms drift in different directions, by more than a skin in total."""
+    """Yield structures whose atoms drift in different directions, in total more than a neighbor-list skin."""
     heading = rng.standard_normal((len(atoms), 3))
     heading /= np.linalg.norm(heading, axis=1)[:, None]
     yield "the structure", atoms

@@ -24,7 +24,7 @@ _NEAREST = 0.3  # distances are walked from the first
 
 
 def read_structure(words: str | Path) -> Atoms:
-    """Read a structure with ASE; `file@5` is the sixth structure of a file, `file` is the last.
+    """Read a structure with ASE; `file@5` selects the sixth structure of a file, and `file` the last one.
 
     The text after @ is passed to ASE and must select exactly one structure: an index (negative indices count
     from the end) or a database selection (`file.db@id=3`).
@@ -103,7 +103,7 @@ class Pair:
         return atoms
 
     def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
-        """Return the distances between atoms of the two particles, except that of the reference atoms."""
+        """Return the distances between atoms of the two particles, except between the two reference atoms."""
         moved = self.second.positions[None] + [distance, 0.0, 0.0]
         return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
 
@@ -118,7 +118,7 @@ class Pair:
 
 
 def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[Skipped]]:
-    """Return a pair of particles for every two species that the calculator supports, most frequent first.
+    """Return a pair of particles for every two supported species, in descending order of frequency.
 
     A pair consists of single atoms if the calculator supports single atoms at the smallest distance in the
     structure. If single atoms fail, each gets two companion atoms, since a bond-order potential may divide by
@@ -160,7 +160,7 @@ def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
 
 
 def exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
-    """Return (atom, k) for each atom with k-th and (k+1)-th nearest neighbors that have swapped."""
+    """Return (atom, k) for each atom whose k-th and (k+1)-th nearest neighbors have swapped order."""
     orders = []
     for atoms in (before, after):
         distances = atoms.get_all_distances(mic=bool(atoms.pbc.any()))
@@ -231,7 +231,7 @@ def _molecules(subject: CalculatorSubject) -> list[Pair]:
 def _answered(
     subject: CalculatorSubject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
 ) -> tuple[Pair | None, str]:
-    """Return the pair in the simplest cell that the calculator supports, or None and a reason."""
+    """Return the pair in the simplest cell that the calculator supports, or None and the error message."""
     why = ""
     for cell, periodic in _SURROUNDINGS:
         name = "-".join(part.get_chemical_formula() for part in (first, second))
@@ -246,7 +246,7 @@ def _answered(
 
 
 def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
-    """Return the distances of a scan at which the calculator does not fail, and the largest of these."""
+    """Return the scan distances at which the calculator does not fail, and the largest of these distances."""
     places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
     first = len(places)
     for k in range(len(places) - 1, -1, -1):

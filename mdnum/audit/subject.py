@@ -62,7 +62,7 @@ class Repeats:
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
-        """Record the first energy or force from a new calculator object; `which` is the object's number."""
+        """Compare the first energy or force of new calculator object number `which` with an earlier one's."""
         before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
@@ -70,7 +70,7 @@ class Repeats:
             setattr(self.new, what, max(abs(value - before), getattr(self.new, what)))
 
     def findings(self, kT: float) -> list[Observed]:
-        """Return a finding if repeated evaluations of one structure differ by more than rounding."""
+        """Return a finding if repeated evaluations of one structure differ by more than rounding errors."""
         for seen, who in ((self.chance, "same"), (self.new, "new")):
             if seen.differ:
                 told = not_repeatable(
@@ -83,7 +83,7 @@ class Repeats:
 
 
 def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) -> bool:
-    """Return whether a change of the energy (eV) or of a force component (eV/Å) is too large for rounding."""
+    """Return whether an energy change (eV) or force change (eV/Å) is too large to be a rounding error."""
     energy, forces = answer
     return change > max(_LARGE_ENERGY * kT, _LARGE_SHARE * abs(energy)) or (
         forces is not None and force > _LARGE * rms(forces)
@@ -99,7 +99,7 @@ def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
 def not_repeatable(
     how: str, energy: float, force: float, typical: float, kT: float, **values: Any
 ) -> Observed:
-    """Report that two evaluations of one structure differ: as an error, if by more than rounding.
+    """Report that two evaluations of one structure differ, as an error if the cause cannot be rounding.
 
     Args:
         how: how the difference was discovered, as the name of a text variant.
@@ -127,11 +127,11 @@ class LoadedCalculator:
 class CalculatorSubject:
     """An ASE calculator and the structure for which it is audited.
 
-    ASE returns its cached energy if no coordinate moved by more than 1e-15 Å, although such a move changes
-    bits near the origin; so the cache is cleared if any bit differs. If no bit differs, the cache is used, so
-    energy and forces require only one calculation; `forget` forces another calculation. The calculator is
-    attached to the atoms, as in a run, since some calculators require this. An evaluation may raise a
-    `CalculatorError`: the calculator raised an exception or returned nan. The structure is then saved.
+    ASE returns its cached energy if no coordinate moved by more than 1e-15 Å. A coordinate near zero changes
+    by such a move, so this class clears the cache if any bit differs. If no bit differs, cached energies and
+    forces are used; the method `forget` forces another calculation. The calculator is attached to the atoms,
+    as in a run, since some calculators require this. An evaluation may raise a `CalculatorError`: the
+    calculator raised an exception or returned nan. The structure is then saved.
 
     Args:
         name: the calculator as the user named it.
@@ -223,7 +223,7 @@ class CalculatorSubject:
         return energy, other
 
     def forces(self, atoms: Atoms) -> Forces:
-        """Return the forces in eV/Å; an array of the wrong shape also raises an error."""
+        """Return the forces (eV/Å); raise an error if the calculator fails or the array shape is wrong."""
         asked = self._ask(atoms)
         forces = np.array(self._answer(asked.get_forces, asked, "forces"), dtype=np.float64)
         if forces.shape != (len(asked), 3):

@@ -190,7 +190,7 @@ def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
 
 
 def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
-    """Return a cluster of the groups of atoms nearest to the first group, in the box of a pair."""
+    """Return the groups of atoms nearest to the first group as a cluster, in the same cell as `pair`."""
     center = _lead(atoms, groups[0])
     offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
@@ -237,7 +237,7 @@ def _targeted(
 
 
 def _at_crossing(subject: CalculatorSubject, route: Route, crossing: RouteCrossing) -> Event:
-    """Measure the jump at a known threshold; a jump of energy or force is located to adjacent doubles."""
+    """Measure the jump at a known threshold; locate a jump of energy or force to two adjacent doubles."""
     curve, side = route.curve(subject), max(_SIDE, 3 * crossing.threshold.located)
     # what is smooth for two may jump among others: the lowest derivative that does, whatever the threshold
     for row in range(2):
@@ -263,7 +263,7 @@ def _event(
 def _scanned(
     subject: CalculatorSubject, thresholds: Sequence[PairThreshold], route: Route, low: float, high: float
 ) -> list[Event]:
-    """Search a route for thresholds that are not known from pairs."""
+    """Search a route for thresholds that the scans of atom pairs did not find."""
     curve = route.curve(subject)
     crossings = route.crossings(thresholds, low - 1.0, high + 1.0)
     inside = sum(low <= one.at <= high for one in crossings)
@@ -422,8 +422,8 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     def change(place: float, without: int | None = None) -> tuple[float, Float[np.ndarray, "atoms"]]:
         """Return the jumps of energy and forces as an atom moves from `place - side` to `place + side`.
 
-        (|energy change plus work of the force|, for each atom |change of the force on it minus the mean
-        change over the adjacent intervals of the same length|).
+        The first value is |energy change plus work of the force|. The second value is, for each atom, |change
+        of its force minus the mean change over the adjacent intervals of the same length|.
         """
         first, before = subject.both(walker(place - side, without))
         second, after = subject.both(walker(place + side, without))
@@ -468,7 +468,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
 
 
 def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int) -> CrowdOrder:
-    """Find the number of neighbors above which the order of atoms matters, and the size of the effect."""
+    """Find the number of neighbors above which reordering the atoms changes the results, and the change."""
     low, high, changed = 1, None, (0.0, 0.0)
     larger = iter([*(count for count in (4, 16, 64) if count < most), most])
     while count := next(larger, None) if high is None else (low + high) // 2 * (high - low > 1):

@@ -247,10 +247,10 @@ def _seen(
     rounding: float,
     known: Sequence[float],
 ) -> tuple[float, float, float, float] | None:
-    """Return (first distance, last distance, median and largest of the detectable force steps).
+    """Return first and last distance, and the median and maximum of the smallest detectable force steps.
 
-    Distances close to a known threshold (which would hide another threshold), or beyond the end of the
-    interaction, are not counted.
+    Distances beyond the end of the interaction are not counted, nor distances close to a known threshold,
+    which would hide another threshold.
     """
     felt = places < end
     for radius in known:
@@ -264,7 +264,7 @@ def _seen(
 
 
 def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThreshold | None:
-    """Return a threshold if its jump exceeds rounding; the end of an interaction is always kept."""
+    """Return a threshold if its jump exceeds rounding errors; always return the end of an interaction."""
     large = any(abs(jump) > STEPS * size for jump, size in zip(threshold.jumps[:2], quantum, strict=True))
     if threshold.order <= 1 and large:
         return threshold
@@ -284,7 +284,7 @@ def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairTh
 def _end_of(
     coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]
 ) -> tuple[float, float] | None:
-    """Return the last distance with a nonzero interaction, and the next double; None if there is none.
+    """Return the last distance with a nonzero interaction, and the next double; None if all are zero.
 
     A smooth switching function may round to zero at some distances before its end, so the search continues
     outward from any nonzero interaction found at a larger distance.
@@ -342,9 +342,9 @@ def _with_end(
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
     """Extrapolate a power law of the force to find the distance at which an interaction ends.
 
-    If the last distance with a nonzero force is within the error of the extrapolation, that distance is
-    returned instead: the power law holds only in the limit, while the distance is exact unless the force was
-    lost in rounding.
+    If the last distance with a nonzero force is within the error of the extrapolation, this distance is
+    returned instead. The power law holds only close to the end, while the distance is exact unless the force
+    was lost in rounding.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])
     far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
@@ -364,7 +364,7 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
 def _beyond(
     subject: CalculatorSubject, pair: Pair, start: float, noise: Float[np.ndarray, "2"], calls: float
 ) -> Beyond | None:
-    """Search beyond the scan for a cutoff, as long as one could still remove a relevant energy.
+    """Search for a cutoff beyond the scanned distances, as long as the remaining energy is not negligible.
 
     The result is None if no distance could be evaluated, because images of the particles in a periodic cell
     come too near or because the calculator fails.
@@ -447,7 +447,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 
 
 def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
-    """Energy change from the last point to infinity for a force with a power law; inf for a slow decay."""
+    """Energy change from the last point to infinity for a power-law force; inf if it decays too slowly."""
     first, last = abs(float(forces[0])), abs(float(forces[-1]))
     if not last or not first:
         return np.inf

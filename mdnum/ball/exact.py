@@ -4,12 +4,12 @@ A ball starts at height y0 above the floor (at height 0) with velocity v0, under
 the floor at t_1 = (v0 + s) / g with speed s = sqrt(v0² + 2 g y0). With the coefficient of restitution e,
 impact n has speed e^(n-1) s, and the time between impacts n and n + 1 is 2 e^n s / g. Therefore
 
-    t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e),
+    t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e).
 
-so infinitely many impacts take place before the finite time t_rest (Zeno behavior). With a spring and a
-damper, y'' = -g - k y - c y' below the floor, and each contact is a damped cosine. Penalty contacts
-discretize this differential equation in time. A ball with a coefficient of restitution moves differently,
-even in the limit of stiff springs, unless e = 1.
+Infinitely many impacts take place before the finite time t_rest (Zeno behavior). With a spring and a damper,
+y'' = -g - k y - c y' below the floor, and each contact is a damped cosine. A simulation with penalty contacts
+discretizes the differential equation of spring and damper in time. A ball with a coefficient of restitution
+moves differently, even in the limit of stiff springs, unless e = 1.
 
 All computations use numpy in float64. The exact solution shares no code with the simulations of this package,
 because it is their reference.
@@ -46,7 +46,7 @@ Parameters = Mapping[str, complex]
 
 
 class _Motion:
-    """Base class of the exact motions of a ball: validation of the start, derivatives, height and velocity.
+    """Base class of a ball's exact motions: checks the start; computes height, velocity and derivatives.
 
     Complex-step derivatives have no cancellation (Squire & Trapp, SIAM Review 40 (1998) 110).
     """
@@ -191,7 +191,7 @@ class ExactImpact(_Motion):
         return np.where(finite & (np.real(_impact(at, now)[0]) > t) & (n > 1), n - 1, n)
 
     def state(self, t: Times) -> tuple[Known, Known]:
-        """Return height and velocity at time t (s), which are zero, with zero derivatives, at rest."""
+        """Return height and velocity at time t (s); at rest, both and all their derivatives are zero."""
         t = _later(t)
         n = self.bounces(t)
         still = np.isinf(n) | ((n > 0) & (self.restitution == 0))
@@ -214,8 +214,8 @@ class ExactPenalty(_Motion):
 
     The equation y'' = -g - k y - c y' holds as long as the ball is below the floor, so the damper may pull
     the ball down at the end of a contact. Without damping, the end time of a contact has a closed form. With
-    damping, the end time is a root, between lowest point and next maximum of the height, of the equation
-    height = 0. A ball whose next maximum is below the floor comes to rest at depth g / k.
+    damping, the end time is the root of the equation height = 0 between the lowest point and the next
+    maximum. A ball whose next maximum is below the floor comes to rest at depth g / k.
 
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.

@@ -37,10 +37,10 @@ def rounded(value: float, name: str) -> float:
 
 
 def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") -> dict[str, float]:
-    """Return the smallest tolerance (m) of an iterative solver that each role's floating-point format allows.
+    """For each role, return the smallest solver tolerance (m) that the role's floating-point format allows.
 
     A penetration no longer decreases when `gain` times the penetration rounds to zero, and a tolerance below
-    the smallest number of a format rounds to zero. A tolerance is usable if it is not below any returned
+    the smallest number of a format rounds to zero. A usable tolerance is at least as large as every returned
     value.
 
     Args:

@@ -115,7 +115,7 @@ class BallProblem:
         return float(_loss(problem.bare, problem.world, *problem.start_arrays, imposed))
 
     def origin(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return the arguments at which `loss_at` is differentiated: parameter values, and 0 for y0 and v0.
+        """Return the arguments for differentiating `loss_at`: parameter values, and zero for y0 and v0.
 
         Raises:
             InputError: a parameter does not exist.
@@ -214,7 +214,7 @@ def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
-    """Compute final heights and their derivatives in one parameter, by forward-mode differentiation.
+    """Compute final heights and their derivatives with respect to one parameter, in forward mode.
 
     The function is compiled only once, because the time step and the number of steps are arguments.
     """

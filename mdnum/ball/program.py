@@ -179,7 +179,7 @@ class BallProgram:
     def repeats(
         self, others: Sequence[BallProgram], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Compute the separations of pairs of runs with perturbed initial states (see `Program.repeats`)."""
+        """Compute the distance of each perturbed run from this run at every step (see `Program.repeats`)."""
         # of the number of steps that was run before: another one would be another compiled program
         steps = min((known for known in self._runs if known >= last), default=last)
         a = self.run(steps)
@@ -191,7 +191,7 @@ class BallProgram:
         return found
 
     def nudged(self, size: float, count: int, seed: int) -> list[BallProgram]:
-        """Return programs with initial heights displaced at random, by at most `size` or `ulp` if larger."""
+        """Return programs whose initial heights are changed at random by at most max(`size`, `ulp`)."""
         rng = np.random.default_rng(seed)
         y = np.asarray(np.atleast_1d(self.problem.y0), np.float64)
         size = max(size, self.ulp)
@@ -199,7 +199,7 @@ class BallProgram:
         return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
 
     def decision(self, other: BallProgram, flips: Sequence[CrossDecision], separation: float) -> Decision:
-        """Return the first decision that differs between two runs: contacts before stops, by ball index."""
+        """Return the first decision that differs between two runs; contacts precede stops within a step."""
         first = flips[0]
         return Decision(
             channel=first.channel,
@@ -216,7 +216,7 @@ class BallProgram:
         )
 
     def number(self, key: str) -> Number:
-        """Find a parameter by its key in the system file, the end of this key, or its name in the model.
+        """Find a parameter by its full key in the system file, the last word of the key, or its model name.
 
         Raises:
             InputError: the parameter does not exist.
@@ -333,7 +333,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
 
 
 def _guarded(separation: np.ndarray, furthest: np.ndarray, guard: float | None) -> np.ndarray:
-    """Set separations to NaN after the first step at which a contact is imposed too far from the floor."""
+    """Set the distances between two runs to NaN after a contact is first imposed too far from the floor."""
     beyond = furthest > (np.inf if guard is None else guard)
     if beyond.any():
         separation[int(beyond.argmax()) + 1 :] = np.nan

@@ -28,7 +28,7 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """Record of a finished run. In arrays of steps, row s describes the step that ends in state s + 1.
+    """Record of a finished run. Row s of an array of steps describes the step that ends in state s + 1.
 
     Attributes:
         world: the bouncing-ball model that was simulated.
@@ -99,7 +99,7 @@ class BallRun:
 def energy(world: World, y: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "..."]:
     """Compute the mechanical energy per mass, (m/s)²: the sum of kinetic, gravitational and spring energy.
 
-    Error: the energy is evaluated in float64, with a softplus contact treated as a linear spring.
+    Error: the energy is computed in float64, and a softplus contact is treated as a linear spring.
     """
     y, v = np.asarray(y, np.float64), np.asarray(v, np.float64)
     total = float(world.gravity) * y + 0.5 * v * v
@@ -242,7 +242,7 @@ def height_bound(
 def residual_bound(world: World, residual: Any, terms: int) -> Any:
     """Return a bound on the rounding error of a residual, in the unit of the residual.
 
-    All terms of a residual have the same sign, so the error of their sum is at most gamma_n times the sum.
+    All terms of a residual have one sign; the relative error of their sum is at most Higham's gamma_n.
 
     Args:
         residual: residual that a stop decision compares with its threshold.
@@ -273,13 +273,13 @@ class CrossDecision(NamedTuple):
 
     @property
     def run(self) -> str:
-        """Name of the run in which the ball touches the floor or the solver stops first."""
+        """Name of the run, A or B, in which the ball touches the floor or the solver stops earlier."""
         return "A" if (self.a > self.b) == (self.channel == "contact") else "B"
 
 
 @dataclass(frozen=True)
 class BallDifference:
-    """Differences between two runs: first differing steps, numbers of differing decisions, and separation."""
+    """How two runs differ: first differing steps, numbers of differing decisions, differences of heights."""
 
     seed: int | None  # first step whose state bits differ (0: the start itself); None where none do
     fork: int | None  # first step whose decisions differ; None where none do
@@ -415,7 +415,7 @@ def overridden(
 
 
 def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
-    """Return a mask of steps (and balls, if separate) at which two runs have different iteration counts."""
+    """Return a mask of the steps, or of steps and balls, at which iteration counts of two runs differ."""
     counts = [run.iterations.reshape(run.steps, -1)[:rows] for run in (a, b)]
     differ = counts[0] != counts[1]
     if _counted(a) != _counted(b):
@@ -427,7 +427,7 @@ def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
 
 
 def _counted(run: BallRun) -> str:
-    """Return the name of what is counted as an iteration in a run, such as "impacts"."""
+    """Return the name of what a run counts as an iteration, such as "impacts"."""
     contact, scheme = run.world.contact, run.world.integrator
     if isinstance(scheme, EventLocated):
         return "impacts"

@@ -1,7 +1,7 @@
 """A time step of the bouncing ball: integration schemes and contact models.
 
 Each integration scheme specifies the height from which contact is decided, and records this height. Products
-are rounded before they are added (no fused multiply-add), so numpy gives the same bits.
+are rounded before they are added (no fused multiply-add), so that numpy reproduces every bit of the results.
 """
 
 from __future__ import annotations
@@ -139,14 +139,14 @@ class _Euler(eqx.Module):
 
 
 class ExplicitEuler(_Euler):
-    """Explicit Euler: y += h v; v += h a(y). Order 1; at any time step, a stiff contact adds energy."""
+    """Explicit Euler: y += h v; v += h a(y). Scheme of order 1; a stiff contact always adds energy."""
 
     def fly(self, y, v, a, r):
         return r(y + r(self.h * v)), r(v + r(self.h * a))
 
 
 class SemiImplicitEuler(_Euler):
-    """Semi-implicit Euler: v += h a(y); y += h v. Symplectic, order 1, stable for h sqrt(k) < 2."""
+    """Semi-implicit Euler: v += h a(y); y += h v. Symplectic scheme of order 1, stable for h sqrt(k) < 2."""
 
     def fly(self, y, v, a, r):
         v = r(v + r(self.h * a))
@@ -177,7 +177,7 @@ class BallVerlet(eqx.Module):
 
 
 class ImplicitMidpoint(eqx.Module):
-    """Implicit midpoint scheme, solved by Newton's method. Order 2, and stable for any time step.
+    """Implicit midpoint scheme, solved by Newton's method. Scheme of order 2, stable for any time step.
 
     The acceleration is evaluated in the middle of the step. Derivatives are implicit derivatives of the
     solved equation, not derivatives of the iterations.
@@ -281,8 +281,8 @@ class _Forceless(eqx.Module):
 class Penalty(eqx.Module):
     """Force k p - damping v on a ball in contact; p is -y or, in a smooth contact, a softplus of -y.
 
-    If contact is imposed, the force is -k y for either sign of y, so that the contact force continues
-    smoothly above the floor, like an imposed pair force beyond its cutoff.
+    If contact is imposed, the force is -k y for either sign of y. The contact force thus continues smoothly
+    above the floor, like an imposed pair force beyond its cutoff.
 
     Source: soft contact of the discrete element method (Cundall and Strack 1979).
     """
@@ -321,8 +321,8 @@ class Projection(_Forceless):
 
     Each iteration multiplies the penetration by 1 - alpha k, so tol is reached from p0 after ceil(log(tol /
     p0) / log(1 - alpha k)) iterations. With alpha k between 1 and 2, iterations overshoot; with alpha k = 2,
-    they never end. For any k, the floor is at 0: k changes the final height only by the remaining
-    penetration.
+    they never end. The floor is at 0 for any k: the value of k affects the final height only through the
+    remaining penetration.
     """
 
     k: Any  # gain, dimensionless; what is learned in place of a stiffness
@@ -374,7 +374,7 @@ class Impact(_Forceless):
 
     With `EventLocated`, the impact takes place at its exact time, and the flight continues for the rest of
     the step. With another scheme, a ball below the floor is put on the floor at the end of the step, and its
-    velocity is reset. The resulting error is of order h in the state and of order 1 in the derivative.
+    velocity is reset. This reset causes an error of order h in the state and of order 1 in the derivative.
     """
 
     restitution: Any = 0.8  # speed after over speed before
@@ -465,7 +465,7 @@ def lowest(y, v, a, time, r):
 def time_of_impact(y, v, a, r):
     """Return the first time (s) at which a parabolic flight meets the floor, or infinity if it never does.
 
-    The relative error is a few units of roundoff, because the formula avoids cancellation.
+    The relative error of the impact time is a few units of roundoff, because the formula avoids cancellation.
     """
     inside = r(r(v * v) - r(r(2.0 * a) * y))
     # the argument is masked as well, so that no derivative is taken where there is no root

@@ -44,7 +44,7 @@ class Reason(IntEnum):
 
 
 class Solve(NamedTuple):
-    """Record of one iterative solve: arrays of shape () if one rule stops all balls, else (balls,)."""
+    """Record of one iterative solve; arrays have shape (balls,) if each ball stops separately, else ()."""
 
     iterations: Int[Array, "..."]  # how often it went on
     reason: Int[Array, "..."]  # a `Reason`
@@ -66,7 +66,7 @@ class StopRule(Protocol):
     def measure(
         self, terms: Float[Array, "balls"], accumulate: Any, decision: Any, zero: Int[Array, ""]
     ) -> Float[Array, "..."]:
-        """Return the residual, rounded to the dtype `decision`, of terms summed in the dtype `accumulate`."""
+        """Sum terms in the dtype `accumulate`, and return the residual rounded to the dtype `decision`."""
         ...
 
     def threshold(self, first: Float[Array, "..."], iteration: Int[Array, "..."]) -> Float[Array, "..."]:
@@ -138,7 +138,7 @@ class HysteresisStop(eqx.Module):
         return self.rule.measure(terms, accumulate, decision, zero)  # type: ignore[attr-defined]
 
     def threshold(self, first, iteration):
-        """Return the higher threshold before the first iteration, then the threshold of the inner rule."""
+        """Return the upper threshold before the first iteration, later the threshold of the inner rule."""
         enter = jnp.asarray(self.enter).astype(first.dtype)
         return jnp.where(iteration == 0, enter, self.rule.threshold(first, iteration))
 
@@ -250,8 +250,8 @@ def elementwise(function: Map) -> Map:
 
     JAX has no reverse mode for a `while_loop`, because the required memory is not known in advance. A
     function that treats each ball separately has a diagonal Jacobian. All entries of a diagonal Jacobian
-    follow from a few tangents that are propagated in the loop, so no iteration is stored. The result is the
-    derivative at fixed decisions. The record and the inputs in `rest` have no derivative.
+    follow from a few tangents that are computed in the loop, so iterations need not be stored. The derivative
+    is taken at fixed decisions. The solve's record and the inputs in `rest` have no derivative.
 
     Args:
         function: a function whose outputs for ball b depend only on the inputs for ball b (and on `rest`).

@@ -42,7 +42,7 @@ class World(eqx.Module):
     """Model of balls above a floor at height 0: all settings of a time step except the state.
 
     `World.create` checks ranges and casts every number to the dtype of its role. Pass a `World` to jitted
-    code as an argument, not by closure, because the compiler may remove operations with a known zero.
+    code as an argument, not by closure, because the compiler may remove operations with a constant of zero.
 
     Attributes:
         contact: contact model of the floor.
@@ -146,7 +146,7 @@ class World(eqx.Module):
     # -- decide ----------------------------------------------------------------------------------------
 
     def touches(self, height: Balls, before: Bool[Array, "balls"]) -> Bool[Array, "balls"]:
-        """Return whether a ball is in contact: height < 0 or, with hysteresis, not yet height > lift."""
+        """Return whether balls touch the floor: height < 0 or, with hysteresis, until height > lift."""
         height = height.astype(self.policy.dtype("decision"))
         enter = Threshold(jnp.zeros((), height.dtype), "<", "height")
         if self.lift is None:

@@ -143,7 +143,7 @@ def _of_verb(verb: str) -> Any:
 
 
 def _command(entry: str, name: str, said: Mapping[str, Any], shared: Mapping[str, Any]) -> Any:
-    """Create a command for the argument parser from the text file of an entry of `VERBS`."""
+    """Create a command for the argument parser from the text file that describes an entry of `VERBS`."""
     parts = [shared[one] for one in said.get("shares", ())]
     # a system comes first among arguments, and a command's own options before those of others
     arguments = {key: one for part in (*parts, said) for key, one in part.get("arguments", {}).items()}
@@ -249,7 +249,7 @@ def _folder(path: Path) -> Any:
 
 
 def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert options to function arguments; allow the execution of a file given on the command line."""
+    """Convert options to arguments of a function, and permit the code in a file given on the command line."""
     options = {}
     for name in given.keys() & said["options"].keys():
         off = said["options"][name].get("type") == "flag" and name.startswith("no_")

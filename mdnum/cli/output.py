@@ -64,13 +64,13 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
 
 
 def print_json(document: Mapping[str, Any]) -> int:
-    """Print the JSON document of a command to stdout; return the exit code for success."""
+    """Print the JSON document of a command to stdout, and return the exit code of a successful command."""
     say(printable(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False), json_escape))
     return EXIT_FINE
 
 
 def print_reply(reply: Reply, as_json: bool) -> int:
-    """Print the reply of a command without a run folder, as JSON or as text; return the exit code."""
+    """Print the reply of a command that writes no run folder, as JSON or text; return the exit code."""
     if as_json:
         print_json(reply.document)
     for one in () if as_json else reply.shown:

@@ -1,10 +1,10 @@
 """Test whether a fork is benign, that is, whether two programs with diverging runs give the same averages.
 
-Runs of program B are compared with an ensemble of runs of program A at one step, which calibration
-determines. At early steps, runs differ by less than rounding errors can cause; at late steps, every run has
-forgotten its start, and a changed program has the same scatter. The steps suitable for a comparison depend on
-the system. For calibration, programs with deliberate changes are run; at the chosen step, all deliberate
-changes are distinguishable from rounding.
+Runs of program B are compared with an ensemble of runs of program A at one step. A calibration determines
+this step. At early steps, the runs of the ensemble differ from one another by less than rounding errors can
+change a run. At late steps, every run has forgotten its start, and a changed program has the same scatter as
+the ensemble. The steps suitable for a comparison depend on the system. For calibration, programs with
+deliberate changes are run; at the chosen step, all deliberate changes are distinguishable from rounding.
 
 The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
 Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
@@ -77,7 +77,7 @@ class Space:
 
     @classmethod
     def of(cls, features: Float[np.ndarray, "runs features"]) -> Space:
-        """Compute 2 to 10 principal components that explain the variance, but at most a third of the runs."""
+        """Compute 2 to 10 principal components that explain the variance, at most one per three runs."""
         mean, spread = features.mean(axis=0), features.std(axis=0, ddof=1)
         # nothing can be said of a feature that is constant, such as a distance that no pair has
         spread = np.where(spread > _ROUNDING * np.abs(mean), spread, np.inf)
@@ -111,8 +111,8 @@ class Space:
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations above which a principal component counts as an outlier.
 
-    The limit is two; it is raised if more than a tenth of the ensemble's own runs would be outliers. Each run
-    is judged by components of other runs, since a run deviates less in components that it influenced.
+    The limit is two standard deviations, or more if over a tenth of the ensemble's runs would be outliers.
+    Each run is judged by components of the other runs, because a run influences its own components.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -122,7 +122,7 @@ def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
 
 
 def triples(seconds: Float[np.ndarray, "runs"]) -> Float[np.ndarray, "tries"]:
-    """Return the medians of groups of three successive runs, which the test compares with its limit."""
+    """Return the median of the second-largest component for each group of three successive runs."""
     tries = len(seconds) // RUNS
     return np.median(seconds[: RUNS * tries].reshape(tries, RUNS), axis=1)
 
@@ -156,7 +156,7 @@ class Planted:
 
     @property
     def ok(self) -> bool:
-        """True if the test detected a change to be detected, or rejected a harmless one only by chance."""
+        """True if a harmful change was always detected, or a harmless change was rejected only by chance."""
         if self.must_fail:
             return self.failures == self.tries
         return bounds(self.failures, self.tries)[0] <= ACCEPTED
@@ -164,7 +164,7 @@ class Planted:
 
 @dataclass(frozen=True)
 class Window:
-    """A step at which runs can be compared, and the principal components and the limit for this step."""
+    """A step at which runs can be compared, and the principal components and outlier limit at this step."""
 
     step: int  # of the comparison
     space: Space  # components of the ensemble
@@ -173,7 +173,7 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest score, in multiples of the limit, of changes that must be detected; infinity if none."""
+        """Smallest score, relative to the limit, of the changes that must be detected; infinity if none."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property
@@ -355,8 +355,8 @@ def benign(
 ) -> Benign:
     """Compare three runs of program B with an ensemble of runs of program A.
 
-    B fails if at least two principal components of the features exceed the limit in two of three runs. If B
-    passes, the difference between A and B had no larger effect than the smallest perturbation of the start.
+    Program B fails if at least two principal components exceed the limit in two of three runs. If B passes,
+    replacing A by B has no larger effect than the smallest perturbation of the initial state.
 
     Args:
         twin: the programs. Atom labels and axes of B do not matter, because no feature depends on them.

@@ -34,7 +34,7 @@ MOST, MOST_BALL = 24, 64
 
 @dataclass(frozen=True)
 class Side:
-    """The run for the parameter value on one side of a boundary."""
+    """The run on one side of a boundary, for the parameter value next to the boundary."""
 
     at: float  # the number, as the float next to the boundary
     digest: str  # of its decisions
@@ -123,7 +123,7 @@ class BoundaryMap:
 
 
 class NumberLine:
-    """Runs of a system for different values of a parameter; ordinal numbers of floats identify the values.
+    """Runs of a system for different parameter values; each value is identified by its ordinal among floats.
 
     Args:
         program: the program with the system's own value of the parameter.
@@ -162,9 +162,9 @@ class NumberLine:
         return self.known[place].digest
 
     def changes(self, a: int, b: int) -> Iterator[tuple[int, int, dict[int, DecisionHistory]]]:
-        """Yield, in ascending order, adjacent ordinals with different histories, and the runs made.
+        """Yield adjacent ordinals whose decisions differ, in ascending order, and the runs made to find them.
 
-        Cells whose ends have the same history are not searched.
+        A cell is not searched if both of its ends have the same history of decisions.
         """
         pending = [(a, b)]
         while pending:
@@ -182,7 +182,7 @@ class NumberLine:
             yield a, b, runs
 
     def boundary(self, below: int, above: int) -> Boundary | None:
-        """Find the first differing decision of the runs at two ordinals; None if a run fails earlier."""
+        """Find the first decision that differs between runs at two ordinals; None if a run ends before it."""
         places = (below, above)
         runs = [self.run(place) for place in places]
         step = runs[0].first_difference(runs[1])
@@ -225,12 +225,12 @@ def boundaries(
 ) -> BoundaryMap:
     """Find the values of a parameter at which the decisions of a run change, within the resolution of a grid.
 
-    The system is run at every grid value of the parameter. If the histories at the ends of a grid cell
-    differ, the cell is bisected until its ends are adjacent floats. If the other half of the cell also
-    contains a change of decisions, this half is searched later. Boundaries are searched from the lowest
-    parameter value upward; if more exist than were requested, the highest are missing. All runs use the
-    program of a normal run; to vary the cutoff radius, the program takes it as an argument. A new process
-    repeats the runs on both sides of every boundary.
+    The system is run at every grid value of the parameter. If the histories of decisions at the two ends of a
+    grid cell differ, the cell is bisected until its ends are adjacent floats. If the decisions also change in
+    the other half of a bisected cell, this half is searched later. Boundaries are searched from the lowest
+    parameter value upward; if more exist than were requested, the highest are missing. All runs use the same
+    program as a normal run; to vary the cutoff radius, the program takes the radius as an argument. A new
+    process repeats the runs on both sides of every boundary.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.
@@ -290,7 +290,7 @@ def _unpacked_line(data: bytes) -> NumberLine:
 
 
 def _run(task: tuple[NumberLine | bytes, int]) -> DecisionHistory:
-    """Run the program for the parameter value with one ordinal."""
+    """Run the program for the parameter value that has the given ordinal."""
     line, place = _line_of(task[0]), task[1]
     line.digest(place)
     return line.known[place]
@@ -299,7 +299,7 @@ def _run(task: tuple[NumberLine | bytes, int]) -> DecisionHistory:
 def _searched(
     task: tuple[NumberLine | bytes, dict[int, DecisionHistory], int],
 ) -> list[tuple[Boundary | None, dict[int, DecisionHistory]]]:
-    """Return the lowest boundaries in a cell with known runs at its ends, and the runs made for each."""
+    """Return the lowest boundaries in a grid cell and the runs made for each; runs at both ends are known."""
     own, ends, most = task
     line = _line_of(own)
     line.known |= ends

@@ -1,10 +1,10 @@
 """Certify the decisions of one run, and the agreement of its decisions with those of another run.
 
 Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound: exact arithmetic
-would give the same decisions for the same states. Up to the end of *protection*, the distance of the pair
-closest to its cutoff differed from the cutoff by more than this distance can differ between two runs. As long
-as the certified horizon and the protection last, the decisions of the two runs agree. If one of two programs
-is at least as precise as the other in every role, both make the same decisions up to the *shadow horizon*.
+would give the same decisions for the same states. Up to the end of *protection*, no pair distance was closer
+to its cutoff than two runs can differ in this distance. As long as the certified horizon and the protection
+last, the decisions of the two runs agree. If one of two programs is at least as precise as the other in every
+role, both make the same decisions up to the *shadow horizon*.
 
 Decisions are certified only for the actual states of the run. A run whose decisions are correct for its
 states may have left the exact history long ago (`forks.exact.certify` finds the step).
@@ -92,11 +92,11 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 
 
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """For each step, return how far the pair closest to its cutoff is from it, and how far it must be.
+    """At each step, return the smallest |pair distance - cutoff|, and the value needed for protection.
 
-    Each atom may be displaced by the separation of the runs, so the distance of two atoms may change by twice
-    the separation. The margins are those of the run with the smaller rounding error; this error is added to
-    the required distance.
+    If positions of atoms differ between the two runs by at most d, a pair distance differs by at most 2 d.
+    The pair distances are those of the run with the smaller rounding error; this error is added to the
+    required value.
     """
     deciders = {"A": fork.twin.a.simulation.decider, "B": fork.twin.b.simulation.decider}
     a, b = deciders.values()
@@ -113,7 +113,7 @@ def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
 
 
 def wider(twin: Twin) -> str | None:
-    """Return the program that is more precise in some role and less precise in none, or None.
+    """Return the program that is more precise in some role and less precise in none; None if neither is.
 
     The programs must be identical otherwise: the effect of a different time step is not rounding.
     """
@@ -204,10 +204,10 @@ def exact_margin(
     end: Float[np.ndarray, "3"],
     kind: int = 0,
 ) -> tuple[Fraction, bool]:
-    """Compute without rounding the margin of a pair, and the decision that results from this margin.
+    """Compute the margin of a pair without rounding errors, and the decision that results from the margin.
 
     The positions are the floating-point numbers of the state, taken as exact. The threshold and the lattice
-    vectors are the double-precision numbers of the system, as in the exact program, for any dtype of the
+    vectors are the double-precision numbers of the system, as in the exact program, whatever the dtype of the
     decision. The margin, expressed as a distance, is accurate to 400 binary digits; the decision is exact.
 
     Args:

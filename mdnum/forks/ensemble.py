@@ -1,4 +1,4 @@
-"""Measure properties of runs with perturbed initial states, and modify programs to test the verdicts.
+"""Measure properties of runs with perturbed starts, and change programs to validate the statistical test.
 
 Every property (feature) is a continuous function of the positions, so that a small difference between two
 runs changes the property only slightly. Pairs are therefore counted with hat functions and not in bins.
@@ -44,7 +44,7 @@ _NUMBERS = (
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
     """Return the distances at which the hat functions of the pair histogram peak, and the histogram's end.
 
-    The distances extend from the closest pairs of a start to the largest distance that is counted.
+    The distances extend from the closest pairs of the initial state to the largest distance that is counted.
     """
     simulation = simulation.in_row(start.state.cells[0])
     half = float(np.min(simulation.cell.widths)) / 2
@@ -108,7 +108,7 @@ def hats(
     """Count pair distances with hat functions: each distance contributes to the two nearest nodes.
 
     The contribution to a node grows linearly as the distance approaches the node. Distances below the first
-    node count for this node. The last node marks the end, so that a pair that leaves causes no jump.
+    node count for this node. The last node marks the end of the range: a pair that leaves it causes no jump.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)
@@ -172,9 +172,9 @@ def ensemble(
 
 
 def steps_to_diverge(simulation: Simulation, start: Start | None, separation: float, seed: int) -> int | None:
-    """Return the step at which the separation of two runs of an ensemble reaches a given length.
+    """Return the step at which two runs of an ensemble have moved apart by a given distance.
 
-    The result is None if the separation remains smaller for 20,000 steps, or if a run blows up.
+    The result is None if the runs stay closer than the given distance for 20,000 steps, or if a run blows up.
     """
     steps = range(_EVERY, _LONGEST + 1, _EVERY)
     pair = [stretches(simulation, one, steps) for one in starts(simulation, 2, seed, start)]
@@ -203,8 +203,8 @@ def planted(a: Simulation) -> tuple[Change, ...]:
     """Create the programs with deliberate changes that are possible for a simulation.
 
     The test must detect programs with a longer time step or a shorter cutoff. Programs with forces in another
-    precision, pairs in another order or the other neighbor search must pass. The cutoff and the precision of
-    a many-body potential cannot be changed, so these two changes are omitted for it.
+    precision, with pairs in another order or with another neighbor search must pass. The cutoff and the
+    precision of a many-body potential cannot be changed, so these two changes are omitted for it.
     """
     longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
     search = next(name for name in BUILDERS if name != a.builder)

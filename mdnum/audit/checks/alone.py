@@ -63,7 +63,7 @@ class AloneCheck(AuditCheck):
         def energy(
             what: str, there: Atoms, expected: float | None = None, lone: slice = slice(None), size: int = 1
         ) -> float | None:
-            """Record the energy, and the net force on each isolated group of `size` atoms."""
+            """Record the energy of a structure, and the net force on each isolated group of `size` atoms."""
             answer = subject.fresh().try_both(there)
             if isinstance(answer, CalculatorError):
                 self.refused.append((what, answer))
@@ -143,7 +143,7 @@ def _boxed(part: Atoms) -> Atoms:
 
 
 def _apart(part: Atoms, other: Atoms) -> Atoms:
-    """Return a structure of two fragments whose separation is larger than the cutoff."""
+    """Return a structure of two fragments that are farther apart than the cutoff."""
     there = other.copy()
     there.positions += [part.positions[:, 0].max() + _FAR - there.positions[:, 0].min(), 2.0, 3.0]
     return part + there

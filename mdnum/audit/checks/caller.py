@@ -63,7 +63,7 @@ class CallerCheck(AuditCheck):
 
 
 def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Callable[[Atoms], Any]]]:
-    """Yield (name of a quantity, function that changes this quantity in an `Atoms` object)."""
+    """Yield the name of each quantity, and a function that changes this quantity in an `Atoms` object."""
     moves = 0.02 * rng.uniform(-1, 1, (len(atoms), 3))
     yield "positions", lambda there: np.add(there.positions, moves, out=there.positions)
     if len(set(atoms.numbers)) > 1:

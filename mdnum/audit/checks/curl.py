@@ -98,7 +98,7 @@ class CurlCheck(AuditCheck):
 
 
 def agreed(tried: Sequence[Loop]) -> Loop:
-    """Return the loop with the smallest error; the error is increased if loops with other radii disagree.
+    """Return the loop whose curl has the smallest error; enlarge it if loops of other radii disagree.
 
     The curl is the same for every small circle, while the work due to a jump of the forces depends on the
     radius.
@@ -112,7 +112,7 @@ def agreed(tried: Sequence[Loop]) -> Loop:
 def _planes(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator
 ) -> Iterator[tuple[str, Displacement, Displacement]]:
-    """Yield planes, each spanned by two orthonormal displacements of all atoms, one atom or a pair."""
+    """Yield planes spanned by two orthonormal displacement vectors of all atoms, of one atom or of a pair."""
     count = len(atoms)
     if count > 1:
         for number in range(3):
@@ -151,9 +151,9 @@ def around(
     noise: NoiseFloor,
     plane: str = "",
 ) -> Loop:
-    """Compute the work of the forces around x + radius (u cos t + v sin t), for orthogonal unit vectors u, v.
+    """Compute the work of the forces on the circle x + radius (u cos t + v sin t), with orthonormal u and v.
 
-    Error: estimated from the spread of the result over subsets of the points, and from force noise.
+    Error: the error is estimated from the work over subsets of the points, and from force noise.
     """
     angles = 2 * np.pi * np.arange(_POINTS) / _POINTS
     forces = [

@@ -50,8 +50,8 @@ _SOURCES = ("integrator", "flips", "elsewhere", "rest")
 class DynamicsCheck(AuditCheck):
     """Is the energy conserved in a short run at constant energy, and if not, why?
 
-    The check reports the energy drift with a block error, and the drift due to the integrator, to flips and
-    other causes. The drift that remains after subtracting flips and the work of the forces is due to the
+    The check reports the energy drift, its standard error, and the drifts due to integrator, flips and other
+    causes. The drift that remains after subtracting flips and the work of the forces is due to the
     integrator. The integrator's drift must fall to a quarter at half the time step; a second run tests this.
     """
 
@@ -113,7 +113,7 @@ class DynamicsCheck(AuditCheck):
 
 
 def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor) -> tuple[float, float]:
-    """Return the largest energy difference between the run and new calculator objects, and its limit, eV."""
+    """Return the largest energy difference (eV) between a run and new calculator objects, and its limit."""
     places = np.unique(np.linspace(0, len(ran.potential) - 1, count).astype(int))
     again = [subject.fresh().energy(ran.at(ran.positions[n])) for n in places]
     rounding = NoiseFloor(np.finfo(float).eps * largest(ran.potential), 0.0)
@@ -158,7 +158,7 @@ class TwoRuns:
     period: float  # of the fastest vibration, internal time
 
     def shares(self) -> dict[str, Drift]:
-        """Energy drifts, meV/atom/ps: total, due to flips, due to the integrator (two methods), remaining."""
+        """Energy drift (meV/atom/ps): total, due to flips, due to the integrator (two methods), the rest."""
         one, other = self.whole, self.half
         rest, elsewhere = self.balance.filled, self.balance.elsewhere
         flips = wandering(one.time, self.balance.jumps)
@@ -400,7 +400,7 @@ def prepared(
 def fitting_timestep(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, iterations: int = _POWER_ITERATIONS
 ) -> tuple[float, float]:
-    """Estimate a time step and the period of the fastest vibration (inf for none), in internal time."""
+    """Estimate a time step and the fastest vibration's period (inf if none exists) in internal time units."""
     roots = np.sqrt(atoms.get_masses())[:, None]
     mode = direction(len(atoms), rng)
     mode /= np.linalg.norm(mode)
@@ -464,8 +464,8 @@ def run(
 class RigidGroups:
     """ASE constraint that fixes all interatomic distances within groups of equal size, such as molecules.
 
-    ASE's class FixBondLengths treats one bond at a time in Python; this class treats one bond of every group
-    at once, and is a hundred times faster for water.
+    ASE's class FixBondLengths treats one bond at a time in Python. This class treats one bond of every group
+    at once, and is a hundred times faster than FixBondLengths for water.
 
     Source:
         H. C. Andersen, Rattle: a velocity version of the Shake algorithm, J. Comput. Phys. 52, 24 (1983).

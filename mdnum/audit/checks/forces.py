@@ -79,8 +79,8 @@ class Slope:
 class ForcesCheck(AuditCheck):
     """Are the forces minus the gradient of the energy, and of which energy?
 
-    The error of a finite difference is |D(h) - D(h/4)| after extrapolation, plus the measured noise divided
-    by the step; of nine steps h, the step with the smallest error is used. If the deviation of a finite
+    For step h, the error of a finite difference D(h) is |D(h) - D(h/4)| after extrapolation, plus noise
+    divided by h. Of nine steps, the one with the smallest error is used. If the deviation of a finite
     difference from the force grows like 1/h, the check reports a jump of the energy and not a wrong force.
     """
 
@@ -257,7 +257,7 @@ def slope(
 def _best(
     gaps: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
 ) -> tuple[int, float]:
-    """Return the index and error of the most accurate finite-difference step, if other steps confirm it.
+    """Return the index and the error of the most accurate finite-difference step that other steps confirm.
 
     If the energy jumps at flips, two finite-difference steps may include the same jumps by chance and give
     the same wrong slope. A wrong force, in contrast, causes equal deviations for all sufficiently accurate
@@ -296,7 +296,7 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
 def _drowned(
     worker: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, known: float, scale: float
 ) -> list[Observed]:
-    """Return a finding if noise larger than rounding errors hides the forces or the energy differences."""
+    """Return a finding if the noise exceeds rounding errors and hides the forces or energy differences."""
     stairs = steps(worker, atoms)  # which are another finding
     size = max(noise.force, 0.0 if stairs.energy else known)
     if size <= max(_DROWNED * scale, stairs.force):
@@ -342,7 +342,7 @@ def _row(one: Slope) -> dict[str, Any]:
 
 
 def _chart(slopes: list[Slope]) -> Chart:
-    """Chart of force error against finite-difference step; a valley for correct forces, else a plateau."""
+    """Chart of force error against finite-difference step: a valley if forces are correct, else a plateau."""
     shown = slopes[:_DIRECTIONS]
     shown += [one for one in [_worst(slopes)] if one not in shown]
     lines = {one.direction: one.gaps[::-1].tolist() for one in shown}
@@ -359,8 +359,8 @@ def _two_energies(
 ) -> Iterator[Observed]:
     """Yield a finding if the energies `energy` and `free_energy` differ by more than a constant.
 
-    By ASE's definition, the forces are minus the gradient of `free_energy`, which all other checks examine.
-    If the two energies differ by at most a constant, the findings hold for both energies.
+    By ASE's definition, the forces are minus the gradient of `free_energy`. All other checks examine this
+    energy. If the two energies differ by at most a constant, the findings hold for both energies.
     """
     free, logged = subject.energies(atoms)
     if logged is None:

@@ -88,9 +88,9 @@ class _Difference:
 class InvarianceCheck(AuditCheck):
     """Do energy and forces of a structure depend on its representation?
 
-    The allowed differences are measured: they are the calculator's noise along a line, and the largest change
-    under random displacements as large as coordinate rounding. A transformation that the calculator does not
-    support is skipped. `structures` contains both representations if their energies or forces differ.
+    The allowed differences are measured: the calculator's noise along a line, and the largest change under
+    random displacements as large as the rounding of coordinates. A transformation that the calculator does
+    not support is skipped. If two representations differ in energy or forces, `structures` contains both.
     """
 
     name, title, order, calls = "invariance", "Invariance", 40, 450
@@ -184,7 +184,7 @@ class InvarianceCheck(AuditCheck):
     def _without_topology(
         self, wrong: dict[str, list[_Difference]], judge: _Judge
     ) -> dict[str, list[_Difference]]:
-        """If the atom order defines the molecules, omit differences due to this order; else return all."""
+        """Omit differences due to the atom order if it defines the molecules; otherwise return all."""
         rng = np.random.default_rng(self.seed + 1)
         grouped = by_molecule(judge.atoms, rng)
         try:
@@ -209,7 +209,7 @@ class InvarianceCheck(AuditCheck):
 
 
 class _Judge:
-    """Compares representations of a structure; the allowed differences depend on the size of rounding."""
+    """Compares representations of a structure; allowed differences depend on the rounding of coordinates."""
 
     def __init__(self, subject: CalculatorSubject, rng: np.random.Generator):
         self.subject, self.worker, self._rng = subject, subject.fresh(), rng
@@ -253,7 +253,7 @@ class _Judge:
         ), answer
 
     def reference(self, base: Atoms, rounding: float) -> tuple[float, Forces, NoiseFloor]:
-        """Return energy and forces of a structure, and allowed differences for a given size of rounding."""
+        """Return a structure's energy and forces, and the differences allowed for a given rounding error."""
         power = int(np.ceil(np.log2(rounding))) if rounding > 0 else -9999
         key = id(base), power
         if key not in self._known:
@@ -273,7 +273,7 @@ class _Judge:
 
 
 def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]:
-    """Yield findings about basic representations that are not supported, and about nonfinite results."""
+    """Yield findings about nonfinite results, and about basic representations that the calculator rejects."""
     empty = [one for one in refused if one[1].cause is None]
     raised = [one for one in refused if one[1].cause is not None and one[0].code in _MUST_ANSWER]
     for code, cases in (("NOT_FINITE", empty), ("FAILS", raised)):
@@ -299,7 +299,7 @@ def _in_turns(ways: Iterable[Same]) -> list[Same]:
 
 
 def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield all representations of a structure that are possible.
+    """Yield all representations that are possible for a structure.
 
     Args:
         atoms: a structure in which no distance is exactly at a threshold.
@@ -405,7 +405,7 @@ def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | N
 
 
 def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
-    """Yield structures with unchanged positions and a cell that is one rounding unit larger or smaller."""
+    """Yield structures with the same positions and a cell that is larger or smaller by a rounding error."""
     if not atoms.pbc.any():
         return
     for what, base in (("", atoms), (", of the structure as it was given", given)):

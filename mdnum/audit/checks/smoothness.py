@@ -99,7 +99,7 @@ def _two(threshold: PairThreshold) -> str:
 def figures(
     walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
 ) -> tuple[tuple[list[str], dict[str, Any]], dict[str, Any]]:
-    """Return sentences about thresholds, the values in these sentences, and the numbers in the summary."""
+    """Return sentences about the thresholds, the values inserted into them, and numbers for the summary."""
     # (lowest derivative that jumps, jump of the energy, of the force) wherever something does
     seen = [(one.order, *one.jumps[:2]) for one in _all(walks)]
     seen += [(one.jump.order, one.jump.energy, one.force) for one in around.events]
@@ -186,7 +186,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
 
 
 def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield a finding if, at a pair threshold, a lower derivative jumps for many atoms than for two atoms."""
+    """Yield a finding if, at a pair threshold, the energy of many atoms is less smooth than that of two."""
     if not around.lower:
         return
     worst = min(
@@ -243,7 +243,7 @@ def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) 
 
 
 def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
-    """Yield findings about atoms with many neighbors: a limit on this number, or another energy jump."""
+    """Yield findings about atoms with many neighbors: a maximum number of neighbors, another energy jump."""
     values: dict[str, Any] = {"species": one.species, "radius": one.radius}
     if one.kept:
         values |= {"kept": one.kept, "distance": one.distance, "force": one.force}
@@ -265,7 +265,7 @@ def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
 
 
 def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
-    """Yield findings about a pair interaction: no cutoff, a steep switch, or unexamined distances."""
+    """Yield findings on a pair interaction: no cutoff, a steep switching function, unexamined distances."""
     further = walk.further
     if walk.cutoff is None and np.abs(walk.energy).max() > 0:
         # what was searched for an end, and no more
@@ -285,7 +285,7 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
 
 
 def _steepness(walk: PairWalk) -> tuple[float, float] | None:
-    """Return the largest ratio of curvatures beyond and at the energy minimum, and the distance."""
+    """Return how much larger than at the energy minimum the curvature is beyond it, and at which distance."""
     curvature = -np.gradient(walk.force, walk.distance)
     bottom = int(np.argmin(walk.energy))
     if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:
@@ -302,7 +302,7 @@ def _steepness(walk: PairWalk) -> tuple[float, float] | None:
 
 
 def _first_to_jump(event: Event) -> str:
-    """Return the name of the lowest derivative of the energy that jumps at an event."""
+    """Return the name of the lowest derivative of the energy that jumps at a point on a route."""
     order = event.jump.order
     return ORDERS[max(order, event.threshold.order) if order == SMOOTH and event.threshold else order]
 

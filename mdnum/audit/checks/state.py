@@ -37,7 +37,7 @@ class StateCheck(AuditCheck):
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compare one calculator object that evaluates all structures with a new object for each."""
+        """Compare one calculator object that evaluates all structures with one new object per structure."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
             atoms, noise = settled(subject.fresh(), rng, brief=self.brief)
@@ -154,7 +154,7 @@ class Comparison:
 
     @property
     def refused(self) -> CalculatorError | None:
-        """Error of the new calculator object or, if none, of the used object; None if both succeeded."""
+        """Error raised by the new calculator object, or else by the used one; None if both succeeded."""
         return next((one for one in (self.new, self.old) if isinstance(one, CalculatorError)), None)
 
     @property
@@ -170,7 +170,7 @@ class Comparison:
 
 
 def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
-    """Return sequences in which two atoms approach each other at the cutoff, and sequences to be skipped."""
+    """Return sequences in which two atoms approach to the cutoff distance, and reasons if there are none."""
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)
@@ -296,7 +296,7 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
     """Return the longest move (Å) of an atom or cell edge that leaves energy and forces unchanged, or 0.
 
-    A move is taken into account only if it should change several of the last digits of the results; the
+    A move is considered only if it should change several of the last digits of energy and forces. The
     expected change is proportional to the length of the move.
     """
     # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate

@@ -1,8 +1,8 @@
 """Choices of arithmetic: the floating-point format of each role, and the order in which sums are computed.
 
-The order of a sum is set by the reduction, or by neighbor lists: their order of pairs depends on how and when
-they are built. A different order of a sum does not change which pairs interact if every list is rebuilt
-before motion exceeds the skin. If sums do not depend on their order, a different order must have no effect.
+The order of a sum is set by the reduction or the neighbor list, whose order of pairs depends on how and when
+it is built. A different order of a sum does not change which pairs interact if every list is rebuilt before
+motion exceeds the skin. If sums do not depend on their order, a different order must have no effect.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ FORMATS = ("dense", "sparse", "ordered-sparse")
 
 @choice("precision")
 class PrecisionChoice(Choice):
-    """Another floating-point format in one role, or in several.
+    """Another floating-point format for one or several roles, such as for the forces.
 
     In molecular dynamics, 16-bit floats are allowed only for pair forces: in any other role, 16-bit floats
     would change the model, not only the rounding (`mdnum.numerics.roles.check_role` gives the reason).
@@ -288,7 +288,7 @@ class Builder(Summed):
 
 @choice("skin")
 class Skin(Summed):
-    """Another skin: neighbor lists hold more or fewer pairs beyond the cutoff, rebuilt at other steps."""
+    """Another skin: neighbor lists contain another number of pairs, and are rebuilt at other steps."""
 
     screened = "skin skin@exact"
     # of the skin; None for half as much again, or three quarters where the box has no room

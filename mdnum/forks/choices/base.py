@@ -210,7 +210,7 @@ def parse(text: str, world: str | None = None) -> Choice:
 
 
 def check(is_good: bool, message: str, where: str, remedy: str | None = None) -> None:
-    """Raise an `InputError` with the given message unless an argument is valid."""
+    """Raise an `InputError` with the given message if an argument of a choice is not valid."""
     if not is_good:
         raise InputError(message, where=where, remedy=remedy)
 
@@ -236,7 +236,7 @@ def some(count: int, where: str) -> None:
 
 
 def plural(count: int, noun: str) -> str:
-    """Return the noun, with a final s if the count is not one."""
+    """Return a noun in the singular or plural form (with a final s), according to a count."""
     return noun if abs(count) == 1 else f"{noun}s"
 
 
@@ -269,7 +269,7 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice that can set the summation of both runs; they must agree if sums do not depend on order."""
+    """A choice that can set how both runs sum; the runs must agree if their sums do not depend on order."""
 
     worlds = ("md",)
     both: str | None = None  # reduction of both runs; None for the system's own

@@ -1,4 +1,4 @@
-"""Choices of the start of a run: parameters, coordinates, random noise, and physically equivalent starts.
+"""Choices of how a run starts: parameters, coordinates, random noise, and physically equivalent states.
 
 Other atom labels, another origin, other axes and other periodic images describe the same physical system.
 """
@@ -142,7 +142,7 @@ def _read(word: str) -> tuple[list[int], list[float]]:
 
 @choice("translate")
 class Translate(Summed):
-    """All atoms moved by a fraction of the lattice vectors: rounding differs for larger coordinates."""
+    """All atoms moved by a fraction of the lattice vectors: larger coordinates are rounded differently."""
 
     screened = "translate=0.25 translate=lattice"
     must_hold = False  # type: ignore[assignment]
@@ -175,9 +175,9 @@ class Translate(Summed):
 class Images(Choice):
     """Atoms that start in other periodic images.
 
-    Positions are wrapped before the first step, so this choice changes no bit if images are exact; usually,
-    the sum of a position and a lattice vector is rounded. Both runs start at positions whose sum with a
-    lattice vector is exact, at most one ulp of the lattice vector from those in the file.
+    Positions are wrapped before the first step, so this choice changes no bit if images are exact. Usually,
+    however, the sum of a position and a lattice vector is rounded. Both runs start from positions with exact
+    images, at most one ulp of the lattice vector away from the positions in the file.
     """
 
     worlds = ("md",)
@@ -217,11 +217,11 @@ class Images(Choice):
 def exact_images(
     cell: Any, positions: Float[np.ndarray, "atoms 3"], images: Int[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"], int]:
-    """Return wrapped positions near given positions, their images, and how many atoms have no exact image.
+    """Return wrapped positions near given ones, their images, and the number of atoms without exact images.
 
-    Wrapping the images gives the wrapped positions, bit for bit. In a box along the axes, a position with a
-    rounded image has an exact image (Sterbenz's lemma: the lattice vector is subtracted again without
-    rounding); a second iteration is needed only if the first moves a position across a face of the box.
+    Wrapping an exact image restores the wrapped position, bit for bit. In an orthogonal box, wrapping a
+    rounded image gives a position with an exact image, because the lattice vector is subtracted exactly
+    (Sterbenz's lemma). A second iteration is needed only if the first moves a position out of the box.
     """
     from mdnum.md.cell import wrap_positions
 
@@ -242,8 +242,8 @@ def exact_images(
 class Ulps(Choice):
     """A parameter of the system file, changed to a nearby float in the format in which the parameter is used.
 
-    For a run at constant energy, the temperature is that of the initial velocities, which both runs draw at
-    random.
+    In a run at constant energy, the temperature in the system file determines only the initial velocities,
+    which both runs draw at random.
     """
 
     screened: ClassVar = {world: " ".join(f"ulps={key}" for key in keys) for world, keys in OFTEN.items()}

@@ -56,9 +56,9 @@ def nearest(value: Decimal) -> float:
 def ball_history(world: World, start: BallState, steps: int) -> BallRun:
     """Compute the run of a ball in exact arithmetic, from the numbers stored in `world`.
 
-    Quantities that do not affect decisions (residuals, stopping margins, the ledger) are not recorded.
+    Quantities that do not affect decisions (residuals, stopping margins, contact flips) are not recorded.
 
-    Error: none, except that recorded values are rounded to double precision.
+    Error: recorded values are rounded to double precision; the calculation itself is exact.
 
     Raises:
         InputError: steps is below 1, or a time step does not consist of sums and products.
@@ -204,7 +204,7 @@ class _ExactBall:
 
 
 class _ExactRule:
-    """A stopping rule of the solver, in exact numbers; the residual is that of the batch or of each ball."""
+    """A solver's stopping rule in exact numbers, applied to the residual of the batch or of each ball."""
 
     def __init__(self, world: World):
         rule: Any = world.contact.stop  # type: ignore[attr-defined]

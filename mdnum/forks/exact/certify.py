@@ -76,7 +76,7 @@ class PolicyHorizon:
 
     @property
     def margin(self) -> float:
-        """Margin, in the exact run, of the first decision that a run makes wrongly; NaN if there is none."""
+        """Margin, in the exact run, of the first wrong decision of a run; NaN if no decision is wrong."""
         return float("nan") if self.decision is None else self.decision.margins["A"]
 
     def is_all(self, dtype: str) -> bool:
@@ -105,8 +105,8 @@ def certify(
 ) -> Certificate:
     """Compute the exact history of a system, and the step at which runs in each precision leave this history.
 
-    The numbers of the system file are rounded to float64. A run in lower precision rounds these numbers
-    further, and this rounding is included in its deviation.
+    The numbers of the system file are rounded to float64. A run in lower precision rounds the numbers of the
+    system file further; its deviation from the exact history includes this rounding.
 
     Args:
         system: a Lennard-Jones system of at most 108 atoms at constant energy (NVE), or a ball whose time
@@ -163,7 +163,7 @@ def _certify_md(system: Simulation, last: int, policies: Mapping[str, Roles], no
     matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
 
     def reduced(x: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Wrap positions into a box at the origin, so that one lattice vector corrects a displacement."""
+        """Wrap positions into a box at the origin; minimum images then require at most one lattice vector."""
         return x - np.floor(x @ np.asarray(simulation.cell.inverse)) @ matrix
 
     rows = []
@@ -227,7 +227,7 @@ def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], 
 
 
 def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
-    """Return ln 2 / growth rate, in steps per bit, for the run in which growth was measured for longest."""
+    """Return ln 2 / growth rate of the deviation (steps per bit) for the run with the longest measurement."""
     # separations that grow by a power of time, as those of a lone pair, are no exponentials
     fits = [row.growth for row in rows if row.growth is not None]
     fits = [fit for fit in fits if fit.rate > 0 and fit.r_squared > _EXPONENTIAL]
@@ -237,7 +237,7 @@ def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
 
 
 def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
-    """For each precision policy that fails later than single precision, add its gain over the latter."""
+    """Add each precision policy's gain over single precision, as a fraction of double precision's gain."""
     low = next((row for row in rows if row.is_all("float32")), None)
     high = next((row for row in rows if row.is_all("float64")), None)
     if low is None or low.horizon is None:
@@ -254,10 +254,10 @@ def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
 
 
 def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
-    """Return how many bits closer to the exact positions one run is than another, while decisions agree.
+    """Return how many bits closer to the exact positions one run is than another before a wrong decision.
 
-    The number of bits is the median over the second half of the steps before the first wrong decision. Unlike
-    the step of this decision, the median does not depend on which pair happens to approach its cutoff.
+    The number of bits is the median over the second half of the steps before the first wrong decision. The
+    median, unlike the step of a wrong decision, does not depend on which pair approaches its cutoff.
     """
     if base.separation is None or row.separation is None:
         return float("nan")
