@@ -95,7 +95,7 @@ class History:
 
 
 def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return indices that sort rows stably by all columns, and a mask of the first row of each group."""
+    """Return indices that sort rows stably by all columns, and a mask of the first of several equal rows."""
     if not len(columns[0]):
         return np.zeros(0, np.int64), np.zeros(0, bool)
     sizes = [int(column.max()) + 1 for column in columns]

@@ -118,7 +118,7 @@ def shortest(
 
 
 def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
-    """Return squared lengths, ascending, of lattice vectors up to `radius`, one of each opposite pair."""
+    """Return ascending squared lengths of lattice vectors up to `radius`; opposite vectors count once."""
     if not lattice.periodic.any() or radius < lattice.narrowest * (1 - 1e-9):
         return np.zeros(0)
     vectors, most = lattice.vectors, np.where(lattice.periodic, radius / lattice.widths + 1, 0).astype(int)
@@ -268,7 +268,7 @@ class Placed:
 
 
 class SearchLimits(NamedTuple):
-    """Lower and upper limits of squared distances in a pair search, by species."""
+    """Lower and upper limits of squared distances in a pair search, for each pair of species."""
 
     kind: int  # `INSIDE` or `DIRECTED`
     low: Float[np.ndarray, "species species"]  # pairs nearer than this are inside for certain

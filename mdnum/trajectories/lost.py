@@ -147,7 +147,7 @@ def lost_flips(
 
 
 def _of_motion(motion: FrameMotion, reach: float, bound: float) -> dict[str, Estimate]:
-    """Estimate missed flips by persistence and, if velocities are known, by velocities."""
+    """Estimate missed flips from the persistence of displacements and, if known, from velocities."""
     taken, few = -np.diff(np.log(motion.growth)), 1 / math.sqrt(motion.atoms)
     found = {"persistence": _carried_on(taken, np.hypot((_LAW["persistence"] + few) * taken, _LEAST))}
     if math.isfinite(motion.moved):

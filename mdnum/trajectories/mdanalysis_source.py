@@ -213,7 +213,7 @@ class MDAnalysisTrajectory(Trajectory):
 
 
 def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
-    """Return a function that reads atom labels of any frame; MDAnalysis reads only the first frame's.
+    """Return a function that reads atom labels of any frame; MDAnalysis reads those of the first frame.
 
     The function returns None unless the file is an XYZ file or a PDB file with several models.
     """
@@ -320,7 +320,7 @@ def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
 
 
 def _behind_text(file: Any) -> str | None:
-    """Describe lines after the last frame of a text file, except blank lines at the end; None if absent."""
+    """Describe lines after the last frame of a text file, except blank lines at the end; None if none."""
     if file is None or file.closed:
         return None
     lines = 0

@@ -1,8 +1,8 @@
 """Contacts between residues: two residues are in contact if any pair of their atoms is within the cutoff.
 
-Decisions are made for pairs of atoms; the ledger contains the smallest atom distance of two residues.
-Hydrogens and virtual sites are excluded by default, because their positions depend on constraints and on the
-program that wrote the file. Customary contact cutoffs are defined for heavy atoms.
+Decisions are made for pairs of atoms; the ledger contains the smallest distance between atoms of the two
+residues. Hydrogens and virtual sites are excluded by default, because their positions depend on constraints
+and on the program that wrote the file. Customary contact cutoffs are defined for heavy atoms.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _TOGETHER = 20_000
 
 @dataclass(frozen=True)
 class ByResidue:
-    """Residues of a file, whose pairs are analyzed in place of pairs of atoms."""
+    """Residues of a file, for an analysis of pairs of residues instead of pairs of atoms."""
 
     of: Int[np.ndarray, "atoms"]  # residue of each atom of the file
     table: AtomTable  # of the residues, an entry each

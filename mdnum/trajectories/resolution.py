@@ -53,7 +53,7 @@ _WIDE = 4.0
 
 @dataclass(frozen=True)
 class Resolution:
-    """Resolution of the positions in a file, a decimal grid or a floating-point format."""
+    """Resolution of the positions in a file: a decimal grid or a floating-point format."""
 
     # "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32", "float64", or
     # "unknown" where every coordinate looked at is 0 (bounds are then those of float32)

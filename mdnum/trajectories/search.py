@@ -380,7 +380,7 @@ def image_distances(
     rank: Int[np.ndarray, "pairs"],
     directed: bool = False,
 ) -> Float[np.ndarray, "pairs"]:
-    """Return distances (length) to the image of j that has `rank` nearer images; inf if there is none.
+    """Return distances (length) from i to the image of j with `rank` nearer images; inf if there is none.
 
     If the membership rule is directed, opposite images of an atom are two different neighbors of this atom.
     """

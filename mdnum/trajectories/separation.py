@@ -159,9 +159,9 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
 def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
     """Describe a contradiction between displacements, velocities and times (medians over frames), if any.
 
-    If atoms turn around between two frames, displacements are smaller than predicted from velocities, but not
-    inconsistent. Smaller displacements are inconsistent only if velocities kept directions and are parallel
-    to displacements.
+    If atoms turn around between two frames, displacements smaller than predicted from velocities are
+    expected. Small displacements contradict the velocities only if the velocities keep their directions and
+    are parallel to the displacements.
 
     Returns:
         the factor by which displacements are too large (or too small, below 1), and whether it is a lower
@@ -198,8 +198,8 @@ def growth(
 ) -> GrowthLaw | None:
     """Fit an exponential and a power law to the growing distance between two trajectories.
 
-    A constant error of a force or a velocity makes the separation of two runs grow as a low power of time;
-    chaos makes the separation grow exponentially. Fits exclude distances that are zero or above `limit`.
+    A constant error of a force or a velocity makes the distance between two runs grow as a low power of time;
+    chaos makes the distance grow exponentially. Fits exclude distances that are zero or above `limit`.
 
     Args:
         began: earliest and latest possible time at which the separation began, as the origin of a power law.

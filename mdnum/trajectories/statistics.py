@@ -97,7 +97,7 @@ class Survival:
 
 
 def survival(found: Durations) -> Survival:
-    """Compute the product-limit estimate from contacts whose beginning was observed.
+    """Compute the product-limit estimate of contact survival from contacts whose beginning was observed.
 
     Contacts present at the first frame are excluded: their age is unknown, and long contacts are
     overrepresented.

@@ -313,7 +313,7 @@ def _halved(x, order):
 
 @njit
 def _nodes(boxes, runs):
-    """Return a binary tree of bounding boxes for each run of clusters: of the run, of its halves, and so on.
+    """Return a tree of bounding boxes for each range of clusters: of the range, of its halves, and so on.
 
     The first half of the clusters of node n is node n + 1; the second half is node n + 2 c, where c is the
     number of clusters in the first half.
@@ -343,7 +343,7 @@ def _nodes(boxes, runs):
 
 @njit
 def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
-    """Write the tiles between two runs of clusters, up to the capacity; return the number of tiles found."""
+    """Write tiles between two ranges of clusters, up to the capacity; return the number of tiles found."""
     count, square, same = 0, reach * reach, a == b
     stack = np.empty((256, 6), np.int64)
     for code in codes:

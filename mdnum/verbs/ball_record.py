@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin at each step; if balls are solved separately, those of the least |margin|."""
+    """Residual and stop margin at each step; for separately solved balls, those with the least |margin|."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

@@ -241,7 +241,7 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
 
 
 def _script(code: str) -> str:
-    """Return the end of the file name of the script that reproduces failures with the given code."""
+    """Return the ending of a script's file name; the script reproduces failures with the given code."""
     return f"{code.lower().replace('_', '-')}.py"
 
 

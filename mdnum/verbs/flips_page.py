@@ -105,7 +105,7 @@ def _ended(view: FlipsView) -> Iterator[Finding]:
 
 
 def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
-    """Return the frames whose number of pairs is not the previous frame's number + entered - left."""
+    """Return frames at which the number of pairs differs from the previous number + entered - left."""
     table = view.table("frames")
     rows = table["rule"] == place
     net = (table["entered"][rows] - table["left"][rows])[1:]

@@ -111,7 +111,7 @@ def _ranking(answer: Answer) -> list[dict[str, Any]]:
 
 
 def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[str, Any]:
-    """Join several named lines into one table, with the columns name, step and separation."""
+    """Join several named data series into one table, with the columns name, step and separation."""
     return {
         name: np.concatenate([np.full(len(line), key) for key, line in lines.items()]),
         "step": np.concatenate([first + np.arange(len(line)) for line in lines.values()]),
@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """Yield sentences on how many correct steps a run gains or loses by another precision in one role."""
+    """Yield sentences on correct steps gained or lost if one role (such as forces) has another precision."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip

@@ -331,7 +331,7 @@ def _with_unit(text: str, unit: str) -> str:
 def fork_forecast(
     system: Simulation | System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Predict, from one tangent run, which decisions a random displacement of the start changes first.
+    """Predict, from one tangent run, which decisions change first if the start is randomly displaced.
 
     Example:
         >>> mdnum.fork_forecast("argon/liquid-864", 1e-9)

@@ -74,7 +74,7 @@ class View:
 
     @cached_property
     def system(self) -> Mapping[str, Any]:
-        """Tables of the system file of the system that was run; empty if the folder has no system."""
+        """Tables in the system file of the run; empty if the folder contains no system."""
         return self.folder.system
 
     @cached_property
@@ -176,8 +176,8 @@ class UnknownKeyword(InputError, TypeError):
 def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
     """Wrap a public function to reject unknown keyword arguments before any file is read or written.
 
-    Without this check, a misspelled keyword in `**keep` would raise an error only when the output folder is
-    made. Until then, the function would use the default value.
+    If keywords were not checked first, a misspelled keyword in `**keep` would raise an error only when the
+    output folder is made. Until then, the function would use the default value of the misspelled option.
 
     Args:
         more: names of keywords that the verb passes on in addition to those of `Keep`.

@@ -111,7 +111,7 @@ def closeness(row: Mapping[str, Any]) -> str:
 
 
 def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
-    """Return a sentence on one of the limits on the number of steps for which a gradient can be trusted."""
+    """Return a sentence on one limit to the number of steps over which a gradient can be trusted."""
     code = f"{limit['what']}_{limit['code']}".replace(" ", "_")
     values = {"horizon": limit["horizon"], **limit["values"]}
     first = values.get("first")

@@ -53,7 +53,7 @@ def split(run: Sample, argument: str) -> Value:
 
 
 def separation(run: Sample, argument: str) -> Value:
-    """Rate at which the separation of two runs grows exponentially, 1/time, from a fit of its logarithm."""
+    """Exponential growth rate of the distance between two runs, in 1/time, from a fit of its logarithm."""
     found = _pair(run, argument)
     grown = found.growth["B"]
     if not grown.plain:
