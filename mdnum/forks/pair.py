@@ -232,7 +232,7 @@ def displacements(fork: Fork) -> tuple[float, float]:
 
 
 def _repeated(found: Fork, most: int, progress: Progress | None) -> Fork:
-    """Add as many repeats to a comparison of two runs as the verdict requires."""
+    """Repeat run B as often as the verdict requires, and add the results to the comparison of the runs."""
     a, b, series, tolerance = found.twin.a, found.twin.b, dict(found.series), found.tolerance
     while wanted := found.verdict.wanted:
         place, sizes = int(found.verdict.other is not None), displacements(found)

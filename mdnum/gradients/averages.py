@@ -57,7 +57,7 @@ class Frames:
 
 
 def known(name: str) -> bool:
-    """Return whether the energy of a frame can depend on the parameter at fixed positions."""
+    """Return whether the energy of a frame can depend on a parameter at fixed positions."""
     return name.startswith(("potential.", "cutoff.")) or name == "box.scale"
 
 

@@ -168,7 +168,7 @@ def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str
 
 def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
     """Replace the custom derivative rule of `stopping.elementwise` by plain loops in a program. With the
-    custom rule, a loop whose derivative is zero looks the same as a loop that did not run.
+    custom derivative rule, a loop with zero derivative looks the same as a loop that did not run.
     """
 
     def run(*inputs):

@@ -155,10 +155,10 @@ def onto_crossings(
 ) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"], Float[Array, "3 3"]]:
     """Propagate cotangents backward through the crossings (saltation) of one step.
 
-    A crossing lies between two steps, on average at half of the drift between them. Let n be the unit vector
-    from i to j, f the force jump and s = n · (v_j - v_i) + n · (dh/dt h^-1) r the radial speed, including the
-    motion of the box. If the distance at the crossing changes by dr = n · (dx_j - dx_i), minus the change of
-    the lattice vectors between the images, the force jump acts for a time that changes by dr/s:
+    A crossing lies between two steps, on average halfway through the drift between these steps. Let n be the
+    unit vector from i to j, f the force jump and s = n · (v_j - v_i) + n · (dh/dt h^-1) r the radial speed,
+    including the motion of the box. If the distance at the crossing changes by dr = n · (dx_j - dx_i), minus
+    the change of the lattice vectors between the images, the force jump acts for a time that changes by dr/s:
 
         d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
         d(W) = (f r_cut n ⊗ n) dr/s        on the integrator's use of the virial tensor W

@@ -63,7 +63,7 @@ class Direction(NamedTuple):
 def quantities(force: PairForce | ManyBodyForce) -> Any:
     """Return the differentiable parameters of a force, as a pytree of arrays.
 
-    For a many-body potential, the result contains the potential's arrays and constants by name.
+    For a many-body potential, the pytree contains the potential's arrays and constants by name.
     """
     return force.model if isinstance(force, PairForce) else manybody.quantities_of(force.potential)
 

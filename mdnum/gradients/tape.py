@@ -223,8 +223,8 @@ class RunTape:
     @property
     def jumps_unseen(self) -> tuple[float, float]:
         """Derivatives of the loss with respect to the energy and virial of a frame, if gradients omit jumps
-        of energy and virial at flips (as for losses of a single frame). If the frames are equally spaced,
-        gradients include these jumps, and both derivatives are set to 0.
+        of energy and virial at flips (as for losses of a single frame). If frames are equally spaced,
+        gradients include the jumps, and the derivatives with respect to energy and virial are set to 0.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0

@@ -275,7 +275,7 @@ class HostCell:
 def wrap_positions(
     cell: Cell, positions: Float[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
-    """Wrap positions, even from far outside the box; return wrapped positions and numbers of shifts.
+    """Wrap positions, even from far outside the box; also return the numbers of lattice vectors subtracted.
 
     Error: the first pass subtracts n lattice vectors at once and rounds n*L; a second pass wraps positions
     that are still outside the box due to this rounding. A wrapped coordinate may equal the edge length L

@@ -141,9 +141,9 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
     The test potentials are u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. Derivatives of the energy with
     respect to r² (nested jvp) are computed at a distance of 2⁻⁴⁶ from r_cut and on both sides of the onset,
     up to one order above the declared smoothness. The derivative one order above the declared smoothness must
-    jump for at least one potential. An energy difference above 1e-9 u(r_cut) counts as a jump, and so does a
-    difference of derivative k above 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k. Jumps at other distances and
-    jumps of derivatives beyond the sixth are not detected.
+    jump for at least one test potential. An energy difference above 1e-9 u(r_cut) counts as a jump, and so
+    does a difference of derivative k above 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k. Jumps at other distances
+    and jumps of derivatives beyond the sixth are not detected.
 
     Raises:
         ValueError: the test fails; the message contains the quantity and the distance.

@@ -86,7 +86,7 @@ class PairDecider:
         The exact margin follows from the stored positions, and from the box and the threshold in double
         precision (error analysis: numerics.rounding). The bound is evaluated at a distance of 1.001 r_cut,
         and holds for every pair up to this distance. For more distant pairs, the decision is correct, or the
-        margin is within the bound. If atoms are beyond `reach`, use `bounds_at` instead.
+        margin is within the bound. If atoms are beyond `reach`, `bounds_at` gives valid bounds.
         """
         return tuple(float(bound) for bound in self._bounds(None))
 

@@ -166,8 +166,8 @@ class FixedPointDecider(PairDecider):
     """Decision whether a pair is inside the cutoff, by comparison of two integers.
 
     The squared distance is an integer in units of the squared spacing. Every comparison is converted to the
-    form `r2 < limit` with an integer limit. For margins, the threshold is half a unit below this limit, so
-    that margins are never zero and have no rounding error.
+    form `r2 < limit` with an integer limit. For margins, the threshold is half a unit below the integer
+    limit, so that margins are never zero and have no rounding error.
     """
 
     spacing: float = 1.0  # of positions, length

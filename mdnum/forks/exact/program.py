@@ -1,4 +1,4 @@
-"""The time steps of a run in exact real arithmetic. Interval arithmetic (Arb) proves every decision.
+"""Run a simulation in exact real arithmetic. Interval arithmetic (Arb) proves every decision.
 
 The initial state and all constants are the double-precision numbers of the simulation, treated as exact.
 Positions and velocities are represented by intervals ("balls") in multiple-precision arithmetic. A decision
@@ -298,7 +298,7 @@ class _Run:
         return math.ceil(1.1 * rate * self.steps) + 2 * _BITS_LEFT
 
     def all(self, progress, restarts: int) -> ExactHistory:
-        """Run all steps, and return the decisions with their proof."""
+        """Run all steps, prove every decision, and return the decisions."""
         from flint import ctx
 
         begin, before = time.perf_counter(), ctx.prec
