@@ -19,7 +19,7 @@ def smallest(name: str) -> float:
 
 
 def columns(quantities: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the largest and smallest magnitude in each row of quantities (rows, values) as table columns.
+    """Return columns with the largest and smallest magnitude per row of arrays of shape (rows, values).
 
     `largest_NAME` is the largest magnitude in a row, `smallest_NAME` the smallest nonzero magnitude (or NaN).
     """

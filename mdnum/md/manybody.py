@@ -81,7 +81,7 @@ class ManyBody(eqx.Module):
         cell: Float[Array, "3 3"],
         deformation: Float[Array, "3 3"],
     ) -> Float[Array, ""]:
-        """Return the energy of positions and lattice vectors (rows) times a deformation near identity."""
+        """Return the energy if positions and lattice vectors (rows) are multiplied by a matrix near 1."""
         return self.energy(positions @ deformation, neighbor, cell @ deformation)
 
     def forces(

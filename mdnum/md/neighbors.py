@@ -127,7 +127,7 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Return neighbor table, atom order and largest neighbor count; above `slots`, pairs are missing."""
+        """Return neighbor table, atom order, largest neighbor count (if above `slots`, pairs are missing)."""
         ...
 
 

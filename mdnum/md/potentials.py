@@ -421,7 +421,7 @@ class CutPotential(eqx.Module):
         return self.cutoff.cut(r2, u, w, here, *weights)
 
     def jumps(self) -> Float[np.ndarray, "2 terms types"]:
-        """Return jumps of energy and radial force as a pair of weight 1 enters r_cut, by term and type."""
+        """Return energy and radial-force jumps when a weight-1 pair enters the cutoff, by term and type."""
         # in numpy: to jax each operation on these few numbers is a program to compile
         made = self.cutoff.jumps(jax.tree.map(np.asarray, self).at_cutoff())
         return np.array(made).swapaxes(0, 1)
@@ -482,7 +482,7 @@ class Channels(eqx.Module):
         return jnp.concatenate([part.r_cut for part in self.parts])
 
     def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
-        """Return jumps of energy and radial force as a pair enters r_cut, by term, channel and pair type."""
+        """Return energy and radial-force jumps when a pair enters the cutoff, by term, channel and type."""
         sides = zip(*(part.jumps() for part in self.parts), strict=True)
         return np.stack([np.asarray(block_diag(*one)) for one in sides])
 

@@ -43,7 +43,7 @@ class StepAtCutoff(ClassicalCalculator):
 
 
 class SpeciesSum(ClassicalCalculator):
-    """Mixture of single-species calculators; unlike pairs have the energy of all pairs minus like pairs.
+    """Mixture of one-species calculators: the energy of unlike pairs is the total minus that of like pairs.
 
     Args:
         parts: (calculator, species a, species b) for every pair of species in the structure.

@@ -463,7 +463,7 @@ PLACES, ATOMS = 8, 32  # places at random, and atoms nearest to each whose energ
 def neighborhoods(
     atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
 ) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
-    """Yield nonperiodic clusters around random positions: a group of atoms and all atoms within `reach`.
+    """Yield nonperiodic clusters at random positions: a group of atoms, and all atoms within `reach` of it.
 
     For a pair potential with range `reach`, the atoms of the group have the same energies and forces in the
     cluster as in the whole system. Neighbors are found from distances between atoms and images, without

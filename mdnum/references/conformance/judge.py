@@ -512,7 +512,7 @@ class Report:
             tally.why[result.refused[1]] = tally.why.get(result.refused[1], 0) + 1
 
     def reach(self, case: Case) -> float:
-        """Return the largest allowed distance of pairs from a list that may include pairs beyond the cutoff.
+        """Return the largest distance allowed for a pair in a list that may include pairs beyond the cutoff.
 
         Both atoms of a pair may have moved as far as the skin allows since the neighbor list was built.
         """
