@@ -216,7 +216,7 @@ class _Lines(io.TextIOWrapper):
             raise ValueError(f"the file has a line of more than {_LONGEST_LINE:,} characters")
         self._at_end = 0 if line else self._at_end + 1
         if self._at_end > _PATIENCE:
-            raise ValueError("the file ends with less data than its header announces")
+            raise ValueError("the file contains less data than its header states")
         return line
 
 

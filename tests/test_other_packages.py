@@ -175,10 +175,10 @@ def test_a_gradient_method(site):
     [
         (CUTOFF.replace(old, new), message)
         for old, new, message in (
-            ("w - share", "w + share", "slope … derivative … energy … r = 1, r_cut = 2"),
+            ("w - share", "w + share", "r = 1, r_cut = 2 … slope … derivative … energy"),
             ("u - share * r2", "u - share * r2 + 1", "energy jumps … -1 … r_cut … smoothness … 0"),
             ("smoothness = 0", "smoothness = 1", "slope jumps … 0.125 … r_cut … smoothness … 1"),
-            ("smoothness = 0", "smoothness = -1", "smoothness = -1 … energy is continuous"),
+            ("smoothness = 0", "smoothness = -1", "smoothness -1 … energy is continuous"),
             ("name = ", "nam = ", "has no name"),
         )
     ],

@@ -396,7 +396,7 @@ _ANSWERS = {
 def test_more_questions_than_anybody_waits_for_are_refused(tmp_path):
     from mdnum.verbs.conform import conform
 
-    with pytest.raises(InputError, match="1,000,000,000 random cases"):
+    with pytest.raises(InputError, match="1,000,000,000 random test cases"):
         conform("ase", cases=10**9, out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

@@ -123,10 +123,10 @@ class _Builder:
             return self.best  # on which no atom feels another: the forces say so
         if made is None:
             raise InputError(
-                f"the calculator computed no energy, neither for single elements nor for water ({why}; "
-                f"structure saved in {saved})",
+                f"the calculator computed no energy for any crystal of one element, nor for water ({why}; "
+                f"the structure was saved in {saved})",
                 where=self.name,
-                remedy="Give a structure that the calculator supports with --structure FILE",
+                remedy="Use --structure FILE to give a structure that the calculator supports",
             )
         return self._mixed(made)
 

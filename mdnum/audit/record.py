@@ -66,8 +66,8 @@ def load_calculator(words: str) -> LoadedCalculator:
     made = make()
     if not _is_calculator(made):
         raise InputError(
-            f"the given object is of type {type(made).__name__}; expected an ASE calculator, with the "
-            "methods get_potential_energy and get_forces",
+            f"the given object is of type {type(made).__name__}; expected an ASE calculator with "
+            "the methods get_potential_energy and get_forces",
             where=text,
             remedy=_WAYS,
         )
@@ -93,7 +93,7 @@ def _of_system(text: str) -> LoadedCalculator:
                 remedy=f"For a Python class, put a colon before the class name: {module}:{last}",
             ) from error
         raise InputError(
-            f"{error.message}, and the given name is neither a Python class nor a Python file",
+            f"the given name is neither a Python class nor a Python file, and {error.message}",
             where=error.where,
             remedy=f"{error.remedy}. {_WAYS}" if error.remedy else _WAYS,
         ) from error
@@ -158,7 +158,7 @@ def kept(folder: RunFolder) -> AuditState:
         FolderError: answers.json does not contain an audit.
     """
     if not (folder.path / NAME).exists():
-        raise FolderError("the folder holds no audit", remedy="Start a new audit", where=str(folder.path))
+        raise FolderError("the folder has no saved audit", remedy="Start a new audit", where=str(folder.path))
     state = restored(folder, AuditState)
     with restoring(folder.path / NAME):
         assert state.atoms

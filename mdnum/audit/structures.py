@@ -38,9 +38,9 @@ def read_structure(words: str | Path) -> Atoms:
     path, which = (Path(head), index) if separator and not Path(text).exists() else (Path(text), "-1")
     if not path.is_file():
         raise InputError(
-            "no such structure file",
+            "the structure file does not exist",
             where=str(path),
-            remedy="Correct the path given to --structure, or omit the option",
+            remedy="Correct the path given to --structure, or omit --structure",
         )
     with reading(text, by="ASE", remedy=CHECK_STRUCTURE):
         chosen = list(ase_images(path, which))
@@ -50,12 +50,12 @@ def read_structure(words: str | Path) -> Atoms:
         raise InputError(
             several if chosen else f"the file has no structure {which} (it has {count})",
             where=text,
-            remedy="Select one structure by its index: file@0 is the first structure, file@-1 the last",
+            remedy="Add the index of one structure to the path: file@0 selects the first, file@-1 the last",
         )
     atoms = chosen[0]
     if not len(atoms):
         raise InputError(
-            "the structure holds no atoms", where=text, remedy="Give another file or index, such as file@0"
+            "the structure contains no atoms", where=text, remedy="Give another file or another index"
         )
     bad = ~np.isfinite(atoms.positions).all(axis=1)
     if bad.any() or not np.isfinite(np.asarray(atoms.cell)).all():

@@ -237,7 +237,7 @@ class ExactPenalty(_Motion):
         _positive("damping", self.damping, zero=True)
         if self.damping**2 == 4 * self.k:
             raise InputError(
-                "no formula is available at critical damping", remedy="Change the damping slightly"
+                "no formula describes the motion at critical damping", remedy="Change the damping slightly"
             )
 
     def state(self, t: Times) -> tuple[Known, Known]:
@@ -326,7 +326,7 @@ def _positive(name: str, value: float, *, zero: bool = False, most: float = np.i
 def _numbers(n: Counts, least: int = 1) -> Float[np.ndarray, "*counts"]:
     n = np.asarray(n, np.float64)
     if np.any(n < least) or np.any(n != np.floor(n)) or np.any(np.isinf(n)):
-        raise InputError(f"the impact number is {n!r}; expected an integer of at least {least}")
+        raise InputError(f"there is no impact number {n!r}; impacts are numbered by integers from {least}")
     return n
 
 

@@ -91,13 +91,13 @@ class BallProgram:
         kinds = [type(one.problem.world.contact).__name__ for one in (self, other)]
         if kinds[0] != kinds[1] or (self.problem.world.lift is None) != (other.problem.world.lift is None):
             raise InputError(
-                f"the contact models {kinds[0]} and {kinds[1]} involve different kinds of decisions",
-                remedy="Compare only programs with the same kind of contact model",
+                f"the runs have contact models {kinds[0]} and {kinds[1]}, whose decisions cannot be compared",
+                remedy="Compare only runs with the same kind of contact model",
             )
         if self.size != other.size:
             raise InputError(
-                f"the programs have {self.size} and {other.size} balls",
-                remedy="Compare programs with the same number of balls",
+                f"the two runs have {self.size} and {other.size} balls",
+                remedy="Compare runs with the same number of balls",
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
@@ -328,7 +328,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
             ends[name] = int(broken.argmax()) - 1
     last = min([a.steps, *ends.values()])
     if last < 0:
-        raise InputError("initial heights or velocities exceed the dtype's range", remedy="Use a wider dtype")
+        raise InputError("an initial height or velocity overflows its dtype", remedy="Use a wider dtype")
     return last, {name: "blow-up" if ends.get(name) == last else "" for name in "AB"}
 
 

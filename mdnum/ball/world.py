@@ -245,7 +245,7 @@ def _check(world: World) -> None:
         if name != "eps" or contact.smooth:
             _in_range(name, world.value(name))
     if world.control is not None and not np.all(np.isfinite(np.asarray(world.control, np.float64))):
-        raise InputError("the control acceleration contains a number that is not finite")
+        raise InputError("the control acceleration has an infinite or NaN value; expected finite values")
     if isinstance(integrator, EventLocated):
         if not isinstance(contact, Impact):
             raise InputError(
@@ -257,7 +257,7 @@ def _check(world: World) -> None:
         gain = float(contact.alpha) * float(contact.k)
         if gain >= 2:
             raise InputError(
-                f"alpha * k = {gain:g}; the iterated projection out of the floor converges only below 2",
+                f"alpha * k = {gain:g}; the iteration that lifts the ball off the floor needs less than 2",
                 remedy="Choose alpha * k below 2; at alpha * k = 1, one iteration is enough",
             )
         _check_stop(contact.stop, world.policy, gain)
@@ -275,7 +275,7 @@ def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
         if not float(rule.enter) >= float(rule.rule.tol):
             raise InputError(
                 f"the stopping rule has enter = {rule.enter}, below tol = {rule.rule.tol}",
-                remedy="Set enter to at least tol, the residual below which iteration ends",
+                remedy="Set enter to at least tol: iterations end when the residual falls below tol",
             )
         return
     tol = float(rule.tol)
@@ -285,12 +285,12 @@ def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
     role = max(usable, key=lambda one: usable[one])
     if not tol >= usable[role]:
         raise InputError(
-            f"the tolerance tol = {tol:g} is too small for {role} computed in {getattr(policy, role)}",
+            f"tol = {tol:g} cannot be reached, because precision.{role} is {getattr(policy, role)}",
             remedy=f"The smallest usable tolerance is {usable[role]:.3g}",
         )
     limit = limits.largest(policy.decision)
     if tol > limit:
-        raise InputError(f"the tolerance {tol:g} exceeds the largest {policy.decision} number, {limit:g}")
+        raise InputError(f"tol = {tol:g} exceeds {limit:g}, the largest number of type {policy.decision}")
 
 
 def _count(name: str, value: int) -> None:

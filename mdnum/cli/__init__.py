@@ -119,7 +119,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         sys.exit(EXIT_STOPPED)
     except MemoryError as error:
         needed = f"more memory is needed than there is ({error})"
-        asked = InputError(needed, remedy="Reduce the number of atoms, balls or steps of the simulation")
+        asked = InputError(needed, remedy="To save memory, simulate fewer atoms, balls or steps")
     except OSError as error:
         # a full disk, a folder without write permission: the person's to mend, not a bug to trace
         where = str(error.filename) if error.filename else None

@@ -236,8 +236,8 @@ def calibrate(
     """
     if members < FEWEST:
         raise InputError(
-            f"members = {members}: too few runs in the ensemble for a statistical limit",
-            remedy=f"Give at least {FEWEST} members",
+            f"members = {members}: the ensemble has too few runs to estimate a statistical limit",
+            remedy=f"Set members to at least {FEWEST}",
         )
     expect_at_least(0, held_out=held_out)
     expect_at_least(1, tries=tries, steps=1 if steps is None else steps)
@@ -304,12 +304,12 @@ def choose(windows: Sequence[Window], name: str) -> Window:
         if not one.ok
     )
     raise InputError(
-        f"after {steps} steps the deliberate changes cannot be distinguished from rounding errors (best at "
-        f"step {best.step}: {missed})",
+        f"after {steps} steps the effects of the deliberate changes cannot be distinguished from those of "
+        f"rounding errors (the best step was {best.step}: {missed})",
         where=name,
         remedy=(
-            "Compare at an earlier step, before the runs of the ensemble diverge, or start from a hotter "
-            "fluid"
+            "Compare at an earlier step, before the runs of the ensemble diverge, or start from a fluid "
+            "at a higher temperature"
         ),
     )
 

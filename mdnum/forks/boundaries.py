@@ -314,7 +314,7 @@ def checked(program: Program, key: str, low: float, high: float) -> Number:
     """
     number = program.number(key)
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise InputError(f"the interval from {low!r} to {high!r} is invalid", remedy="Give finite LOW < HIGH")
+        raise InputError(f"invalid interval {low!r}:{high!r}", remedy="Give two finite numbers, LOW < HIGH")
     if number.positive and (low < 0 if number.zero else low <= 0):
         raise InputError(
             f"{number.key} = {low!r}; expected a value {'of at least' if number.zero else 'above'} 0"

@@ -100,7 +100,7 @@ def tangents(
     tangent = np.asarray(dx, np.float64).T, np.asarray(dv, np.float64).T
     first = _length(tangent, clock)
     if not (np.isfinite(first) and first > 0):
-        raise InputError("the perturbation is zero or not finite", remedy="Give a nonzero perturbation")
+        raise InputError("the perturbation (dx, dv) is zero or not finite", remedy="Give nonzero dx or dv")
     for segment in Engine(simulation, steps).segments():
         order = segment.table.order
         tables = simulation.tables(segment.table)
@@ -276,7 +276,7 @@ def lyapunov(simulation: Simulation, steps: int | None = None, *, seed: int = 0)
     last = simulation.steps if steps is None else steps
     if last < 10 * BLOCKS:
         raise InputError(
-            f"steps = {last} is too small for a growth rate", remedy=f"Give at least {10 * BLOCKS} steps"
+            f"{last} steps are too few for a Lyapunov exponent", remedy=f"Give at least {10 * BLOCKS} steps"
         )
     dx = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
     dx -= dx.mean(axis=0)
@@ -456,7 +456,7 @@ def forecast(
         dx = direction(simulation, seed)
     change = [np.zeros(shape) if part is None else np.asarray(part, np.float64) for part in (dx, dv)]
     if any(part.shape != shape for part in change):
-        raise InputError(f"the perturbation must have the shape of the positions, {shape}")
+        raise InputError(f"dx and dv must have the same shape as the positions, {shape}")
     dx, dv = change
     parts = list(tangents(simulation, last, dx, dv))
     tables = [part.segment.table for part in parts]

@@ -138,7 +138,7 @@ def fork(
     expect_at_least(1, steps=asked)
     tolerance = SPLIT * a.scale if split is None else split
     if not 0 < tolerance < np.inf:
-        raise InputError(f"split = {tolerance:g}; expected a length above 0")
+        raise InputError(f"split = {tolerance:g}; expected a distance between runs A and B above 0")
     guard = _GUARD * tolerance
     gathered: list[PairRows] = []
     flips: list[Any] = []
@@ -183,7 +183,7 @@ def counterfactuals(
     most = repeats_asked(repeats, runs, reason or "such runs are disabled")
     if back and not runs:
         raise InputError(
-            "the option back was given, but run B is not repeated with the decisions of run A: "
+            "the option back needs a repeat of run B with the decisions of run A, but there is none: "
             f"{reason or 'such runs are disabled'}",
             remedy="Omit the option `back`",
         )
@@ -200,13 +200,13 @@ def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such ru
         return REPEATS if counterfactual else 0
     if repeats < 0 or 0 < repeats < FEWEST:
         raise InputError(
-            f"repeats = {repeats}; expected either 0 or at least {FEWEST} repeats",
+            f"repeats = {repeats}; expected 0 or at least {FEWEST} repeated runs",
             remedy="Fewer repeats cannot give a significant result" if repeats > 0 else None,
         )
     if repeats and not counterfactual:
         raise InputError(
-            f"repeats = {repeats}, but run B is not repeated with A's decisions: {why}",
-            remedy="Set repeats = 0, or omit the option",
+            f"repeats = {repeats}, but run B cannot be repeated with the decisions of run A: {why}",
+            remedy="Set repeats = 0, or omit repeats",
         )
     return repeats
 
@@ -368,7 +368,7 @@ def screen(
     """
     choices = list(shipped(world_of(system)).values()) if choices is None else choices
     if not choices:
-        raise InputError("no numerical choice was given", remedy="Give at least one, such as precision")
+        raise InputError("no numerical choice was given", remedy="Give a choice to vary, such as precision")
     rows: list[Screened] = []
     with engines.requested(on, workers) as engine:
         sent = system if engine is None else packed(system)

@@ -150,9 +150,9 @@ def variants(
 
     check_one_box(system.integrator, "variants in processes of their own")
     if not system.pairwise:
-        raise InputError("variants of a many-body potential cannot be compared", where=system.name)
+        raise InputError("numerical variants of many-body potentials cannot be compared", where=system.name)
     if steps < 1 or not which:
-        raise InputError("a comparison needs at least one step and one variant", where=f"steps = {steps}")
+        raise InputError("give at least one step and one variant to compare", where=f"steps = {steps}")
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         question = _question(system, steps, folder)
@@ -176,7 +176,7 @@ def variants(
     reference, own = next(((row, x) for row, x in found if x is not None), (None, None))
     if reference is None or own is None:
         row = found[0][0]
-        raise MdnumError(f"all variants failed; the error of {row.variant.name!r} was: {row.failed}")
+        raise MdnumError(f"the runs of all variants failed; {row.variant.name!r} failed with: {row.failed}")
     cell = Cell.create(np.asarray(system.cell.matrix), system.pbc)
 
     def furthest(one: np.ndarray, other: np.ndarray) -> float:

@@ -378,9 +378,9 @@ class StretchReversal:
         force: Any = simulation.force
         if guard is not None and not simulation.imposable:
             raise InputError(
-                "flips of pair decisions can be included in the gradient only for pair potentials whose "
-                "energy is summed over the listed pairs",
-                remedy="Use the gradient method symmetric for a many-body potential",
+                "the gradient can include flips of pair decisions only for a pair potential whose energy is "
+                "summed over the pairs of the neighbor list",
+                remedy="For a many-body potential, use the gradient method symmetric",
                 where=simulation.name,
             )
         if simulation.integrator.moves_cell:

@@ -349,7 +349,7 @@ class RandomizedSmoothing(BallMethod):
         """
         if not self.width > 0 or self.samples < 2:
             raise InputError(
-                f"the smoothing width is {self.width} and the number of samples {self.samples}",
+                f"width = {self.width} and samples = {self.samples} give no average over random parameters",
                 remedy="Choose a width above 0 and at least 2 samples.",
             )
         at = problem.origin(names)

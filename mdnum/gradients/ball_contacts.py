@@ -108,13 +108,13 @@ class Implicit(BallMethod):
             raise InputError(
                 f"the contact {type(contact).__name__} is not solved by iteration, so the implicit gradient "
                 "method has no fixed point to differentiate",
-                remedy="Use the gradient method unrolled, or for an impact contact event-aware.",
+                remedy="Use the gradient method unrolled; for an impact contact, use event-aware.",
             )
         gain = float(contact.alpha) * float(contact.k)
         condition = max(1.0, gain + self.regularization) / min(1.0, gain + self.regularization)
         if condition > LIMIT:
             raise InputError(
-                f"the implicit equation has condition number {condition:.3g}; expected at most {LIMIT:g}",
+                f"the equation of implicit has condition number {condition:.3g}; expected at most {LIMIT:g}",
                 remedy="Set a regularization; the derivative is then that of the regularized problem.",
             )
         rule = FixedPointRule(self.regularization, self.at_iterate)
@@ -225,7 +225,7 @@ def softened(problem: BallProblem, eps: float) -> BallProblem:
     rate, h = speed / eps, float(world.integrator.h)
     if h * rate * _RESOLVED > 1.001:
         raise InputError(
-            f"the ball crosses the contact layer of width {eps:g} m in {1 / rate:.3g} s, too fast for "
+            f"the ball crosses the smoothed contact of width {eps:g} m in {1 / rate:.3g} s, too fast for "
             f"a time step of {h:g} s",
             remedy=f"Choose an eps of at least {_RESOLVED * speed * h:.2g} m, or a shorter time step.",
             where="eps",
@@ -296,7 +296,7 @@ class ThroughContacts(BallMethod):
         if flagged:
             raise NumericalError(
                 f"the ball only grazes the floor in {int(flagged)} contacts, whose times have no derivative",
-                remedy="Change the start or the time step so that the ball hits, or smooth the contact.",
+                remedy="Change the initial state or time step so that the ball hits, or smooth the contact.",
             )
         use = used(problem, names, slopes, run, own=located or smooth)
         for name in names:

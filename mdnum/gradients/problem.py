@@ -55,8 +55,8 @@ class Problem:
         assert self.simulation.propagator is not None
         if not self.loss.looks_at(np.arange(self.steps + 1), self.steps).any():
             raise InputError(
-                f"the loss {self.loss.name} is evaluated at none of the steps 0 to {self.steps}",
-                remedy="Run more steps, or evaluate the loss at earlier or more steps",
+                f"the loss {self.loss.name} is not evaluated at any step from 0 to {self.steps}",
+                remedy="Run more steps, or evaluate the loss at earlier steps or more often",
             )
         around = surroundings(self.simulation)
         why = self.loss.reason_unavailable(around)

@@ -103,9 +103,9 @@ def passed(
     lost = not all(np.isfinite(one).all() for one in gradient.values())
     if lost and not problem.simulation.pairwise and (operation := second_derivative(problem.simulation)):
         raise NumericalError(
-            f"a second derivative of the energy function is not finite, in the operation {operation}",
+            f"the operation {operation} of the energy function has a second derivative that is not finite",
             where=problem.simulation.model.name,
-            remedy="Mask the argument of that operation, not only its result",
+            remedy="Mask the argument of the operation with jnp.where, not only its result",
         )
     return ReversePass(tape, parts, gradient, crossings if saltation else [], speed)
 

@@ -200,7 +200,7 @@ class RunTape:
         skin = self.simulation.rule.skin
         if segment.closes == "displacement" and segment.moved > skin:
             raise NumericalError(
-                f"the neighbor list may miss pairs at step {segment.last}: since the list was built an atom "
+                f"the neighbor list may miss pairs at step {segment.last}: since its last rebuild an atom "
                 f"has moved {segment.moved:.3g}, more than the skin of {skin:.3g}",
                 remedy="Use a wider skin, or a smaller time step if atoms move that far in one step",
             )
@@ -342,8 +342,8 @@ class ReversibleTape(RunTape):
     def _astray(self, step: int, last: int) -> None:
         where = f"at step {step}" if last - step <= 1 else f"between steps {step} and {last}"
         raise NumericalError(
-            f"the reversed run did not retrace the forward run: positions or velocities deviated {where}",
-            remedy="Rebuild the neighbor list more often (neighbors.rebuild); it may have missed pairs",
+            f"the reversed run differs from the forward run: positions or velocities deviate {where}",
+            remedy="Rebuild the neighbor list more often (neighbors.rebuild), since it may have missed pairs",
             where=self.simulation.name,
         )
 

@@ -50,13 +50,13 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
-        raise InputError("table file not found", where=where, remedy="Correct potential.file") from None
+        raise InputError("potential table not found", where=where, remedy="Correct potential.file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"the potential table cannot be read ({error})", where=where) from error
     try:
         count, *elements = lines[3].split()
         if int(count) != len(elements):
-            raise ValueError(f"line 4 gives the number of elements as {count}, but names {len(elements)}")
+            raise ValueError(f"line 4 states that there are {count} elements, but names {len(elements)}")
         first, drho, second, dr, r_cut = (float(word) for word in lines[4].split())
         n_rho, n_r = int(first), int(second)
     except (IndexError, ValueError) as error:
@@ -67,8 +67,8 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
         ) from error
     if len(elements) != 1:
         raise InputError(
-            f"the potential table is for {len(elements)} elements ({', '.join(elements)}); expected a table "
-            "for a single element",
+            f"the potential table contains {len(elements)} elements ({', '.join(elements)}), but mdnum "
+            "supports only tables of one element",
             where=where,
             remedy="Give a table for a single element",
         )
@@ -82,13 +82,13 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
     words = " ".join(lines[6:]).split()
     expected = n_rho + 2 * n_r
     if len(words) != expected:
-        raise InputError(f"found {len(words)} numbers after line 6; expected {expected}", where=where)
+        raise InputError(f"the table has {len(words)} numbers after line 6; expected {expected}", where=where)
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError as error:
         raise InputError(f"a number in the potential table cannot be read ({error})", where=where) from error
     if not np.isfinite(numbers).all() or min(drho, dr, r_cut) <= 0 or min(n_rho, n_r) < 5:
-        raise InputError("the table contains numbers that are not finite, or empty grids", where=where)
+        raise InputError("the potential table contains invalid numbers or too few grid points", where=where)
     # many files end one step before their cutoff: the last cubic is carried on, as ASE does it
     if r_cut > n_r * dr * (1 + 1e-9):
         raise InputError(

@@ -236,7 +236,7 @@ def energy_function(
     if not others or not callable(function := others[0 if first else -1]):
         seen = ", ".join(type(part).__name__ for part in parts)
         raise InputError(
-            f"expected an energy function; found {seen}", remedy="Give a function, or (neighbor_fn, function)"
+            f"expected an energy function, not {seen}", remedy="Give energy_fn, or (neighbor_fn, energy_fn)"
         )
     start = others[0] if not first and len(others) > 1 else None
     if not name:
@@ -247,7 +247,7 @@ def energy_function(
     how = replace(how, images=lists is not None and "MultiImage" in type(lists).__name__)
     if how.parameters and parameters is None and start is None:
         raise InputError(
-            f"{name} takes parameters as its first argument, but none were given", remedy="Give parameters="
+            f"{name} takes parameters as its first argument, but none were given", remedy="Add parameters=..."
         )
     length, energy = _scales(units, name)
     tree = () if parameters is None else jax.tree.map(jnp.asarray, parameters)
@@ -274,7 +274,7 @@ def recognized(function: Callable[..., Any], parameters: bool, name: str) -> Con
     if placed and (names[0] in _GRAPHS or "Graph" in str(placed[0].annotation)):
         raise InputError(
             f"the energy function {name} takes a graph; expected a function of a neighbor list",
-            remedy="Call it from a function energy(parameters, R, neighbor, cell) that makes the graph "
+            remedy="Wrap it in a function energy(parameters, R, neighbor, cell) that makes the graph "
             "from neighbor.idx and mdnum.md.jaxmd.displacement(cell)",
         )
     open_ended = any(one.kind == kinds.VAR_KEYWORD for one in given)
@@ -296,6 +296,6 @@ def _scales(units: Any, name: str) -> tuple[float, float]:
         return LENGTHS[length], ENERGIES[energy]
     except (ValueError, KeyError):
         raise InputError(
-            f"{units!r} is not a known pair of units for the energy function {name}",
+            f"the units {units!r} of the energy function {name} are not known",
             remedy=f"Give a length unit ({', '.join(LENGTHS)}) and an energy unit ({', '.join(ENERGIES)})",
         ) from None

@@ -410,9 +410,9 @@ def counted(x: Float[Array, "*shape"], zero: jax.Array) -> jax.Array:
 def _counted_jvp(primals, tangents):
     # a derivative of 0 would be taken for an answer
     raise InputError(
-        "a step in fixed-point arithmetic has no derivative, because numbers are rounded to integers",
+        "a time step in fixed-point arithmetic has no derivative, because it rounds numbers to integers",
         where="precision.state",
-        remedy="Use --methods reversible or symmetric, which differentiate as if nothing were rounded",
+        remedy="Use --methods reversible or symmetric, which differentiate the step without rounding",
     )
 
 

@@ -314,7 +314,7 @@ class KickDrift(Integrator):
         own = ("kick", "init", "finish", "begin", "deform")
         if other := [name for name in own if getattr(cls, name) is not getattr(KickDrift, name)]:
             raise TypeError(
-                f"the class {cls.__name__} overrides {other[0]}; derive it from Integrator, not KickDrift"
+                f"the class {cls.__name__} overrides {other[0]}; derive it from Integrator instead"
             )
 
     def kick(self, v: Vector, time: Number, acceleration: Vector) -> Vector:

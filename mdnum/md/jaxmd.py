@@ -69,7 +69,7 @@ def displacement(
     ) -> Array:
         if Ra.shape != (3,) or Rb.shape != (3,):
             # jax-md probes with one and two dimensions and moves on at a ValueError
-            raise ValueError(f"points of shapes {Ra.shape} and {Rb.shape}; expected shape (3,) for both")
+            raise ValueError(f"the two positions have shapes {Ra.shape} and {Rb.shape}; expected (3,) each")
         vector = Ra - Rb
         if periodic:
             lattice = jnp.asarray(base if cell is None else cell, vector.dtype)
@@ -140,7 +140,7 @@ def scalar(value: float | np.ndarray) -> Float[Array, ""]:
 
 def _refuse_update(*_: Any, **__: Any) -> NeighborList:
     raise InputError(
-        "the neighbor list was built outside of jax-md, so it cannot be updated with its method update",
+        "the method update does not work for a neighbor list that was built outside of jax-md",
         remedy="Build a new neighbor list with mdnum.md.jaxmd.as_neighbor_list",
     )
 
@@ -253,8 +253,8 @@ class PairSearch:
         # a hair beyond half the width is the room that callers add for rounding, not another image
         if not 0 < r_list <= narrowest / 2 * (1 + 1e-9):
             raise InputError(
-                f"the radius of the neighbor list (cutoff plus skin) is {r_list:g}, in a cell {narrowest:g} "
-                f"wide; expected at most half the width, {narrowest / 2:g}",
+                f"the radius of the neighbor list (cutoff plus skin) is {r_list:g}, but the cell is "
+                f"{narrowest:g} wide; expected a radius of at most half the width, {narrowest / 2:g}",
                 remedy="Repeat the cell along its narrowest direction, or reduce the cutoff or the skin",
             )
         self.cell = complete(cell, np.asarray(pbc))
@@ -284,7 +284,7 @@ class PairSearch:
 
         def metric(Ra: Array, Rb: Array, **_: Any) -> Array:
             if Ra.shape != (3,):
-                raise ValueError("the positions are not three-dimensional; expected three coordinates each")
+                raise ValueError("a position does not have three coordinates; expected x, y and z")
             delta = Ra - Rb
             delta = delta - jnp.where(wraps, jnp.round(delta), 0.0)
             return delta[0] * rows[0] + delta[1] * rows[1] + delta[2] * rows[2]
@@ -327,7 +327,7 @@ class PairSearch:
             with standard_promotion(), _quiet_scatter():
                 found = self._allocate(folded)
             if bool(found.did_buffer_overflow):
-                raise CapacityError("the neighbor list of jax-md overflows directly after its allocation")
+                raise CapacityError("jax-md allocated a neighbor list that is too small for its pairs")
             self._list = found
         idx = np.asarray(found.idx)
         vectors = positions[np.minimum(idx, atoms - 1)] - positions[:, None, :]

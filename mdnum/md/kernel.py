@@ -265,7 +265,7 @@ def _written(
         if isinstance(value, _Value):
             if value.kind != kind:
                 raise TypeError(
-                    "an operation of the potential mixes numbers with truth values in a way that cannot be "
+                    "an operation of the potential mixes numbers with booleans in a way that cannot be "
                     "compiled"
                 )
             return value.name
@@ -353,7 +353,7 @@ def _written(
             "select_n": given[0] != "BOOL",
         }
         if line is None or not kind or unlike.get(name):
-            raise TypeError("an operation of the potential is not supported in the compiled loop")
+            raise TypeError("the potential uses an operation that the compiled loop does not support")
         operands = list(map(text, inputs, given))
         if kind == "VEC" and name in ("mul", "div"):
             return [product(*operands) if name == "mul" else quotient(*operands)]

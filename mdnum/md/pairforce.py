@@ -290,8 +290,8 @@ class ChannelForce(PairForce):
 
     def judge(self, positions):
         raise InputError(
-            "the terms of the potential have different cutoff radii, so there is no single decision for "
-            "each pair of atoms",
+            "the terms of the potential have different cutoff radii, so a pair of atoms can be "
+            "inside one cutoff and outside another",
             remedy="Give all terms of the potential the same cutoff radius",
         )
 

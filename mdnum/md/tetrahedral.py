@@ -183,6 +183,6 @@ def named(
     """
     made, sets = _SETS[kind]
     if parameters not in sets:
-        known = f"{'are' if len(sets) > 1 else 'is'} {' and '.join(sets)}"
-        raise InputError(f"{kind} has no set of parameters called {parameters!r}; known {known}")
+        known = f"{'sets are' if len(sets) > 1 else 'set is'} {' and '.join(sets)}"
+        raise InputError(f"{kind} has no parameter set called {parameters!r}; the known {known}")
     return made(**sets[parameters], pbc=pbc)

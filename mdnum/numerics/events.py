@@ -29,7 +29,7 @@ class Threshold:
 
     def __post_init__(self):
         if self.comparison not in INCLUSIVE:
-            raise InputError(f"the comparison is {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
+            raise InputError(f"the operator is {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
 
     def margin(self, quantity):
         """Return the threshold minus the compared quantity, which is positive if the decision is "yes".
@@ -61,14 +61,14 @@ class Hysteresis:
     def __post_init__(self):
         if self.enter.space != self.leave.space:
             raise InputError(
-                f"the two thresholds are for different quantities, {self.enter.space} and {self.leave.space}"
+                f"enter and leave limit different quantities, {self.enter.space} and {self.leave.space}"
             )
         enter, leave = self.enter.value, self.leave.value
         # traced values are checked where they were made
         if isinstance(enter, float | int) and isinstance(leave, float | int) and leave < enter:
             raise InputError(
-                f"the threshold for leaving is {leave:g}, below the threshold for entering, {enter:g}",
-                remedy="Set the threshold for leaving to at least the threshold for entering",
+                f"the threshold leave = {leave:g} is below the threshold enter = {enter:g}",
+                remedy="Set leave to at least the value of enter",
             )
 
     def margin(self, quantity, before):

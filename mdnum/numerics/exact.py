@@ -209,7 +209,7 @@ def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list
         if (inner := inlined(equation)) is not None:
             return interpreted(inner, inputs, rule, enter)
         if name not in _IN_BALLS:
-            raise TypeError(f"the operation {name} is not supported")
+            raise TypeError(f"the operation {name} is not supported in exact arithmetic")
         return [_IN_BALLS[name](*inputs, **equation.params)]
 
     return lambda *balls: interpreted(program, balls, rule, enter)

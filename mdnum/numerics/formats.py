@@ -171,5 +171,5 @@ def check_scale(scale: float) -> None:
     if not (scale > 0 and math.frexp(scale)[0] == 0.5):
         raise InputError(
             f"the scale of the number format is {scale:g}; expected a power of two",
-            remedy="Give a power of two, with which scaling causes no rounding",
+            remedy="Give a power of two, so that scaling numbers causes no rounding errors",
         )

@@ -145,7 +145,7 @@ class FixedPoint(Reduction):
 
     def __post_init__(self):
         if abs(self.bits) > 1000:
-            raise InputError(f"bits = {self.bits} is out of range", remedy="Give -1000 to 1000 bits.")
+            raise InputError(f"bits = {self.bits} is out of range", remedy="Choose bits from -1000 to 1000.")
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """Return the sum, which is computed with one int64 as accumulator."""

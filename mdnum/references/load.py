@@ -91,7 +91,7 @@ class NamedObject:
     def _module(self, anew: bool) -> ModuleType:
         path = Path(self.home).expanduser()
         if self.is_file and not path.is_file():
-            raise InputError("no such file", where=self.home, remedy="Give the path of a Python file")
+            raise InputError("the file is missing", where=self.home, remedy="Give the path of a Python file")
         try:
             if not self.is_file:
                 search_last(".", self.home)  # a module beside the person is found, too

@@ -60,7 +60,7 @@ class _Fields(string.Formatter):
         if format_spec.lstrip("+").isdigit():
             return words.number(value, int(format_spec), signed=format_spec.startswith("+"))
         if format_spec:
-            raise ValueError(f"{format_spec!r} is not a format for a field of a sentence")
+            raise ValueError(f"{format_spec!r} is not a valid format of a field in a report sentence")
         return cell(value)
 
     def get_value(self, key: int | str, args: Any, kwargs: Any) -> Any:
@@ -68,7 +68,7 @@ class _Fields(string.Formatter):
             return revived(super().get_value(key, args, kwargs))
         except (KeyError, IndexError):
             raise KeyError(
-                f"a sentence uses the field {key!r}; the given fields are {', '.join(kwargs) or 'no values'}"
+                f"a report sentence uses the field {key!r}, but was given {', '.join(kwargs) or 'no values'}"
             ) from None
 
 

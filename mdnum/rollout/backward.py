@@ -137,9 +137,9 @@ class BackwardRun:
     ):
         if simulation.fixed_point is None:
             raise InputError(
-                "the run uses floating-point steps, which cannot be reversed exactly",
+                "the run uses floating-point arithmetic, so its steps cannot be reversed exactly",
                 where="precision.state",
-                remedy='Set state = "lattice" for reversible fixed-point steps',
+                remedy='Set state = "lattice", which makes the steps reversible by fixed-point arithmetic',
             )
         self.simulation = simulation
         self.baths = dict(baths or {})
@@ -183,7 +183,7 @@ class BackwardRun:
             return
         self._check_bath()
         if step not in self.baths:
-            raise NumericalError(f"the velocity bits lost to friction before step {step} were not stored")
+            raise NumericalError(f"velocity bits that friction removed before step {step} were not stored")
         self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
@@ -191,6 +191,6 @@ class BackwardRun:
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(
-                f"the reversed run did not retrace the forward run: at step {step}, bits of the velocities "
-                "are left that friction had not removed"
+                f"the reversed run differs from the forward run: at step {step}, stored bits of velocities "
+                "are left that friction did not remove in the forward run"
             )

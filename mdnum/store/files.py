@@ -182,7 +182,7 @@ def _refuse(seen: os.stat_result, path: Path, in_place: bool) -> None:
 def _linked(path: Path) -> FolderError:
     return FolderError(
         "the file is a link; expected a regular file in the result folder",
-        remedy="If you trust the file that the link leads to, replace the link by a copy",
+        remedy="If you trust the linked file, replace the link with a copy of the file",
         where=str(path),
     )
 

@@ -167,7 +167,7 @@ class RunFolder:
         expect_path(path, "Give the folder of a run")
         folder = cls(Path(path))
         if not folder.path.is_dir():
-            raise FolderError("no such folder", remedy="Give the folder of a run", where=str(path))
+            raise FolderError("the folder does not exist", remedy="Give the folder of a run", where=str(path))
         names = (*_FILES, "parts", manifest.NAME)
         if not any([*((folder.path / name).exists() for name in names), *folder.path.glob("*.parquet")]):
             raise FolderError("the folder holds no run", remedy="Give the folder of a run", where=str(path))
@@ -742,7 +742,7 @@ def restoring(path: Path) -> Iterator[None]:
     except _OF_WRONG_VALUES as error:
         seen = " ".join(str(error).split())[:200]
         raise FolderError(
-            f"the file has content that mdnum never writes into it ({type(error).__name__} {seen})",
+            f"the file contains data that mdnum never writes into it ({type(error).__name__}: {seen})",
             remedy="Restore the file from a copy, or start again in a new folder",
             where=str(path),
         ) from error

@@ -59,16 +59,16 @@ class Layout:
                 f"invalid kind {self.kind!r}, command {self.command!r} or resumes_from {self.resumes_from!r}"
             )
         if len(self.further) > _MOST_COLUMNS:
-            raise ValueError(f"the list of further files has too many characters: {self.further[:100]!r}")
+            raise ValueError(f"the list `further` has too many characters: {self.further[:100]!r}")
         if len(self.tables) > _MOST_TABLES or not all(map(_TABLE.fullmatch, self.tables)):
-            raise ValueError(f"too many tables, or invalid names of tables: {list(self.tables)[:3]}")
+            raise ValueError(f"the layout has too many tables or an invalid name: {list(self.tables)[:3]}")
         _ = self._columns
         for table, texts in (self.described or {}).items():
             for column, said in texts.items():
                 if "*" not in column and column not in self.columns(table):
-                    raise ValueError(f"{table}.{column} is described, but the table has no such column")
+                    raise ValueError(f"{table}.{column} has a description, but the table has no such column")
                 if (len(said) != 2 and type(said) is not str) or len("".join(said)) > _MOST_COLUMNS:
-                    raise ValueError(f"{table}.{column} is {said!r:.100}; expected [unit, description]")
+                    raise ValueError(f"{table}.{column} = {said!r:.100}; expected a list [unit, description]")
         for table, values in self.usual.items():
             for column, value in values.items():
                 kind, _ = self.columns(table)[column]

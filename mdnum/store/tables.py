@@ -347,7 +347,7 @@ class _Writing:
         while (table := self._tables.get()) is not None:
             yield table
         if not self._whole:
-            raise RuntimeError("some rows of the table were not written")
+            raise RuntimeError("some rows of the result table were not written to its file")
 
     def put(self, table: pa.Table | None) -> None:
         """Add a table to the queue when there is room; raise the error of the writing thread, if any."""

@@ -70,7 +70,7 @@ def parse(text: str) -> Axis:
     if found := _RANGE.fullmatch(rest):
         return Axis(key, _range(text, *map(scalar, found.groups())))
     if re.fullmatch(r"[-+.\deE]+(:[-+.\deE]*)+", rest):
-        raise InputError(f"--over {text!r} is not a range of values", remedy=_REMEDY)
+        raise InputError(f"--over {text!r} is not a range LOW:HIGH:STEP", remedy=_REMEDY)
     # lists of a file ([4, 4, 4]) have commas of their own
     parts = re.split(r",(?![^\[]*\])", rest)
     return checked(Axis(key, tuple(scalar(part.strip()) for part in parts)))
@@ -151,7 +151,7 @@ def points(
         for axis in axes:
             chosen += [{**base, axis.key: value} for value in axis.values if value != base[axis.key]]
     if len(chosen) * len(seeds) > MOST_POINTS:
-        raise InputError(f"a sweep of {len(chosen) * len(seeds):,} points; expected at most {MOST_POINTS:,}")
+        raise InputError(f"sweep of {len(chosen) * len(seeds):,} points; expected at most {MOST_POINTS:,}")
     return [Point(choices, seed) for seed in seeds for choices in chosen]
 
 
@@ -160,7 +160,7 @@ def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
     from scipy.stats import qmc
 
     if samples < 2 or samples & (samples - 1):
-        raise InputError(f"{samples} samples were requested", remedy="Give a power of two, such as 16")
+        raise InputError(f"samples = {samples} is not a power of two", remedy="Give for example 16")
     unit = qmc.Sobol(len(axes), rng=np.random.default_rng(0)).random(samples)
     rows = []
     for row in unit:

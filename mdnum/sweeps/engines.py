@@ -254,7 +254,7 @@ def opened(on: str | Executor | TaskEngine | None, workers: int | None) -> Itera
     elif on.endswith(".toml"):
         engine = _executorlib(on, workers)
     else:
-        raise InputError(f"unknown engine {on!r}", remedy="Give tcp://HOST:PORT of dask or a .toml file")
+        raise InputError(f"unknown engine {on!r}", remedy="Give a dask scheduler (tcp://...) or a .toml file")
     try:
         yield engine
     finally:

@@ -103,7 +103,7 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
     if isinstance(system, Simulation):
         if overrides:
             raise InputError(
-                "overrides have no effect on a loaded system", where=system.name, remedy=_CHANGE_OBJECTS
+                "overrides cannot change a loaded system", where=system.name, remedy=_CHANGE_OBJECTS
             )
         return system
     system = load(system, overrides, world="md")

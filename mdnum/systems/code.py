@@ -46,7 +46,7 @@ def parts(place: str, folder: Path, where: str = "potential.function") -> tuple[
     """
     file, _, name = place.rpartition(":")
     if not file.endswith(".py") or not name.isidentifier():
-        raise InputError(f"the given text is {place!r}; expected the form FILE.py:NAME", where=where)
+        raise InputError(f"{place!r} does not have the form FILE.py:NAME", where=where)
     return folder / file, name
 
 
@@ -68,7 +68,7 @@ def function(place: str, folder: Path, where: str = "potential.function") -> Cal
             remedy="Read the code, then give --allow-code, or allow_code=True in Python",
         )
     if not file.is_file():
-        raise InputError("no such file", where=str(file), remedy=f"Correct the file name in {where}")
+        raise InputError("file not found", where=str(file), remedy=f"Correct the file name in {where}")
     own = f"mdnum_code_{file.stem}"
     # anew each time: inspect reads the source of what is defined there now
     sys.modules.pop(own, None)

@@ -180,7 +180,7 @@ def simulation(
     if isinstance(integrator, Integrator):
         if also := [*given, *(["timestep"] if timestep is not None else [])]:
             message = f"the integrator is an object, but {', '.join(also)} was given as well"
-            raise InputError(message, where=name, remedy="Omit these, or give the integrator's name")
+            raise InputError(message, where=name, remedy="Omit other values, or give the integrator by name")
         _check_instance(integrator, system, name)
     else:
         if timestep is None:
@@ -319,8 +319,8 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
         k, kind = np.unravel_index(np.argmax(differs), u.shape)
         first, second = pairs_of[kind].split("-")
         raise InputError(
-            f"the pair energy at distance {r[k, kind]:.6g} is {u[k, kind]:.12g} for the species {first}, "
-            f"{second}, but {swapped[k, kind]:.12g} for {second}, {first}; expected equal energies",
+            f"the pair energy at distance {r[k, kind]:.6g} is {u[k, kind]:.12g} for the species "
+            f"{first}-{second}, but {swapped[k, kind]:.12g} for {second}-{first}; expected equal energies",
             where=potential.name,
             remedy="Combine the parameters of the two species symmetrically, for example as (a + b) / 2",
         )
@@ -336,7 +336,7 @@ def common(terms: Mapping[str, Term]) -> Cut:
     if len(set(compared.values())) != 1:
         seen = ", ".join(f"{name} {compare!r}" for name, compare in compared.items()) or "no term"
         message = f"all terms must use the same comparison; found {seen}"
-        raise InputError(message, where="cutoff.compare", remedy="Give all terms the same cutoff.compare")
+        raise InputError(message, where="cutoff.compare", remedy="Set the same cutoff.compare in all terms")
     return next(iter(terms.values())).cutoff
 
 

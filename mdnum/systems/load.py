@@ -81,7 +81,7 @@ def find(name: str | Path) -> tuple[str, Path]:
     if path.is_file():
         return path.stem, path
     if path.suffix == ".toml":
-        raise InputError("no such system file", where=text, remedy="Check the path")
+        raise InputError("the system file does not exist", where=text, remedy="Check the path")
     known = names()
     if text in known:
         return text, shipped_folder() / f"{text}.toml"
@@ -329,7 +329,7 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
     if spec.balls != base.balls:
         raise InputError(
             f"the variant {name!r} has {spec.balls} balls, but the system has {base.balls}, so their "
-            "decisions cannot be compared",
+            "contact decisions cannot be compared",
             where=where,
             remedy="Use the same number of balls in the variant and in the system",
         )
@@ -414,7 +414,7 @@ def load(
     if isinstance(name, System | BallSystem):
         if overrides:
             remedy = "Load it with the overrides, or give its name"
-            raise InputError("overrides have no effect on a loaded system", where=name.name, remedy=remedy)
+            raise InputError("overrides cannot change a loaded system", where=name.name, remedy=remedy)
         _check_world(name.name, isinstance(name, BallSystem), world)
         return name
     found, path = find(name)
@@ -447,7 +447,7 @@ def _is_ball(data: Mapping[str, Any], where: str) -> bool:
     if "world" not in data:
         if "contact" in data:
             raise InputError(
-                "key 'world' missing in the system file",
+                "the system file has a table [contact], but no key `world`",
                 where=where,
                 remedy='Add `world = "ball"` at the top of the file',
             )

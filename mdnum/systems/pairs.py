@@ -47,8 +47,8 @@ def pair_constants(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> 
     if missing:
         known = ", ".join(potential.pairs) if potential.pairs else "one set for all"
         raise InputError(
-            f"the structure holds {', '.join(species)}, but [potential] has no parameters for "
-            f"{', '.join(missing)} (it has {known})",
+            f"the structure contains {', '.join(species)}, but [potential] has no parameters for "
+            f"{', '.join(missing)} (parameters given: {known})",
             remedy=f"Add the table [potential.pairs.{missing[0]}], or correct the species of the structure",
         )
     return {

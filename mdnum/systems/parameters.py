@@ -237,7 +237,7 @@ def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation
         here, new = value(simulation, name), np.asarray(given)
         if new.shape != here.shape or np.iscomplexobj(new) or not np.isfinite(new).all():
             raise InputError(
-                f"{name}: the new value has shape {new.shape} and type {new.dtype} (all finite: "
+                f"the new value of {name} has shape {new.shape} and type {new.dtype} (all finite: "
                 f"{bool(np.isfinite(new).all())}); expected finite real numbers of shape {here.shape}"
             )
         place = entry(simulation, name)
@@ -371,7 +371,7 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
             return ends[0]
         if ends:
             several = f"{word!r} is ambiguous: it could be any of {', '.join(ends)}"
-            raise InputError(several, remedy="Give the full name of one of these parameters")
+            raise InputError(several, remedy="Give the full name, such as potential.sigma")
     if entry(simulation, word).index:
         return word
     hint = meant(word, [*known, *(name.rpartition(".")[2] for name in known)]) + "Choose from "

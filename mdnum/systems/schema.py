@@ -87,7 +87,7 @@ class PairPotentialTable(TomlTable):
         if not pairs:
             missing = [key for key in self.constants if getattr(self, key, None) is None]
             if missing:
-                raise ValueError(f"{', '.join(missing)} missing; give values here or in the table `pairs`")
+                raise ValueError(f"{', '.join(missing)} missing; give a value here or in the table [pairs]")
         return self
 
     @property
@@ -279,14 +279,14 @@ class CutoffTable(TomlTable):
         if self.radius is not None and self.in_sigma is not None:
             raise ValueError("the cutoff radius is given twice, by radius and by in_sigma; remove one key")
         if self.base is None and not self.pairs:
-            raise ValueError("the cutoff radius is missing; give radius or in_sigma, or a table pairs")
+            raise ValueError("no cutoff radius was given; add the key radius or in_sigma, or the table pairs")
         if self.onset is None:
             return self
         if not self.switches:
             raise ValueError(f"onset is given, but {self.kind} cutoffs have no switching range; remove onset")
         if self.base is None:
             raise ValueError(
-                "onset is given without radius or in_sigma, relative to which onsets of pairs are scaled"
+                "onset needs the key radius or in_sigma, because the onset of each pair scales with it"
             )
         if self.onset >= self.base:
             raise ValueError(f"the switching onset {self.onset:g} is not below the cutoff {self.base:g}")
@@ -615,7 +615,7 @@ class SystemSpec(TomlTable):
         if self.potential is not None:
             check_interaction(self.potential, self.cutoff)
         if len({one.cutoff.compare for one in self.interactions.values() if one.cutoff}) > 1:
-            raise ValueError("the potential terms differ in cutoff.compare; expected the same in all")
+            raise ValueError("the potential terms differ in cutoff.compare; expected one value in all terms")
         return self
 
     @property

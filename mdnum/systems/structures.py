@@ -115,7 +115,7 @@ def _read(path: Path, index: int) -> Atoms:
     from ase import Atoms
 
     if not path.is_file():
-        raise InputError("no such structure file", where=str(path), remedy="Correct the key structure.file")
+        raise InputError("structure file not found", where=str(path), remedy="Correct the key structure.file")
     if path.suffix == ".extxyz" and index in (0, -1) and (ours := _from_extxyz(path)) is not None:
         return ours
     with reading(path, by="ASE", remedy=CHECK_STRUCTURE):
@@ -239,8 +239,8 @@ def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
     if (places > farthest).any():
         worst = int(np.argmax(places))
         raise InputError(
-            f"atom {worst} ({atoms.symbols[worst]}) has a coordinate of {places[worst]:g} {length}, at "
-            f"which rounding is {np.spacing(places[worst]):.2g} {length}; expected at most {farthest:.3g} "
+            f"atom {worst} ({atoms.symbols[worst]}) has a coordinate of {places[worst]:g} {length}, with "
+            f"a rounding error of {np.spacing(places[worst]):.2g} {length}; expected at most {farthest:.3g} "
             f"{length}, {_FARTHEST:g} times the cutoff radius",
             remedy="Correct the coordinates or the length unit of the structure, or the key structure.rattle",
         )

@@ -259,7 +259,7 @@ class TomlTable(BaseModel):
                 if number and name != "tol" and not _SMALLEST <= abs(number) <= 1 / _SMALLEST:
                     raise ValueError(
                         f"{name} = {number:g}; expected 0 or a magnitude from {_SMALLEST:g} to "
-                        f"{1 / _SMALLEST:g}, so that the square can be represented"
+                        f"{1 / _SMALLEST:g}, so that its square can be represented"
                     )
         return self
 

@@ -184,7 +184,7 @@ class NeighborFlips(AnalysisBase):
         self._check = FrameCheck(seen, radius=smallest_radius(self.rules), bits=32)
         if bound is not None and not (math.isfinite(bound) and bound >= 0):
             message = f"bound = {bound!r}; expected a length of 0 or more, Å"
-            raise InputError(message, remedy="Omit `bound` to use the resolution of the file")
+            raise InputError(message, remedy="Omit `bound` to use the resolution of coordinates in the file")
         self._bound = bound
         self._resolution: Resolution | None = None
         self._other_box: tuple[str, Box] | None = None
@@ -219,7 +219,7 @@ class NeighborFlips(AnalysisBase):
                     raise InputError(
                         f"the transformation {name!r} of the trajectory cannot be sent to other processes, "
                         f"as {backend=} requires",
-                        remedy="Use backend='serial', or make it an "
+                        remedy="Use backend='serial', or derive the transformation from "
                         "MDAnalysis.transformations.TransformationBase with parallelizable=True",
                     )
         return super()._configure_backend(backend, *args, **kwargs)
@@ -468,4 +468,4 @@ def _cutoff(value: Any) -> Rule:
         return CutoffRule(length(value))
     except (TypeError, ValueError):
         message = f"r_cut = {value!r}; expected a length in Å, or lengths by pair of species"
-        raise InputError(message, remedy='Give a cutoff (8.5), {("O", "H"): 2.5}, or a list') from None
+        raise InputError(message, remedy='Give r_cut=8.5, {("O", "H"): 2.5} or a list of cutoffs') from None

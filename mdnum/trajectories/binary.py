@@ -182,7 +182,7 @@ class XtcFile(XdrFile):
         stream = np.frombuffer(self._read(size), np.uint8)
         self._read(-size % 4)
         if (_walk(stream, atoms, bits, small) + 7) // 8 != size:
-            raise ValueError("the file is damaged: stated and actual length of the coordinates differ")
+            raise ValueError("the file is damaged: the coordinates do not have the stated length")
 
 
 @njit

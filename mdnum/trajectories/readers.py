@@ -63,7 +63,7 @@ def open_trajectory(
     file, words = split_path(str(path))
     if words and slice:
         raise InputError(
-            f"frames are selected twice, by @{words} and by {slice!r}", remedy="Use only one of the two"
+            f"frames are selected twice, by @{words} and by {slice!r}", remedy="Use only one selection"
         )
     frames = parse_slice(slice or words, where=str(path))
     if file.is_dir() and (file / "trajectory.traj").exists():

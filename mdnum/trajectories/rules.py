@@ -28,7 +28,7 @@ NEVER = -1.0
 def _radius(value: float, where: str) -> None:
     if not (math.isfinite(value) and value > 0):
         message = f"a radius of {value!r}; expected a positive length"
-        raise InputError(message, remedy="Give the radius in the length unit of the trajectory", where=where)
+        raise InputError(message, remedy="Give the cutoff in the length unit of the trajectory", where=where)
 
 
 def _count(value: int, where: str) -> None:

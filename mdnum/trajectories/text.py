@@ -161,8 +161,8 @@ def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
         others = [word for word in words[:-1] if "." in word]
     if _is_cut(words[-1], others):
         raise ValueError(
-            f"the file ends in the middle of a number, {words[-1]!r}, which has fewer digits than the "
-            "numbers before it and is not followed by a newline; if the number is complete, add a newline"
+            f"the file ends in the middle of a number: {words[-1]!r} has fewer digits than the numbers "
+            "before it, and no newline follows. If the number is complete, add a newline"
         )
 
 
@@ -397,7 +397,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
     words = np.array("".join(rows).split(), dtype=object)
     if len(words) != len(rows) * len(columns):
         odd = next(row for row in rows if len(row.split()) != len(columns))
-        raise ValueError(f"found line {odd.strip()[:40]!r}; expected {len(columns)} columns per atom")
+        raise ValueError(f"the line of an atom is {odd.strip()[:40]!r}; expected {len(columns)} columns")
     return columns, words.reshape(len(rows), len(columns))
 
 
@@ -475,7 +475,7 @@ class GroTrajectory(TextTrajectory):
         if not box.endswith("\n"):
             refuse_cut_line([box], words[:-1])
             if len(words) < self._box_words:
-                raise ValueError(f"the file ends after {len(words)} numbers of the box line")
+                raise ValueError(f"the file ends in the box line of a frame, after {len(words)} numbers")
         self._box_words = len(words)
         return [title, count, *rows, box]
 
@@ -492,7 +492,7 @@ def _gro_box(line: str) -> Box:
     """Return the box from 3 diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; no box if all are 0."""
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
-        raise ValueError(f"the line with the box of a frame has {len(values)} numbers; expected 3 or 9")
+        raise ValueError(f"the box line of a frame has {len(values)} numbers; expected 3 or 9")
     if not any(values):
         return Box()
     xx, yy, zz, xy, xz, yx, yz, zx, zy = values if len(values) == 9 else [*values, *[0.0] * 6]

@@ -29,13 +29,13 @@ def _check(module: Any) -> None:
     commands = [*texts.get("commands", {}).values(), *filter(None, [texts.get("command")])]
     calls = [one["calls"] for one in commands]
     if lacking := [one for one in calls if not callable(getattr(module, one, None))]:
-        raise TypeError(f"{name} has no function {lacking[0]}, which its text file names")
+        raise TypeError(f"the module {name} has no function {lacking[0]}, which its .toml file names")
     if {*texts.get("kinds", ())} != {*getattr(module, "KINDS", ())}:
-        raise TypeError(f"KINDS of {name} differ from the kinds in its text file")
+        raise TypeError(f"the module {name} and its .toml file list different kinds of folders")
     for kind, said in texts.get("kinds", {}).items():
         Layout(kind, **said)
         if VERBS.place(home(kind)) != name:
-            raise ValueError(f"mdnum or another package already has folders of kind {kind!r}")
+            raise ValueError(f"mdnum or another package already writes folders of kind {kind!r}")
 
 
 #: Modules by command, with the subcommand if a command has several.

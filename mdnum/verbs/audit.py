@@ -266,7 +266,7 @@ def _wanted(checks: str | Sequence[str] | None) -> list[str]:
     names = frame.words(checks)
     expect_known("check", names, CHECKS)
     if not names:
-        raise InputError("no check was given", remedy=f"Choose from {', '.join(CHECKS)}")
+        raise InputError("no check of the calculator was selected", remedy=f"Choose from {', '.join(CHECKS)}")
     return conclusion.in_order(list(names))
 
 
@@ -313,7 +313,7 @@ def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator, d
     else:
         found = default_structure(loaded, deadline) if structure is None else read_structure(structure)
     if not len(found):
-        raise InputError("the structure has no atoms", remedy="Give a structure with atoms: -s FILE")
+        raise InputError("the structure has no atoms", remedy="Use -s FILE to give a structure with atoms")
     return found
 
 

@@ -64,7 +64,7 @@ class Options:
         """
         if not 0 <= self.cases <= MOST_CASES:
             raise InputError(
-                f"{self.cases:,} random cases were requested", remedy=f"Give 0 to {MOST_CASES:,} cases"
+                f"{self.cases:,} random test cases were requested", remedy=f"Give 0 to {MOST_CASES:,} cases"
             )
         expect_known("precision", [] if self.precision is None else [self.precision], PRECISIONS)
         expect_known("limit", self.limits, LIMITS)

@@ -193,7 +193,7 @@ def flips_each(
     from mdnum.sweeps import engines
 
     if isinstance(trajectories, str | Path):
-        raise InputError("found one path", where=str(trajectories), remedy="Give a list of paths")
+        raise InputError("found one path; expected a list", where=str(trajectories), remedy="Give [path]")
     if options.get("topology") is not None:
         options["topology"] = Path(options["topology"]).absolute()
     tasks = [(Path(one).absolute(), Path(out).absolute(), options) for one in trajectories]
@@ -369,7 +369,7 @@ def rules(
 
     if most is not None and not cutoffs:
         raise InputError(
-            "the option --most, for the nearest neighbors inside a cutoff, was given without a cutoff",
+            "the option --most selects the nearest neighbors inside a cutoff, but no cutoff was given",
             remedy="Add --cutoff R, or write --nearest K for the K nearest neighbors without a cutoff",
         )
     radii, species, counts = map(_listed, (cutoffs, pairs, nearest))
@@ -405,7 +405,7 @@ def _species_cutoffs(words: _Pairs) -> Mapping[Any, float]:
             length = math.nan
         if not (equals and dash and first and second) or "-" in second or not length > 0:
             raise InputError(
-                f"the part {part.strip()!r} of --pairs {words!r} is not of the form A-B=LENGTH", remedy=_PAIRS
+                f"{part.strip()!r} in --pairs {words!r} does not have the form A-B=LENGTH", remedy=_PAIRS
             )
         if {(first, second), (second, first)} & set(found):
             raise InputError(f"--pairs {words!r} gives {first}-{second} twice", remedy="Keep one of them")

@@ -59,7 +59,7 @@ def interval(text: str) -> tuple[str, float, float]:
         for key, low, high in _INTERVAL.findall(text):
             return key, float(low), float(high)
     seen = f"{text!r} is not of the form KEY=LOW:HIGH"
-    raise InputError(seen, remedy="Write for example potential.sigma=3.40:3.41")
+    raise InputError(seen, remedy="Write KEY=LOW:HIGH, for example potential.sigma=3.40:3.41")
 
 
 @frame.keywords_checked
@@ -353,7 +353,7 @@ def fork_forecast(
     from mdnum.forks.linearized import LINEAR, forecast
 
     if not 0 < size < float("inf"):
-        raise InputError(f"the displacement is {size:g}; expected a length above 0")
+        raise InputError(f"the largest displacement is {size:g}; expected a length above 0")
     loaded = of_md(system, keep.get("overrides"), "forecast", pairwise=True)
     last = last_step(loaded, steps)
     with frame.answering("forecast", f"fork-{loaded.name}", loaded, **keep) as answer:

@@ -285,7 +285,7 @@ def answering(
         InputError: overrides were given without a system. FolderError: the folder cannot be used.
     """
     if overrides and system is None:
-        raise InputError("overrides were given without a system file", remedy="Omit the overrides")
+        raise InputError("overrides were given without a system to change", remedy="Omit the overrides")
     began = perf_counter()
     with new_folder(kind, name, out, system=system) as folder:
         answer = Answer(folder, logged(folder, progress, STEPWISE))

@@ -90,7 +90,7 @@ def grad(
     from mdnum.systems.load import world_of
 
     if replicas < 0 or replicas == 1:
-        raise InputError(f"replicas = {replicas}; a standard error needs at least 2")
+        raise InputError(f"replicas = {replicas}; a standard error needs at least 2 replicas")
     names, further = words(wrt), words(also)
     asked = None if methods is None else words(methods)
     expect_known("part of a diagnosis", further, (*ALSO, ALL))

@@ -57,7 +57,7 @@ def separation(run: Sample, argument: str) -> Value:
     found = _pair(run, argument)
     grown = found.growth["B"]
     if not grown.plain:
-        raise InputError("the separation of two runs does not grow exponentially", remedy="Use more steps")
+        raise InputError("runs A and B do not diverge exponentially", remedy="Use more steps")
     return Value(float(grown.rate / found.twin.a.timestep))
 
 
@@ -105,9 +105,9 @@ def horizon(run: Sample, argument: str) -> Value:
     if found.trust is None:
         raise InputError(found.failed["trust"])
     if found.trust.verdict == "trusted":
-        raise InputError("the gradient is trusted for all steps of the run", remedy="Use more steps")
+        raise InputError("the gradient can be trusted for all steps of the run", remedy="Use more steps")
     if found.trust.verdict != "limited":
-        raise InputError(f"the trust horizon is undecided; not tested: {', '.join(found.trust.unknown)}")
+        raise InputError(f"the trust horizon is undecided; missing tests: {', '.join(found.trust.unknown)}")
     return Value(float(found.trust.horizon * run.simulation.integrator.timestep))
 
 

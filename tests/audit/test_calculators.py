@@ -81,7 +81,7 @@ def test_a_system_brings_its_structure_and_temperature():
         ("ase.calculators.tersoff:Tersoff", "Class(argument=value)"),
         ("ase.build:molecule('H2O')", "expected an ASE calculator"),
         ("argon/crystl-108", "Did you mean argon/crystal-108"),
-        ("none.py", "no such file"),
+        ("none.py", "the file is missing"),
         ("{folder}/fails.py", "ZeroDivisionError"),
         ("{folder}/empty.py", "or calc or make"),
     ],
@@ -229,7 +229,7 @@ def test_structures_from_files(tmp_path: Path):
     ase.io.write(tmp_path / "two.traj", [bulk("Ar"), bulk("Cu")])
     (tmp_path / "bad.extxyz").write_text("1\n\nAr 0 nan 0\n")
     for name, message in {
-        "none.xyz": "no such", "bad.extxyz": "not finite",
+        "none.xyz": "does not exist", "bad.extxyz": "not finite",
         "three.extxyz@9": r"@9: .*no structure 9 .*3\)",
         "three.extxyz@-4": r"no structure -4 .*3\)",
         "two.traj@2": r"no structure 2 .*2\)",

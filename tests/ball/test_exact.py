@@ -168,7 +168,7 @@ def test_no_time_is_lost_on_the_way_to_rest():
         (lambda: ExactImpact(y0=1.0, gravity=0.0), "gravity = 0"),
         (lambda: ExactImpact(y0=np.nan), "y0 = nan"),
         (lambda: ExactImpact(1.0, restitution=1.0).rest_time(), "never comes to rest"),
-        (lambda: ExactImpact(1.0).impact_time(0), "integer of at least 1"),
+        (lambda: ExactImpact(1.0).impact_time(0), "numbered by integers from 1"),
         (lambda: ExactImpact(1.0).height(-0.1), "time is negative"),
         (lambda: ExactPenalty(1.0, k=-1.0), "k = -1"),
         (lambda: ExactPenalty(1.0, k=25.0, damping=10.0), "critical damping"),

@@ -28,7 +28,7 @@ def copper(tmp_path: Path, monkeypatch) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("nowhere.py",), "no such file"),
+        (("nowhere.py",), "the file is missing"),
         ((EMT, "--checks", "curls"), "Did you mean curl?"),
         ((EMT, "-s", "no.xyz"), "no.xyz"),
         ((EMT, "-s", "cu.extxyz@7"), "cu.extxyz@7"),

@@ -159,7 +159,7 @@ def test_both_sides_differ_in_a_fresh_process(make, key, low, high, steps):
 @pytest.mark.parametrize(
     ("key", "low", "high", "words"),
     [
-        ("sigma", 2.0, 1.0, "interval from"),
+        ("sigma", 2.0, 1.0, "invalid interval"),
         ("timestep", -1.0, 1.0, "above 0"),
         ("position.7.x", 0.0, 1.0, "no atom 7"),
         ("sgima", 1.0, 2.0, "'sgima'"),

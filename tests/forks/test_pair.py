@@ -106,7 +106,7 @@ def test_the_other_displacement_is_two_decades_away_where_there_is_room(ulp, sep
     [
         ({"steps": 0}, "steps = 0"),
         ({"split": -1.0}, "split = -1"),
-        ({"repeats": 4, "counterfactual": False}, "repeats = 4, .*A's decisions"),
+        ({"repeats": 4, "counterfactual": False}, "repeats = 4, .*decisions of run A"),
         ({"repeats": 3}, "repeats = 3"),
         ({"back": True, "counterfactual": False}, "option back"),
     ],

@@ -95,11 +95,11 @@ def test_what_cannot_be_pinned_is_refused(found):
             pinned(found, [bad])
     with pytest.raises(InputError, match="do not fork"):
         pinned(replace(found, decision=None))
-    with pytest.raises(InputError, match="did not split"):
+    with pytest.raises(InputError, match="stayed close together"):
         minimal_cause(followed(1e-7, 37, repeats=0, counterfactual=False))
     labels = ReferenceFrame(np.roll(np.arange(108), 1), np.arange(3), np.ones(3), np.zeros(3))
     other = replace(found.twin, b=replace(found.twin.b, frame=labels))
-    with pytest.raises(InputError, match="different atom labels"):
+    with pytest.raises(InputError, match="number the atoms differently"):
         pinned(replace(found, twin=other))
 
 

@@ -103,7 +103,7 @@ def test_a_run_that_missed_pairs_is_not_found_back():
     # lists that are used far beyond their skin; the way back uses none of them so
     blind = {"skin": 0.02, "rebuild": {"every": 50, "delay": 50, "check": False}}
     simulation = small(neighbors=blind, dynamics={"kind": "nve", "timestep": 0.004, "temperature": 3.0})
-    with pytest.raises(NumericalError, match=r"deviated (at step|between steps) \d+"):
+    with pytest.raises(NumericalError, match=r"deviate (at step|between steps) \d+"):
         Reversible()(Problem(simulation, FinalProjection(), STEPS), ("sigma",))
 
 

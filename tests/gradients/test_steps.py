@@ -103,7 +103,7 @@ def test_bad_input_says_what_there_is(switched, silicon):
         (lambda: method(switched, ("seed",)), "no"),
         (lambda: method(switched, ("skin",)), "which list"),
         (lambda: Problem(simulation, vector, switched.steps), "scalar"),
-        (lambda: Problem(simulation, switched.loss, 3), "of the steps"),
+        (lambda: Problem(simulation, switched.loss, 3), "at any step"),
         (lambda: method(Problem(narrow, FinalProjection(), 10), ("sigma",)), "bfloat16 are rounded"),
         (lambda: EventAware()(silicon, ("x0",)), "pair potentials"),
     ):

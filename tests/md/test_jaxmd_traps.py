@@ -143,7 +143,7 @@ def test_a_shrinking_box_triggers_no_rebuild(md):
     )
     # mdnum's lists cannot update themselves: a new cell is a new search
     own = dense_list(silicon(0.0), 3.0)
-    with pytest.raises(InputError, match="cannot be updated"):
+    with pytest.raises(InputError, match="does not work"):
         own.update(own.reference_position)
 
 
@@ -159,7 +159,7 @@ def test_a_cutoff_over_half_the_box_has_no_flag(md):
     with pytest.raises(InputError, match=r"is 2\.6, .* 4 wide; .*, 2\."):
         jaxmd.PairSearch(np.eye(3) * side, ALWAYS, r_list)
     tilted = np.array([[6.0, 0, 0], [5.0, 6.0, 0], [0, 0, 6.0]])
-    with pytest.raises(InputError, match=r"in a cell 4\.60"):
+    with pytest.raises(InputError, match=r"the cell is 4\.60"):
         jaxmd.PairSearch(tilted, ALWAYS, 2.5)
 
 

@@ -262,7 +262,7 @@ def test_a_sum_of_nothing_is_zero_and_of_one_term_that_term():
         ("kahn", "'kahn'.*mean kahan"),
         ("exact:3", "'exact' takes no argument"),
         ("permuted:x", "'x' .*integer"),
-        ("blocked:1", "width 1 adds no terms"),
+        ("blocked:1", "cannot have width 1"),
     ],
 )
 def test_a_reduction_that_is_none(text, message):

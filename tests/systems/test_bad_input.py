@@ -110,7 +110,7 @@ OWN, PAIR = "epsilon = 0.0103235", "{ sigma = 1.0, epsilon = 1.0 }"
         (CUTOFF, "", None, "[cutoff] is missing"),
         (LJ, 'kind = "tersoff"', 10, "[cutoff]"),
         (f"[structure]\n{FILE}", "", None, "table [structure] missing"),
-        (FILE, 'file = "gone.extxyz"', None, "gone.extxyz: no such structure file"),
+        (FILE, 'file = "gone.extxyz"', None, "gone.extxyz: structure file not found"),
         ("[neighbors]", "[neighbors]\nrebuild = 5", 17, "neighbors.rebuild = 5 … a table"),
         (OWN, f"{OWN}\npairs.ArKr = {PAIR}", None, "'ArKr' … two species … hyphen"),
         (OWN, f"{OWN}\npairs.Ar-Kr = {PAIR}\npairs.Kr-Ar = {PAIR}", None, "is given twice"),
@@ -239,7 +239,7 @@ def test_unknown_species(folder: Path):
     atoms.symbols[5] = "Kr"
     change(folder, atoms)
     said = refusal(folder)
-    assert "the structure holds Ar, Kr" in said
+    assert "the structure contains Ar, Kr" in said
     assert "no parameters for Ar-Ar, Ar-Kr, Kr-Kr" in said
     with_pairs = """kind = "lennard-jones"
 pairs.Ar-Ar = { sigma = 3.4, epsilon = 0.01 }

@@ -117,7 +117,7 @@ def test_the_world_decides_what_is_loaded(files: dict[str, Path]):
     edit(files["penalty"], 'world = "ball"', 'world = "bal"')
     assert "world = 'bal'; expected \"ball\"" in refusal(files["penalty"])
     edit(files["penalty"], 'world = "bal"\n', "")
-    assert "key 'world' missing" in refusal(files["penalty"])
+    assert "no key `world`" in refusal(files["penalty"])
     assert 'Add `world = "ball"`' in refusal(files["penalty"])
 
 

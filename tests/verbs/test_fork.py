@@ -287,7 +287,7 @@ def test_what_is_refused_leaves_no_folder(tmp_path, system, vary, options, words
 
 def test_overrides_of_a_loaded_system_and_used_folders_are_refused(tmp_path, file):
     for system in (load("pair/at-cutoff"), load(file)):
-        with pytest.raises(InputError, match="no effect on a loaded"):
+        with pytest.raises(InputError, match="cannot change a loaded"):
             mdnum.fork(system, "precision", overrides={"dynamics.steps": 3})
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(FolderError, match="already holds"):
@@ -421,7 +421,7 @@ def test_a_replay_meets_the_stored_runs(runs, capsys):
     lines = printed(capsys)
     assert any(line.startswith("precision.force float64 float32") for line in lines)
     assert call("fork", "compare", str(runs / "a"), str(runs / "nowhere")) == 2
-    assert "no such folder" in capsys.readouterr().err
+    assert "the folder does not exist" in capsys.readouterr().err
 
 
 def test_two_finished_runs_of_a_ball(tmp_path, monkeypatch):

@@ -144,7 +144,7 @@ def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> 
             raise
         message = f"{type(choice).__module__} reads the tables of a system file, but was given a Simulation"
         raise InputError(
-            message, where=choice.name, remedy="Read about `mdnum.choices` in docs/extending.md"
+            message, where=choice.name, remedy="See how to write a choice in docs/extending.md"
         ) from error
     except InputError as error:
         # the choice is named where this is printed
@@ -190,7 +190,7 @@ def parse(text: str, world: str | None = None) -> Choice:
     if family in _PROGRAMS:
         raise InputError(
             f"the choice {text} needs separate processes, so it cannot be varied between two runs",
-            remedy="Run `mdnum fork processes SYSTEM`, which compares such variants",
+            remedy="Run `mdnum fork processes SYSTEM`, which compares runs in separate processes",
         )
     if head in CHOICES and (argument or not equals) and (both or not at):
         kind: type[Choice] = CHOICES[head]

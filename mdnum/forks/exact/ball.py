@@ -93,8 +93,8 @@ class _ExactBall:
             raise InputError(
                 f"the contact {type(contact).__name__} with the integrator {type(scheme).__name__} cannot "
                 "be computed exactly from sums and products",
-                remedy="Use explicit Euler, semi-implicit Euler or velocity Verlet, and a contact that is "
-                "not smooth",
+                remedy="Use explicit Euler, semi-implicit Euler or velocity Verlet, and a contact "
+                "without smoothing",
             )
         self.world, self.contact_model, self.scheme = world, contact, scheme
         self.value = {name: exactly(world.value(name)) for name in world.parameters}

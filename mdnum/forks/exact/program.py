@@ -194,7 +194,7 @@ def _without_balls(simulation: Simulation) -> InputError | None:
     except TypeError as error:
         return InputError(
             f"the potential {simulation.potential.name!r} cannot be evaluated in exact arithmetic: {error}",
-            remedy="Use a potential made of the operations that docs/compiled-loop.md lists",
+            remedy="Use only the operations listed in docs/compiled-loop.md in the potential",
             where="potential.kind",
         )
     return None
@@ -271,9 +271,9 @@ class ExactProgram:
                 failed = run.step
             bits = max(more, bits + bits // 2)
         raise InputError(
-            f"with {bits} bits it cannot be decided whether a pair at step {failed} is inside the cutoff; "
-            "its distance may equal the cutoff exactly",
-            remedy="Change a starting position by one unit in the last place",
+            f"at step {failed}, arithmetic with {bits} bits cannot decide if a pair is inside the cutoff; "
+            "the distance of the pair may equal the cutoff exactly",
+            remedy="Change one initial coordinate by one unit in the last place",
         )
 
 

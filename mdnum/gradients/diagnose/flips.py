@@ -88,8 +88,8 @@ def flips(
     kept = [name for name in full if name not in skipped]
     if not kept:
         raise InputError(
-            f"the parameter {', '.join(full)} has {sizes[full[0]]} entries, too many to compute the "
-            "contributions of flips to each derivative",
+            f"the parameter {', '.join(full)} has {sizes[full[0]]} entries, too many to compute how "
+            "much the flips contribute to each derivative",
             remedy="Give a scalar parameter",
         )
     if made is None:
@@ -189,14 +189,14 @@ def edges(
     here = parameters.value(problem.simulation, full)
     if here.shape:
         raise InputError(
-            f"decision boundaries are located along one number, but {full} has {here.size} entries",
+            f"decision boundaries are located by varying one number, but {full} has {here.size} entries",
             remedy="Give a scalar parameter",
         )
     value = float(here)
     if value == 0 or not 0 < reach < 1:
         raise InputError(
-            f"the parameter {full} is {value:g} and reach is {reach:g}; expected a nonzero parameter and a "
-            "relative reach between 0 and 1"
+            f"the parameter {full} is {value:g} and reach is {reach:g}; expected a nonzero parameter and, as "
+            "reach, a fraction of it between 0 and 1"
         )
     program = MdProgram(problem.simulation)
 

@@ -295,9 +295,7 @@ class Jacobian:
     def __init__(self, tape: RunTape, clock: float):
         check_kick(tape.simulation.integrator)
         if not isinstance(tape.simulation.force, PairForce):
-            raise InputError(
-                "the Jacobian of a step is available only for pair potentials", where=tape.simulation.name
-            )
+            raise InputError("the Jacobian of a time step needs a pair potential", where=tape.simulation.name)
         self.tape, self.clock = tape, clock
         self.force: PairForce = tape.simulation.force
         self.coordinates = 6 * tape.simulation.atoms
@@ -417,7 +415,7 @@ def spectrum(
     timestep = float(simulation.integrator.timestep)
     jacobian = Jacobian(tape, CLOCK_STEPS * timestep)
     if not 1 <= values <= jacobian.coordinates or rounds < 1:
-        raise InputError(f"{values = }, {rounds = }; expected values up to {jacobian.coordinates}, both ≥ 1")
+        raise InputError(f"{values = }, {rounds = }; expected 1 to {jacobian.coordinates} values, 1 round")
     vectors = min(values + extra, jacobian.coordinates)
     rng = np.random.default_rng(seed)
     start, _ = np.linalg.qr(rng.standard_normal((jacobian.coordinates, vectors)))

@@ -299,15 +299,15 @@ def trust(
     kept = [name for name in full if np.size(parameters.value(simulation, name)) <= MOST]
     if not kept:
         raise InputError(
-            f"the parameter {', '.join(full)} has too many entries to compute a trust horizon for each",
+            f"the parameter {', '.join(full)} has too many entries to compute a horizon for each one",
             remedy="Give a scalar parameter, such as dynamics.temperature",
         )
     if replicas == 1 or replicas < 0:
         raise InputError(
-            f"replicas = {replicas}; a standard error needs at least 2", remedy="Give 0 or at least 2"
+            f"replicas = {replicas}; a standard error needs 2 replicas", remedy="Give 0 or at least 2"
         )
     if not 0 < tolerance < 1:
-        raise InputError(f"the relative tolerance is {tolerance:g}; expected a number between 0 and 1")
+        raise InputError(f"tolerance = {tolerance:g}; expected a relative difference between 0 and 1")
     at = spread(problem, points)
     if made is None or growth is None:
         near = Near(simulation, pace_of(problem.loss, problem.steps)) if saltation else None

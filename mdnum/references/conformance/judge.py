@@ -367,7 +367,7 @@ class Failed:
 
     def __post_init__(self) -> None:
         if not self.failures or any(failure.step >= self.case.steps for failure in self.failures):
-            raise ValueError("a test case is marked as failed without a failure at one of its steps")
+            raise ValueError("a test case is marked as failed, but none of its steps has a failure")
 
     @property
     def worst(self) -> Failure:
@@ -399,8 +399,8 @@ class CaseAnswers:
         steps += [result.refused[0]] if result.refused is not None else []
         if result.case != case.name or any(step >= case.steps for step in steps):
             raise InputError(
-                f"test case {number} is {result.case!r} in the folder, but {case.name!r} with {case.steps} "
-                "steps in the installed version of mdnum",
+                f"test case {number} of the folder is {result.case!r}, but in the installed version of mdnum "
+                f"it is {case.name!r} with {case.steps} steps",
                 remedy="Start the tests again in a new folder",
             )
         return result

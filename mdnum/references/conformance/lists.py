@@ -226,6 +226,6 @@ def _check_signatures(made: Any, name: str, kept: bool) -> None:
                 "Accept these arguments, in order" if given else "Give a class that is made without arguments"
             )
             raise InputError(
-                f"{name}{word}{signature} cannot be called with ({', '.join(given)}): {error}",
+                f"{name}{word}{signature} cannot be called with the arguments ({', '.join(given)}): {error}",
                 remedy=order if kept else _WANTED,
             ) from error

@@ -135,7 +135,7 @@ def test_a_stop_that_differs_is_dated():
     [
         (Impact(), EventLocated(0.01), "sums and products"),
         (Penalty(900.0), ImplicitMidpoint(0.01), "ImplicitMidpoint"),
-        (Penalty(900.0, eps=0.01, smooth=True), SemiImplicitEuler(0.01), "not smooth"),
+        (Penalty(900.0, eps=0.01, smooth=True), SemiImplicitEuler(0.01), "without smoothing"),
     ],
 )
 def test_what_is_not_rational_is_refused(contact, scheme, message):
