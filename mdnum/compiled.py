@@ -24,14 +24,14 @@ _missed: list[Any] = []  # what could not be kept
 
 
 def njit(function: Any = None, /, **options: Any) -> Any:
-    """`numba.njit` without the global lock; compiled functions are cached on disk if a folder is writable."""
+    """`numba.njit` without the global lock; compiled functions are cached on disk if a cache is writable."""
     if function is None:
         return lambda function: njit(function, **options)
     return _kept(lambda keep: numba.njit(cache=keep, nogil=True, **options)(function))
 
 
 def cfunc(signature: Any, function: Callable[..., Any]) -> Any:
-    """`numba.cfunc` with compiled functions cached on disk if a folder is writable."""
+    """`numba.cfunc` with compiled functions cached on disk if a cache folder is writable."""
     return _kept(lambda keep: numba.cfunc(signature, cache=keep)(function))
 
 

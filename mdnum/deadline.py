@@ -84,7 +84,7 @@ def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
 def fewest(
     items: Sequence[T], enough: Callable[[list[T]], bool], spent: Callable[[], bool] = lambda: False
 ) -> list[T]:
-    """Return a subset of items that satisfies a condition, and that is minimal unless time ran out.
+    """Return a subset of items that satisfies a condition; the subset is minimal unless time ran out.
 
     Args:
         items: items that are sufficient together.

@@ -3,10 +3,10 @@
 All tests of `mdnum doctor` are computations on the current machine. Package versions that are known to be
 faulty are also reported, but no version is assumed correct.
 
-Error bounds require that +, -, *, / and sqrt are each correctly rounded, and that sums are not reordered. On
-CPUs, XLA rounds correctly and does not reorder sums, but contracts a*b+c and rewrites divisions by constants.
-Contractions and rewritten divisions change the last bits of results. Two builds of a program may therefore
-decide differently on a pair whose distance differs from the cutoff by less than the error bound.
+Error bounds in mdnum require that +, -, *, / and sqrt are correctly rounded and that sums are not reordered.
+On CPUs, XLA rounds correctly and does not reorder sums, but contracts a*b+c and rewrites divisions by
+constants. Contractions and rewritten divisions change the last bits of results. Two builds of a program may
+therefore decide differently on a pair whose distance differs from the cutoff by less than the error bound.
 """
 
 from __future__ import annotations

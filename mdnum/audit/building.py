@@ -185,7 +185,7 @@ class _Builder:
 
 
 def meant_for(calculator: Any, words: str) -> list[str]:
-    """Return the elements named in a calculator's arguments, file or documentation, most likely first."""
+    """Return the elements named in a calculator's arguments, file or documentation, likeliest ones first."""
     from ase.data import atomic_names, atomic_numbers, chemical_symbols
 
     module = sys.modules.get(type(calculator).__module__)
@@ -376,7 +376,7 @@ def _least_distance(cell: Atoms) -> float:
 def _least_energy(
     subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
 ) -> tuple[float, bool]:
-    """Return the lattice scale factor of lowest energy, found from `start`, and whether a minimum exists."""
+    """Return the lattice scale factor of lowest energy, starting at `start`, and whether a minimum exists."""
 
     def energy(scale: float) -> float:
         try:

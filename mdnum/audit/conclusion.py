@@ -59,13 +59,13 @@ def _begun(results: Sequence[CheckResult]) -> set[str]:
 
 
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
-    """Return whether the audit has no verdict yet: no error was found, and a basic check is still to run."""
+    """Return whether the audit has no verdict yet: no error was found, and a basic check has not run."""
     begun, basic = _begun(results), {name for name in wanted if CHECKS[name].basic}
     return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
 
 
 def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
-    """Return, for findings whose text depends on the results of several checks, the variant of the text.
+    """Return the text variants of findings whose text depends on the results of more than one check.
 
     Incorrect forces that do no work around closed loops are the gradient of another energy; forces that do
     work around closed loops are not the gradient of any energy.

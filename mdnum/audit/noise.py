@@ -68,7 +68,7 @@ class NoiseFloor:
     freedom: float = math.inf  # independent values that the standard deviations were estimated from
 
     def louder(self, other: NoiseFloor) -> NoiseFloor:
-        """Return the larger noise of each quantity, with the smaller of two numbers of degrees of freedom."""
+        """Combine two noise levels: the larger noise of each quantity, and the smaller degrees of freedom."""
         return NoiseFloor(
             max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical),
             min(self.freedom, other.freedom),
@@ -173,7 +173,7 @@ def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
 
 
 def _quantum(values: Float[np.ndarray, "points"]) -> float:
-    """Return a common divisor of all second differences of values that exceed rounding errors, or 0."""
+    """Return a common divisor of those second differences that exceed rounding errors; 0 if none exists."""
     sizes = np.abs(np.diff(values, n=2))
     sizes = sizes[sizes > np.spacing(largest(values)) / _ALIKE]
     for part in (1, 2, 3) if sizes.size else ():

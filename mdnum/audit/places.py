@@ -43,7 +43,7 @@ class WrongPlaces:
 def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) -> WrongPlaces | None:
     """Find atom indices at which results are wrong, by exchanging atoms of one species between two indices.
 
-    Exchanging two atoms of the same species between two correct indices changes nothing. An error tied to an
+    Exchanging two equal atoms between correct indices changes neither energy nor forces. An error tied to an
     index appears at this index for any order of the atoms. An error that depends on the whole order of atoms,
     such as neglected neighbors, appears at nearly all indices, or at other indices for another order.
 

@@ -39,7 +39,7 @@ def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[Sequ
 
 
 def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures with other numbers of atoms, other densities, other species and other periodicity."""
+    """Yield structures that differ in the number of atoms, in density, in species and in periodicity."""
     yield "the structure", atoms
     if len(atoms) <= 64 and atoms.pbc.any():
         yield "the structure grew to its supercell", atoms.repeat(np.where(atoms.pbc, 2, 1))

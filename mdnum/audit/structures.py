@@ -122,7 +122,7 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
 
     A pair consists of single atoms if the calculator supports single atoms at the smallest distance in the
     structure. If single atoms fail, each gets two companion atoms, since a bond-order potential may divide by
-    the number of neighbors. If companion atoms fail too (rigid water), the pair consists of molecules.
+    the number of neighbors. If companion atoms fail too, as for rigid water, the pair consists of molecules.
 
     Returns:
         (pairs, omitted pairs with the reason).

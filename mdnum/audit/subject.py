@@ -1,4 +1,4 @@
-"""Wrapper of an ASE calculator for audits that returns numbers or a clear error, but no outdated results."""
+"""Wrapper of an ASE calculator for audits: it returns up-to-date results or raises a clear error."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Answered = tuple[float, Forces] | CalculatorError  # energy and forces, or why t
 
 @dataclass
 class RepeatCounts:
-    """Statistics of repeated evaluations of the same structures, identical to the last bit."""
+    """Statistics of repeated evaluations of structures that are identical to the last bit."""
 
     times: int = 0  # answers that could be compared with an earlier one
     differ: int = 0  # of them, those that are not the same to the last bit

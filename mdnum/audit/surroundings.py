@@ -336,7 +336,7 @@ class CrowdOrder(NamedTuple):
 
 @dataclass(frozen=True)
 class Crowd:
-    """A central atom with many neighbors at different distances, and the energy and force jumps found."""
+    """A central atom with many neighbors, and the energy and force jumps when another neighbor enters."""
 
     species: str  # of all atoms
     radius: float  # cutoff that the crowd is inside of, length

@@ -9,7 +9,7 @@ impact n has speed e^(n-1) s, and the time between impacts n and n + 1 is 2 e^n 
 Infinitely many impacts take place before the finite time t_rest (Zeno behavior). With a spring and a damper,
 y'' = -g - k y - c y' below the floor, and each contact is a damped cosine. A simulation with penalty contacts
 discretizes the differential equation of spring and damper in time. A ball with a coefficient of restitution
-moves differently, even in the limit of stiff springs, unless e = 1.
+moves differently from a ball on a penalty contact, even in the limit of stiff springs, unless e = 1.
 
 All computations use numpy in float64. The exact solution shares no code with the simulations of this package,
 because it is their reference.

@@ -24,7 +24,7 @@ class BallLoss(Protocol):
     """Protocol of a loss of a bouncing-ball simulation: a sum over time steps and a final term."""
 
     def step(self, state: BallState, record: BallRecord, dtype: Any) -> Float[Array, ""]:
-        """Return the contribution to the loss of the time step that ended in the given state."""
+        """Return how much the time step that ended in the given state contributes to the loss."""
         ...
 
     def end(self, state: BallState, steps: int, total: Float[Array, ""]) -> Float[Array, ""]:

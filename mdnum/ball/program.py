@@ -101,7 +101,7 @@ class BallProgram:
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
-        """Run the simulation; return the balls in the order of the run with which this run is compared.
+        """Run the simulation; return the balls in the same order as in the other run of the comparison.
 
         Args:
             decisions: decisions imposed on the balls in that order; None for the program's own decisions and
@@ -290,7 +290,7 @@ def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float
 
 
 def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
-    """Return a run with its balls in the order of the run with which this run is compared."""
+    """Return a run with its balls in the same order as in the other run of the comparison."""
     place = np.argsort(order)
     columns = ("y", "v", "height", "contact", "iterations", "reason", "residual", "margin", "before")
     arrays = {name: getattr(run, name) for name in columns}

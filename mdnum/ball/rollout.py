@@ -72,7 +72,7 @@ class BallRun:
 
     @cached_property
     def time(self) -> Float[np.ndarray, "times"]:
-        """Time of each state, s, shape (steps + 1,)."""
+        """Time (s) of each state, shape (steps + 1,)."""
         return np.arange(self.steps + 1) * self.h
 
     @cached_property

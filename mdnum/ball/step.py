@@ -139,14 +139,14 @@ class _Euler(eqx.Module):
 
 
 class ExplicitEuler(_Euler):
-    """Explicit Euler: y += h v; v += h a(y). Scheme of order 1; a stiff contact always adds energy."""
+    """Explicit Euler (y += h v; v += h a(y)): of order 1; a stiff contact adds energy at any time step."""
 
     def fly(self, y, v, a, r):
         return r(y + r(self.h * v)), r(v + r(self.h * a))
 
 
 class SemiImplicitEuler(_Euler):
-    """Semi-implicit Euler: v += h a(y); y += h v. Symplectic scheme of order 1, stable for h sqrt(k) < 2."""
+    """Semi-implicit Euler (v += h a(y); y += h v): symplectic, of order 1, stable for h sqrt(k) < 2."""
 
     def fly(self, y, v, a, r):
         v = r(v + r(self.h * a))
@@ -154,7 +154,7 @@ class SemiImplicitEuler(_Euler):
 
 
 class BallVerlet(eqx.Module):
-    """Velocity Verlet: kick, drift, kick. Symplectic, order 2 between events, stable for h sqrt(k) < 2."""
+    """Velocity Verlet (kick, drift, kick): symplectic, order 2 between events, stable for h sqrt(k) < 2."""
 
     h: Any
 
@@ -177,7 +177,7 @@ class BallVerlet(eqx.Module):
 
 
 class ImplicitMidpoint(eqx.Module):
-    """Implicit midpoint scheme, solved by Newton's method. Scheme of order 2, stable for any time step.
+    """Implicit midpoint scheme, solved by Newton's method; it has order 2 and is stable for any time step.
 
     The acceleration is evaluated in the middle of the step. Derivatives are implicit derivatives of the
     solved equation, not derivatives of the iterations.

@@ -39,7 +39,7 @@ class Reason(IntEnum):
 
     @property
     def word(self) -> str:
-        """Name of the reason for stopping, as displayed."""
+        """Name under which the reason for stopping is displayed."""
         return self.name.lower().replace("_", " ")
 
 

@@ -128,7 +128,7 @@ def triples(seconds: Float[np.ndarray, "runs"]) -> Float[np.ndarray, "tries"]:
 
 
 def two_of_three(rate: float) -> float:
-    """From the outlier rate of one run, compute the probability that at least two of three are outliers."""
+    """Compute the probability that two or all of three runs are outliers, from the outlier rate of a run."""
     return 3 * rate**2 - 2 * rate**3
 
 

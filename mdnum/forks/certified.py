@@ -2,9 +2,9 @@
 
 Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound: exact arithmetic
 would give the same decisions for the same states. Up to the end of *protection*, no pair distance was closer
-to its cutoff than two runs can differ in this distance. As long as the certified horizon and the protection
-last, the decisions of the two runs agree. If one of two programs is at least as precise as the other in every
-role, both make the same decisions up to the *shadow horizon*.
+to its cutoff than two runs can differ in this distance. Up to the certified horizon and the end of
+protection, the decisions of the two runs agree. If one of two programs is at least as precise as the other in
+every role, both make the same decisions up to the *shadow horizon*.
 
 Decisions are certified only for the actual states of the run. A run whose decisions are correct for its
 states may have left the exact history long ago (`forks.exact.certify` finds the step).
@@ -92,7 +92,7 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 
 
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """At each step, return the smallest |pair distance - cutoff|, and the value needed for protection.
+    """For each step, return the smallest |pair distance - cutoff|, and the value needed for equal decisions.
 
     If positions of atoms differ between the two runs by at most d, a pair distance differs by at most 2 d.
     The pair distances are those of the run with the smaller rounding error; this error is added to the

@@ -134,7 +134,7 @@ def starts(simulation: Simulation, count: int, seed: int, start: Start | None = 
 
 
 def stretches(simulation: Simulation, start: Start, steps: Iterable[int]) -> Iterator[Segment]:
-    """Run to several ascending steps in turn, and yield each part of the run; stop if the run blows up."""
+    """Run a simulation in segments that end at given steps, and yield each one; stop if the run blows up."""
     for step in steps:
         for segment in Engine(simulation, step, start=start, record=False).segments():
             if segment.closes in FAILURES:

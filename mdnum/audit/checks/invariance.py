@@ -390,7 +390,7 @@ def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | None:
-    """Return structures with molecules reordered or in other images; None if there are no molecules."""
+    """Return structures with molecules reordered or in other periodic images; None if no molecules exist."""
     size = group(atoms)
     if size is None:
         return None

@@ -224,7 +224,7 @@ def _through(
 def _again(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, worst: Comparison
 ) -> bool:
-    """Return whether the largest difference in a sequence is reproduced by another calculator object."""
+    """Return whether another calculator object reproduces the largest difference found in a sequence."""
     end = next(k for k, one in enumerate(sequence) if (one.what, one.atoms) == (worst.what, worst.atoms))
     way = [step._replace(compared=place == end) for place, step in enumerate(sequence[: end + 1])]
     (again,) = _through(subject, way, noise, worst.sequence)
