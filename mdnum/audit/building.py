@@ -51,11 +51,11 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
     """Return a test structure for a calculator: the calculator's own structure, a crystal, or rigid water.
 
     The crystal consists of an element for which the calculator is intended. If the calculator distinguishes
-    this element from a second one, half of the atoms are of the second element. The lattice constant is the
-    one at which the calculator's energy is lowest. The crystal is repeated until the cell is two cutoffs wide
-    (at most 500 atoms, fewer for a slow calculator), and its atoms are displaced slightly. `info["origin"]`
-    of the returned structure describes how the structure was built. If the calculator fails on atoms without
-    neighbors, a denser crystal is built; the failure is reported later.
+    this element from a second one, half of the atoms are of the second element. The lattice constant
+    minimizes the calculator's energy of the crystal. The crystal is repeated until the cell is two cutoffs
+    wide (at most 500 atoms, fewer for a slow calculator), and its atoms are displaced slightly.
+    `info["origin"]` of the returned structure describes how the structure was built. If the calculator fails
+    on atoms without neighbors, a denser crystal is built; the failure is reported later.
 
     Args:
         deadline: time limit for building; at the deadline, or after `BUILDING_CALLS` calls, the best
@@ -245,7 +245,7 @@ def water(edge: int = 4) -> Atoms:
 def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
     """Return the smaller of two measured processor times (s) of an energy and force calculation.
 
-    This time includes the time of the calculator's child processes. The time of other programs is not
+    The processor time includes that of the calculator's child processes. The time of other programs is not
     included, so that the chosen structure does not depend on the load of the machine.
     """
 

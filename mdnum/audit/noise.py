@@ -60,7 +60,7 @@ _FORMATS = ((8, "bfloat16"), (_HALF, "half precision"), (24, "single precision")
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """Noise level of energies and forces: smaller differences do not indicate an error."""
+    """Noise level of energies and forces: differences below this level do not indicate an error."""
 
     energy: float  # standard deviation, eV
     force: float  # standard deviation of a component, of the atom that scatters most, eV/Å

@@ -80,7 +80,7 @@ class _Motion:
     def first_contact(self) -> Known:
         """Return the time (s) at which the ball first reaches the floor.
 
-        The error is a few ulps for any sign of the initial velocity v0.
+        The error of the time is a few ulps for any sign of the initial velocity v0.
         """
         return self._known(_down)[0]
 

@@ -229,7 +229,7 @@ def height_bound(
 ) -> Float[np.ndarray, "..."]:
     """Return a bound on the rounding error of the height that a contact decision uses, m.
 
-    The height results from the previous state by four roundings; the bound adds the magnitudes of all terms.
+    The height is computed with four roundings from the previous state; the bound sums all terms' magnitudes.
 
     Args:
         y, v: height (m) and velocity (m/s) of the previous state.

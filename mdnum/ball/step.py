@@ -306,7 +306,7 @@ class Penalty(eqx.Module):
         return r(free + r(r(self.k * self.depth(y, contact)) - drag))
 
     def move(self, motion: Motion) -> Moved:
-        """Make one time step of the integration scheme with this contact force."""
+        """Make one time step of an integration scheme with the contact force of this contact model."""
         r = motion.rounding
 
         def pull(y, v, contact):

@@ -266,7 +266,7 @@ def _check(world: World) -> None:
 
 
 def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
-    """Raise an error if a stopping rule is invalid, or if its tolerance cannot be met in these dtypes."""
+    """Raise an error if a stopping rule is invalid, or if its tolerance cannot be met in the given dtypes."""
     _count("max_iter", rule.max_iter)
     if isinstance(rule, stopping.FixedCount):
         return

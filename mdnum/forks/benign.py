@@ -9,8 +9,8 @@ deliberate changes are run; at the chosen step, all deliberate changes are disti
 The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
 Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
 run is an outlier if at least two of its principal components exceed the limit; a program fails the test if at
-least two of its three runs are outliers. In other words, a program fails if the median over its three runs of
-the second-largest component exceeds the limit.
+least two of its three runs are outliers. Equivalently, a program fails if the median of the second-largest
+component over its three runs exceeds the limit.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ def hats(
 
 
 def noise_size(simulation: Simulation) -> float:
-    """Return the displacement (length) of the atom that moves most when a start is perturbed."""
+    """Return the displacement (length) of the atom that moves most when an initial state is perturbed."""
     largest = np.abs(np.asarray(first_state(simulation).state.x)).max()
     return NOISE * float(np.spacing(np.float32(largest)))
 

@@ -286,7 +286,7 @@ def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]
 
 
 def _in_turns(ways: Iterable[Same]) -> list[Same]:
-    """Order representations so that one of each kind is tested first, and then a second one of each kind."""
+    """Order representations so that one of each kind is tested before a second one of any kind is tested."""
     seen: dict[str, int] = {}
     turns = []
     for same in ways:
@@ -435,9 +435,9 @@ def repeated(atoms: Atoms) -> Iterator[Same]:
 def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     """Yield a supercell of a dense four-atom cell, for comparison with the four-atom cell.
 
-    In larger cells (at least two cutoffs wide), no atom interacts with two images of another atom. The
-    four-atom cell has one species, or two in equal numbers as in a salt; structures with more species are not
-    tested, since the result would be ambiguous.
+    In cells at least two cutoffs wide, no atom interacts with two images of another atom. The four-atom cell
+    has one species, or two in equal numbers as in a salt; structures with more species are not tested, since
+    the result would be ambiguous.
     """
     species = list(dict.fromkeys(atoms.symbols))
     nearest = nearest_distance(atoms)

@@ -278,7 +278,7 @@ class Ulps(Choice):
 
 @choice("start")
 class StartUlp(Choice):
-    """One coordinate of the start, changed to a nearby float."""
+    """One coordinate of the initial state, changed to a nearby float."""
 
     screened: ClassVar = {"md": "start", "ball": "start start=velocity:+1"}
     # the atom or the ball; None for that of the largest value. An ulp of a small coordinate would be lost in
