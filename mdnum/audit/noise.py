@@ -130,8 +130,8 @@ class Staircase:
 def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     """Detect discrete steps in energies and forces: values that stay constant to the last bit, then change.
 
-    If an atom moves by 1e-4 Å, every smooth energy or force changes, even in single precision. Points at
-    which energy and forces are identical to those of the previous point are ignored: they may be cached.
+    If an atom moves by 1e-4 Å, every smooth energy or force changes, even in single precision. Points with
+    the same energy and forces as the previous point are ignored, because they may be cached.
     """
     key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
     if key in subject.known:

@@ -83,7 +83,7 @@ class Route:
     def crossings(self, thresholds: Sequence[PairThreshold], low: float, high: float) -> list[RouteCrossing]:
         """Return the points between `low` and `high` at which the moving atom crosses a threshold distance.
 
-        The squared distance along a line is quadratic, so the points are roots of quadratic equations.
+        The squared distance along a line is quadratic, so the crossings are roots of quadratic equations.
         """
         found: list[RouteCrossing] = []
         symbols = np.array(self.atoms.get_chemical_symbols())

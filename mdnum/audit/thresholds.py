@@ -366,8 +366,8 @@ def _beyond(
 ) -> Beyond | None:
     """Search for a cutoff beyond the scanned distances, as long as the remaining energy is not negligible.
 
-    The result is None if no distance could be evaluated, because images of the particles in a periodic cell
-    come too near or because the calculator fails.
+    The result is None if no distance could be evaluated, because periodic images of the particles come too
+    close or because the calculator fails.
     """
     if pair.periodic:
         return None

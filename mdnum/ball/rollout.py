@@ -382,7 +382,7 @@ def _at(values: np.ndarray, row: np.ndarray, ball: np.ndarray) -> np.ndarray:
 def overridden(
     run: BallRun, last: int | None = None
 ) -> tuple[Int[np.ndarray, "times"], Float[np.ndarray, "times"]]:
-    """Count imposed decisions that differ from the decisions that the run would have made by itself.
+    """Count imposed decisions that differ from those that the run's heights and residuals imply.
 
     Args:
         run: a run with imposed decisions.
