@@ -106,7 +106,7 @@ class Registry(Generic[T]):
                 raise InputError(
                     f"the {self.noun} {point.name!r} of package {_package(point)} is already provided by "
                     f"{taken}",
-                    remedy=f"Uninstall {_package(point)}, or use a version with another name for it",
+                    remedy=f"Uninstall {_package(point)}, or use a version that renames the {self.noun}",
                 )
             added[point.name] = point
         return added

@@ -55,7 +55,7 @@ def read_structure(words: str | Path) -> Atoms:
     atoms = chosen[0]
     if not len(atoms):
         raise InputError(
-            "the structure contains no atoms", where=text, remedy="Give another file or another index"
+            "the structure contains no atoms", where=text, remedy="Give another file or another structure"
         )
     bad = ~np.isfinite(atoms.positions).all(axis=1)
     if bad.any() or not np.isfinite(np.asarray(atoms.cell)).all():

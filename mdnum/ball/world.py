@@ -257,7 +257,7 @@ def _check(world: World) -> None:
         gain = float(contact.alpha) * float(contact.k)
         if gain >= 2:
             raise InputError(
-                f"alpha * k = {gain:g}; the iteration that lifts the ball off the floor needs less than 2",
+                f"alpha * k = {gain:g}; the iteration of the contact solver converges only below 2",
                 remedy="Choose alpha * k below 2; at alpha * k = 1, one iteration is enough",
             )
         _check_stop(contact.stop, world.policy, gain)

@@ -176,7 +176,7 @@ def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
     """
     if not simulation.rule.safe:
         raise InputError(
-            "with these settings the neighbor list may miss pairs, whose decisions would not be checked",
+            "a neighbor list that is not checked at every step may miss pairs and leave them unexamined",
             remedy="Set neighbors.rebuild.every = 1 and neighbors.rebuild.check = true",
             where="neighbors.rebuild",
         )

@@ -203,7 +203,7 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
         raise InputError(
             f"the two runs decide by different rules which pairs are neighbors: {seen}",
             where=where,
-            remedy="Compare runs that use the same membership rule",
+            remedy="Compare runs that use the same rule for neighbors",
         )
     differences = [(name, *(each[name] for each in summaries)) for name in _GIVEN]
     frames = [folder.read("frames", ["rule", "number"]) for folder in (first, second)]

@@ -456,7 +456,7 @@ def forecast(
         dx = direction(simulation, seed)
     change = [np.zeros(shape) if part is None else np.asarray(part, np.float64) for part in (dx, dv)]
     if any(part.shape != shape for part in change):
-        raise InputError(f"dx and dv must have the same shape as the positions, {shape}")
+        raise InputError(f"the perturbations dx and dv must have the same shape as the positions, {shape}")
     dx, dv = change
     parts = list(tangents(simulation, last, dx, dv))
     tables = [part.segment.table for part in parts]

@@ -126,7 +126,7 @@ def pinned(
     last_step = fork.steps if steps is None else steps
     if pairs is None:
         if fork.decision is None:
-            raise InputError("the two runs do not fork", remedy="Name the pairs whose decisions are imposed")
+            raise InputError("runs A and B do not fork", remedy="Name the pairs whose decisions are imposed")
         i, j = fork.decision.subject
         pairs = [(i, j)]
         spell = disagreements(fork, i, j)[0]
@@ -162,7 +162,7 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
     named = re.fullmatch(r"(\d+)\s*[-–]\s*(\d+)(?::(\d+)\.\.(\d+))?", text.strip())
     if named is None:
         raise InputError(
-            f"{text!r} names no pair decision", where="pin", remedy="Give fork, 3-75 or 3-75:600..700"
+            f"{text!r} names no pair decision", where="pin", remedy="Give fork, atoms 3-75 or 3-75:600..700"
         )
     pair = int(named[1]), int(named[2])
     _check_pair(pair, atoms)
@@ -190,8 +190,8 @@ def check_pins(fork: Fork) -> None:
         )
     if b.frame is not None and not b.frame.is_same:
         raise InputError(
-            "the two runs number the atoms differently or use different axes",
-            remedy="Vary a choice that changes neither the numbers of the atoms nor the axes",
+            "runs A and B list the atoms in different orders or use different axes",
+            remedy="Vary a choice that changes neither the order of the atoms nor the axes",
         )
 
 

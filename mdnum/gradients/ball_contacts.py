@@ -114,7 +114,7 @@ class Implicit(BallMethod):
         condition = max(1.0, gain + self.regularization) / min(1.0, gain + self.regularization)
         if condition > LIMIT:
             raise InputError(
-                f"the equation of implicit has condition number {condition:.3g}; expected at most {LIMIT:g}",
+                f"the condition number of the linear system is {condition:.3g}; expected at most {LIMIT:g}",
                 remedy="Set a regularization; the derivative is then that of the regularized problem.",
             )
         rule = FixedPointRule(self.regularization, self.at_iterate)
@@ -296,7 +296,7 @@ class ThroughContacts(BallMethod):
         if flagged:
             raise NumericalError(
                 f"the ball only grazes the floor in {int(flagged)} contacts, whose times have no derivative",
-                remedy="Change the initial state or time step so that the ball hits, or smooth the contact.",
+                remedy="Change the start or time step to make the ball hit the floor, or smooth the contact.",
             )
         use = used(problem, names, slopes, run, own=located or smooth)
         for name in names:

@@ -149,7 +149,7 @@ def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str,
         if name not in full:
             raise InputError(
                 f"a value was given for {word}, but the gradient does not include this parameter",
-                remedy=f"Add {word} to the parameters of the gradient: {', '.join(full)}",
+                remedy=f"Add {word} to the parameters of the gradient, now {', '.join(full)}",
             )
         out[name] = np.asarray(value)
     return out

@@ -29,7 +29,7 @@ class Threshold:
 
     def __post_init__(self):
         if self.comparison not in INCLUSIVE:
-            raise InputError(f"the operator is {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
+            raise InputError(f"comparison = {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
 
     def margin(self, quantity):
         """Return the threshold minus the compared quantity, which is positive if the decision is "yes".

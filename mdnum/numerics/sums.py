@@ -175,7 +175,7 @@ class Blocked(Reduction):
 
     def __post_init__(self):
         if self.width < 2:
-            raise InputError(f"a summing tree cannot have width {self.width}", remedy="Give a width above 1")
+            raise InputError(f"a summation tree cannot have width {self.width}", remedy="Set width above 1")
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """Add the terms level by level in the tree."""

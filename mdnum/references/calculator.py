@@ -117,7 +117,7 @@ class MdnumCalculator(ClassicalCalculator):
             raise InputError("give either a system or a potential, and not both", remedy=remedy, where=where)
         if isinstance(system, System | Simulation) and overrides:
             remedy = "Pass the name of the system, or load it with the overrides"
-            raise InputError("overrides cannot change a loaded system", remedy=remedy, where=where)
+            raise InputError("keys of a loaded system cannot be overridden", remedy=remedy, where=where)
         if system is not None and not isinstance(system, System | Simulation):
             system = systems.load(str(system), overrides, world="md")
         self._recipe = _of_potential(potential, cutoff, units) if system is None else _of_system(system)

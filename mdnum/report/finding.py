@@ -68,7 +68,7 @@ class _Fields(string.Formatter):
             return revived(super().get_value(key, args, kwargs))
         except (KeyError, IndexError):
             raise KeyError(
-                f"a report sentence uses the field {key!r}, but was given {', '.join(kwargs) or 'no values'}"
+                f"a sentence needs the field {key!r}; the given fields are {', '.join(kwargs) or 'no values'}"
             ) from None
 
 

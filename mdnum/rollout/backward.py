@@ -139,7 +139,7 @@ class BackwardRun:
             raise InputError(
                 "the run uses floating-point arithmetic, so its steps cannot be reversed exactly",
                 where="precision.state",
-                remedy='Set state = "lattice", which makes the steps reversible by fixed-point arithmetic',
+                remedy='Set state = "lattice": steps in fixed-point arithmetic can be reversed exactly',
             )
         self.simulation = simulation
         self.baths = dict(baths or {})
@@ -191,6 +191,6 @@ class BackwardRun:
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(
-                f"the reversed run differs from the forward run: at step {step}, stored bits of velocities "
-                "are left that friction did not remove in the forward run"
+                f"the reversed run differs from the forward run: at step {step}, bits of the velocities "
+                "remain that friction did not remove in the forward run"
             )

@@ -386,7 +386,7 @@ def run(
             return finished
         rollout = _resumed(Path(resume), layout, given, steps, progress, began)
     elif system is None:
-        raise InputError("no system was given", remedy="Give a system, or a folder to resume")
+        raise InputError("no system was given", remedy="Give a system, or the folder of a run to resume")
     else:
         simulation = build(system, overrides)
         rollout = _fresh(simulation, layout, out, steps, save_every, progress, began)

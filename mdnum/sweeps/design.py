@@ -151,7 +151,7 @@ def points(
         for axis in axes:
             chosen += [{**base, axis.key: value} for value in axis.values if value != base[axis.key]]
     if len(chosen) * len(seeds) > MOST_POINTS:
-        raise InputError(f"sweep of {len(chosen) * len(seeds):,} points; expected at most {MOST_POINTS:,}")
+        raise InputError(f"the sweep has {len(chosen) * len(seeds):,} points; the limit is {MOST_POINTS:,}")
     return [Point(choices, seed) for seed in seeds for choices in chosen]
 
 

@@ -103,7 +103,7 @@ def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any]
     if isinstance(system, Simulation):
         if overrides:
             raise InputError(
-                "overrides cannot change a loaded system", where=system.name, remedy=_CHANGE_OBJECTS
+                "keys of a loaded system cannot be overridden", where=system.name, remedy=_CHANGE_OBJECTS
             )
         return system
     system = load(system, overrides, world="md")

@@ -414,7 +414,7 @@ def load(
     if isinstance(name, System | BallSystem):
         if overrides:
             remedy = "Load it with the overrides, or give its name"
-            raise InputError("overrides cannot change a loaded system", where=name.name, remedy=remedy)
+            raise InputError("keys of a loaded system cannot be overridden", where=name.name, remedy=remedy)
         _check_world(name.name, isinstance(name, BallSystem), world)
         return name
     found, path = find(name)

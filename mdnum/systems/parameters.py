@@ -371,7 +371,7 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
             return ends[0]
         if ends:
             several = f"{word!r} is ambiguous: it could be any of {', '.join(ends)}"
-            raise InputError(several, remedy="Give the full name, such as potential.sigma")
+            raise InputError(several, remedy="Give the full name of a parameter, such as potential.sigma")
     if entry(simulation, word).index:
         return word
     hint = meant(word, [*known, *(name.rpartition(".")[2] for name in known)]) + "Choose from "

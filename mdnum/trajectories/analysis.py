@@ -184,7 +184,7 @@ class NeighborFlips(AnalysisBase):
         self._check = FrameCheck(seen, radius=smallest_radius(self.rules), bits=32)
         if bound is not None and not (math.isfinite(bound) and bound >= 0):
             message = f"bound = {bound!r}; expected a length of 0 or more, Å"
-            raise InputError(message, remedy="Omit `bound` to use the resolution of coordinates in the file")
+            raise InputError(message, remedy="Omit `bound` to use the resolution of the file's coordinates")
         self._bound = bound
         self._resolution: Resolution | None = None
         self._other_box: tuple[str, Box] | None = None

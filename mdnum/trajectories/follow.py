@@ -97,7 +97,7 @@ def _usable(
         yield frames, stepped
     if not found.frames:
         where = str(files[0].path) if len(files) == 1 else None
-        raise InputError("the chosen range of frames is empty", remedy="Request other frames", where=where)
+        raise InputError("the chosen range of frames is empty", remedy="Choose other frames", where=where)
 
 
 # ---- one trajectory

@@ -335,7 +335,7 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
     wrapped, home, bin_of = wrap(positions, lattice, bins, step)
     if (away // bins * lattice.periodic).max() >= MOST_IMAGES - 1:
         message = f"a box of widths {np.round(lattice.widths, 6).tolist()} cannot hold pairs within {reach:g}"
-        raise InputError(message, remedy="Check the units of cutoff and box", where="cutoff")
+        raise InputError(message, remedy="Check the length units of the cutoff and the box", where="cutoff")
     total, half = int(np.prod(bins)), who.centers is who.others
     start, order = _sorted_by_bin(bin_of, who.others, total)
     first, centers = (start, order) if half else _sorted_by_bin(bin_of, who.centers, total)

@@ -58,7 +58,7 @@ def _universe(trajectory: Trajectory) -> Any:
     first = next(iter(trajectory.frames()), None)
     if first is None:
         raise InputError(
-            "the chosen range of frames is empty", remedy="Request other frames", where=str(trajectory.path)
+            "the chosen range of frames is empty", remedy="Choose other frames", where=str(trajectory.path)
         )
     if trajectory.universe is not None:
         # `frames` has left the Universe there

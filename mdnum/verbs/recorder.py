@@ -219,7 +219,7 @@ class Recorder:
         if self._one is None and self._failed is None and self._given:
             self._advance()
         if self._one is None:
-            raise self._failed or InputError("no frame was recorded", remedy="Call its method `see` first")
+            raise self._failed or InputError("no frame was recorded", remedy="Call the method `see` first")
         one, folder = self._one, self._one.answer.folder
         with self._stack:
             self._add("lost", self._check.ended(self._done, one.found.rules[0].tracker.bound))

@@ -252,7 +252,7 @@ def test_a_broken_table_is_refused_in_one_line(tmp_path, change, message):
     [
         (lambda: made_eam(COPPER, ["Cu", "Al"]), "is for Cu, .*holds Al"),
         (lambda: made_eam(COPPER.with_name("none.alloy")), "potential table not found"),
-        (lambda: tetrahedral.named("tersoff", "Ge"), "known are Si and Si-1989"),
+        (lambda: tetrahedral.named("tersoff", "Ge"), "known sets are Si and Si-1989"),
         (lambda: tetrahedral.named("stillinger-weber", "Ge"), "known is Si"),
     ],
 )

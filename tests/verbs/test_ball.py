@@ -208,7 +208,7 @@ def test_systems_that_cannot_be_bounced_or_run(tmp_path: Path):
     """A loaded system takes no overrides; each world has its own verb."""
     drop, crystal, out = load("ball/drop"), load("argon/crystal-108"), tmp_path / "x"
     asked: list[tuple[Any, Any, dict[str, Any], str]] = [
-        (bounce, drop, {"overrides": {"contact.k": 1.0}}, "overrides cannot change a loaded system"),
+        (bounce, drop, {"overrides": {"contact.k": 1.0}}, "keys of a loaded system cannot be overridden"),
         (bounce, drop, {"against": ["contact.k"]}, "not of the form key=value"),
         *((run, system, {}, "the system is a ball") for system in ("ball/drop", drop)),
         *((bounce, system, {}, "molecular dynamics") for system in ("argon/crystal-108", crystal)),

@@ -287,7 +287,7 @@ def test_what_is_refused_leaves_no_folder(tmp_path, system, vary, options, words
 
 def test_overrides_of_a_loaded_system_and_used_folders_are_refused(tmp_path, file):
     for system in (load("pair/at-cutoff"), load(file)):
-        with pytest.raises(InputError, match="cannot change a loaded"):
+        with pytest.raises(InputError, match="of a loaded system"):
             mdnum.fork(system, "precision", overrides={"dynamics.steps": 3})
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(FolderError, match="already holds"):

@@ -144,7 +144,7 @@ def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> 
             raise
         message = f"{type(choice).__module__} reads the tables of a system file, but was given a Simulation"
         raise InputError(
-            message, where=choice.name, remedy="See how to write a choice in docs/extending.md"
+            message, where=choice.name, remedy="docs/extending.md explains how to write a choice"
         ) from error
     except InputError as error:
         # the choice is named where this is printed

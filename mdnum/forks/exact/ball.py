@@ -92,7 +92,7 @@ class _ExactBall:
         if not served or getattr(contact, "smooth", False):
             raise InputError(
                 f"the contact {type(contact).__name__} with the integrator {type(scheme).__name__} cannot "
-                "be computed exactly from sums and products",
+                "be computed by exact sums and products",
                 remedy="Use explicit Euler, semi-implicit Euler or velocity Verlet, and a contact "
                 "without smoothing",
             )

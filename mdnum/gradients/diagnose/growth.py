@@ -415,7 +415,9 @@ def spectrum(
     timestep = float(simulation.integrator.timestep)
     jacobian = Jacobian(tape, CLOCK_STEPS * timestep)
     if not 1 <= values <= jacobian.coordinates or rounds < 1:
-        raise InputError(f"{values = }, {rounds = }; expected 1 to {jacobian.coordinates} values, 1 round")
+        raise InputError(
+            f"{values = }, {rounds = }; expected 1 to {jacobian.coordinates} values and 1 or more rounds"
+        )
     vectors = min(values + extra, jacobian.coordinates)
     rng = np.random.default_rng(seed)
     start, _ = np.linalg.qr(rng.standard_normal((jacobian.coordinates, vectors)))

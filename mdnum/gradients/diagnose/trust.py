@@ -299,7 +299,7 @@ def trust(
     kept = [name for name in full if np.size(parameters.value(simulation, name)) <= MOST]
     if not kept:
         raise InputError(
-            f"the parameter {', '.join(full)} has too many entries to compute a horizon for each one",
+            f"the parameter {', '.join(full)} has too many entries to give each a trust horizon",
             remedy="Give a scalar parameter, such as dynamics.temperature",
         )
     if replicas == 1 or replicas < 0:

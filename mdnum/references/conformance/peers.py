@@ -317,7 +317,7 @@ class JaxMdList:
         import numpy as np
 
         if bool(self.found.did_buffer_overflow):
-            raise ValueError("the neighbor list of jax-md overflowed during its allocation")
+            raise ValueError("jax-md allocated a neighbor list that is too small for its pairs")
         i, j = np.asarray(self.found.idx)
         real = (i < len(positions)) & (j < len(positions))
         return {"i": i[real], "j": j[real]}
