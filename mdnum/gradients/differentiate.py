@@ -136,7 +136,7 @@ def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) ->
                 why = f": at step {blamed.step} {blamed.operation}({inputs}) in {blamed.source}"
         what = "the loss" if not np.isfinite(found.value) else f"a derivative, by {', '.join(bad)}"
         raise NumericalError(
-            f"{what} is not finite{why}", where=found.method, remedy="Correct the operation with this value"
+            f"{what} is not finite{why}", where=found.method, remedy="Correct the operation at fault"
         )
     return found
 

@@ -74,7 +74,7 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
         )
     if others := sorted(set(symbols) - set(elements)):
         raise InputError(
-            f"the potential table is for {elements[0]}, but the structure also holds {', '.join(others)}",
+            f"the potential table is for {elements[0]}, but the structure also contains {', '.join(others)}",
             where=where,
             remedy="Correct the structure, or give another table with the key potential.file",
         )

@@ -141,7 +141,7 @@ def points(
         count = math.prod(len(axis.values) for axis in axes)
         if count * len(seeds) > MOST_POINTS:
             raise InputError(
-                f"the sweep has {count * len(seeds):,} points", remedy="Give fewer values or another design"
+                f"{count * len(seeds):,} points are too many", remedy="Give fewer values or another design"
             )
         chosen = [dict(zip(keys, values, strict=True)) for values in product(*(axis.values for axis in axes))]
     elif design == "space-filling":

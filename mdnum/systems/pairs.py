@@ -118,7 +118,7 @@ def many_body(
         return embedded_atom.embedded_atom(folder / potential.file, species, pbc)
     if unknown := [name for name in species if name != potential.parameters]:
         raise InputError(
-            f"the structure holds {', '.join(unknown)}, but the {potential.kind} potential has parameters "
+            f"the structure contains {', '.join(unknown)}, but the {potential.kind} potential has parameters "
             f"only for {potential.parameters}",
             remedy="Correct the structure or the potential",
         )

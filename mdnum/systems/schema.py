@@ -43,7 +43,7 @@ def _check_pairs(pairs: Mapping[str, Any] | None) -> None:
     for name in pairs or {}:
         parts = name.split("-")
         if len(parts) != 2 or not all(part.isalpha() for part in parts):
-            raise ValueError(f"pair {name!r} is not two species joined by a hyphen, such as 'Ni-P'")
+            raise ValueError(f"the pair {name!r} is not two species joined by a hyphen, such as 'Ni-P'")
         key = pair_key(*parts)
         if key in seen:
             raise ValueError(f"the pair of species {name!r} is given twice, the first time as {seen[key]!r}")

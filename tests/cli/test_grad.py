@@ -39,7 +39,7 @@ grad: Any = importlib.import_module("mdnum.verbs.grad")
         ),
         ((WELL, "--of", "msd", "--wrt", "sigma", "--methods", "symetric"), "Did you mean symmetric?"),
         ((WELL, "--of", "pressure", "--wrt", "sigma"), "not defined for"),
-        ((WELL, "--of", "potential:first=9", "--wrt", "sigma", "--steps", "8"), "steps 0 to 8"),
+        ((WELL, "--of", "potential:first=9", "--wrt", "sigma", "--steps", "8"), "any step from 0 to 8"),
         ((WELL, "--of", "potential:evry=2", "--wrt", "sigma"), "write for example potential:every=10"),
         ((WELL, "--of", "potential:every=x", "--wrt", "sigma"), "expected a whole number"),
         (

@@ -137,7 +137,7 @@ def test_fork_folders_are_told_from_runs(folders, tmp_path):
     answered = tmp_path / "answered"
     RunFolder.create(answered, layout("map")).close()
     for pair in ((folders["plain"], answered), (answered, folders["plain"])):
-        with pytest.raises(InputError, match=r"answered: .*fork.*not a run.*`mdnum run`"):
+        with pytest.raises(InputError, match=r"answered: .*fork.*expected a run.*`mdnum run`"):
             compare_folders(*pair)
     (answered / "manifest.json").rename(answered / "summary.json")
     with pytest.raises(FolderError, match=r"manifest\.json: is missing"):

@@ -198,7 +198,7 @@ def hover() -> BallProblem:
 @pytest.mark.parametrize(
     ("word", "problem", "name", "options", "message"),
     [
-        ("implicit", relaxation(1e-2, k=1e-13, most=3), "k", {}, "condition number 2e\\+13"),
+        ("implicit", relaxation(1e-2, k=1e-13, most=3), "k", {}, "linear system is 2e\\+13"),
         ("event-aware", hover(), "y0", {}, "graze"),
         ("smoothed", bouncing(1e-2, 1.0), "y0", {"eps": 1e-3}, "too fast"),
         ("smoothed", bouncing(1e-2, 1.0), "y0", {"eps": 0.0}, "width"),
