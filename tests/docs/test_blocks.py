@@ -42,6 +42,7 @@ LEFT_OUT = {
 PARTIAL = {
     "class Pressed(mdnum.Integrator):": "a part of a class",
     "class TestNeighbors(NeighborListConformance):": "a test of another library: tests/references",
+    "context.getState(positions=True)": "needs OpenMM",
     "multiprocessing.get_context(": "starts the file that it stands in: tests/test_pools.py",
     "mp_context=get_context(": "starts the file that it stands in: tests/test_pools.py",
     "backend=": "starts the file that it stands in: tests/trajectories",
