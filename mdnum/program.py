@@ -1,10 +1,10 @@
-"""Interface between simulations and analyses such as forks and parameter maps, and results of comparisons.
+"""Interface through which analyses, such as forks and parameter maps, run and compare simulations.
 
 Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. An
-object with this interface (a program) determines all bits of a run, including the initial state. Analyses
-such as forks and parameter maps use only the interface `Program`. Decisions, such as whether a pair is inside
-the cutoff, are an input of each time step. The decisions of one program can therefore be recorded and imposed
-on another program. The implementations are `mdnum.rollout.program.MdProgram` and
+object with this interface, called a program, determines every bit of a run, including its initial state.
+Analyses such as forks and parameter maps use only the interface `Program`. Every time step takes its
+decisions, such as whether a pair is inside the cutoff, as input. The decisions of one program can therefore
+be recorded and imposed on another program. The implementations are `mdnum.rollout.program.MdProgram` and
 `mdnum.ball.program.BallProgram`.
 """
 
@@ -22,7 +22,7 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 
 
 class Program(Protocol):
-    """Protocol of a simulation that can be run, compared with another simulation, and varied.
+    """Protocol of a simulation that can be run, perturbed, and compared with another simulation.
 
     Attributes:
         size: number of atoms or balls.
@@ -50,7 +50,7 @@ class Program(Protocol):
     def imposable(self) -> str | None: ...
 
     def check(self, other: Any) -> None:
-        """Raise an error if two programs have different numbers of atoms or balls, or kinds of decisions.
+        """Raise an error if two programs differ in number of atoms or balls, or in kinds of decisions.
 
         Raises:
             InputError: the programs cannot be compared.
@@ -73,7 +73,7 @@ class Program(Protocol):
     def repeats(
         self, others: Sequence[Any], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Return the distances of other runs from this run, without and with this run's decisions imposed.
+        """Return the distances between this run and perturbed runs, without and with imposed decisions.
 
         Args:
             others: the same program with perturbed starts.
@@ -84,7 +84,7 @@ class Program(Protocol):
         ...
 
     def nudged(self, size: float, count: int, seed: int) -> list[Any]:
-        """Return programs whose initial states are displaced randomly, by about `size` or less."""
+        """Return programs with random displacements of the initial state, of about `size` or less."""
         ...
 
     def decision(self, other: Any, flips: Sequence[Any], separation: float) -> Decision:
@@ -97,7 +97,7 @@ class Program(Protocol):
         ...
 
     def number(self, key: str) -> Number:
-        """Return the numerical parameter of the system that is given by a key of the system file.
+        """Return a numerical parameter of the system, given its key in the system file.
 
         Raises:
             InputError: no parameter or several parameters match; the message lists the known parameters.
@@ -215,7 +215,7 @@ class Decision:
 
     @property
     def margin(self) -> float:
-        """Margin (threshold minus quantity) in the run that decided; for a decision at the start, in A."""
+        """Margin (threshold minus quantity) in run `run`; in run A if the runs differ from the start."""
         return self.margins["A" if self.run == "start" else self.run]
 
     @property
@@ -230,7 +230,7 @@ class Decision:
 
     @property
     def ambiguous(self) -> bool:
-        """True if rounding could have reversed the decision in the run that made the decision."""
+        """True if rounding errors could have reversed the decision to which `margin` refers."""
         return abs(self.margin) <= self.bound
 
 

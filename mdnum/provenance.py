@@ -37,7 +37,7 @@ class _System(Protocol):
 
 
 def collect(system: _System) -> dict[str, Any]:
-    """Return everything outside the system file on which a run depends, and hashes of the input.
+    """Return the software, hardware and settings on which a run depends, and hashes of the input.
 
     Returns:
         a mapping of plain values, ready for JSON.
@@ -79,7 +79,7 @@ def collect(system: _System) -> dict[str, Any]:
 
 
 def surroundings() -> dict[str, Any]:
-    """Return time, machine and software versions of a computation without a simulation and without jax."""
+    """Return time, command, machine and software versions, for computations without jax."""
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": shlex.join(sys.argv),

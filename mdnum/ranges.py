@@ -1,4 +1,4 @@
-"""Ranges of numbers, and detection of floating-point formats that are too narrow for these ranges."""
+"""Ranges of the numbers in a run, and floating-point formats that are too narrow for these numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def smallest(name: str) -> float:
 
 
 def columns(quantities: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return columns with the largest and smallest magnitude per row of arrays of shape (rows, values).
+    """Return columns with the largest and the smallest magnitude in each row of the given arrays.
 
     `largest_NAME` is the largest magnitude in a row, `smallest_NAME` the smallest nonzero magnitude (or NaN).
     """

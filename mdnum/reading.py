@@ -1,7 +1,7 @@
 """Reading of files with ASE and MDAnalysis, with one-line error messages.
 
 The readers of ASE and MDAnalysis can raise any Python exception, with a message of many lines or without a
-message. `reading` converts each exception to one line with the file and the frame.
+message. `reading` converts each exception to a one-line error that names the file and the frame.
 """
 
 from __future__ import annotations

@@ -169,8 +169,8 @@ class Registry(Generic[T]):
     def parse(self, text: str) -> T:
         """Return the value for a text of the form "name" or "name=argument".
 
-        A class or function is called with the text of the argument, if any (or the `parse` method of the
-        class, if it exists). Any other value is returned unchanged, and cannot have an argument.
+        A class or function is called with the text of the argument, if any. If a class has a method `parse`,
+        the argument is passed to this method. Any other value is returned and cannot have an argument.
 
         Raises:
             InputError: the name is unknown, or an argument is unexpected or missing.

@@ -41,7 +41,7 @@ def environment(**changes: str) -> dict[str, str]:
 def guard(parent: int) -> None:
     """End this process when its parent process ends, and limit its memory to half of the machine's memory.
 
-    On systems other than Linux, a process inside a foreign function ends only when this function returns.
+    On systems other than Linux, a process that executes a C function ends only after this function returns.
 
     Args:
         parent: process number of the parent process.

@@ -43,7 +43,7 @@ class StepAtCutoff(ClassicalCalculator):
 
 
 class SpeciesSum(ClassicalCalculator):
-    """Mixture of one-species calculators: the energy of unlike pairs is the total minus that of like pairs.
+    """ASE calculator of a mixture. Energies of unlike pairs are those of all pairs minus those of like pairs.
 
     Args:
         parts: (calculator, species a, species b) for every pair of species in the structure.
@@ -122,7 +122,7 @@ def morse(form: PairForm, begin: float, end: float) -> Calculator:
 
 
 def short_listed_eam(file: Path) -> Calculator:
-    """Return ASE's EAM with a shorter neighbor list (ASE's list is slow; it reaches 2 (cutoff + skin))."""
+    """Return ASE's EAM with a short neighbor list; ASE's own list reaches 2 (cutoff + skin) and is slow."""
     from ase.calculators.eam import EAM
     from ase.neighborlist import NeighborList
 
@@ -141,8 +141,8 @@ def short_listed_eam(file: Path) -> Calculator:
 class EnergyOnNeighborList(ClassicalCalculator):
     """ASE calculator for an energy function, compiled separately and evaluated on ASE's neighbor list.
 
-    This reference tests neighbor lists, cutoff decisions and time steps, but not the energy function and its
-    derivatives, since mdnum and the reference compute these by jax.
+    This reference tests neighbor lists, cutoff decisions and time steps. The energy function and its
+    derivatives are not tested, because the reference computes them with jax, too.
     """
 
     implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012

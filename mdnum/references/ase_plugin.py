@@ -1,4 +1,4 @@
-"""Registers mdnum as a plugin of ASE; ASE imports this module, which imports no other module of mdnum."""
+"""Module that ASE imports to register mdnum as a plugin; it imports no other module of mdnum."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def _of_system(system: Simulation | System) -> _Recipe:
 
 
 def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
-    """Return a recipe for simulations with given potential objects, or with the tables of a system file."""
+    """Return a recipe for simulations with a potential, given as objects or as tables of a system file."""
     if isinstance(potential, Mapping):
         made = interaction(potential, cutoff)
         end, model = made.cutoff, lambda atoms: model_of(made, atoms, Path())
@@ -77,8 +77,8 @@ class MdnumCalculator(ClassicalCalculator):
     """ASE calculator that evaluates a potential with mdnum.
 
     Use this calculator to relax structures with ase.optimize, to compute stress and equations of state, and
-    to analyze mdnum's forces by means of ASE. The Verlet list is kept between calls until motion and box
-    strain exceed its skin. For molecular dynamics, use the function `rollout` of mdnum, which records flips.
+    to analyze mdnum's forces by means of ASE. The Verlet list is kept until atoms or box have moved farther
+    than its skin allows. For molecular dynamics, use the function `rollout` of mdnum, which records flips.
 
     Args:
         system: a `Simulation`, a `System`, or the name or path of a system file; the evaluated atoms may

@@ -174,13 +174,13 @@ def check_energy(
 
 
 def narrowest(simulation: Simulation, roles: Sequence[str] = ("state", "force", "accumulate")) -> str:
-    """Return the narrowest float type of the given roles (default: state, force and accumulated sums)."""
+    """Return the least precise float type of the given roles (default: state, force and accumulated sums)."""
     kinds = (carrier(getattr(simulation.policy, role)) for role in roles)
     return max(map(str, kinds), key=unit_roundoff)
 
 
 def _places(simulation: Simulation) -> str:
-    """Return the narrowest float type that affects positions (of state and decision for 16-bit forces)."""
+    """Return the least precise float type that affects positions; 16-bit types of forces are ignored."""
     wide = simulation.policy.force in WIDE
     return narrowest(simulation) if wide else narrowest(simulation, ("state", "decision"))
 
@@ -203,7 +203,7 @@ def _named(frames: Any, simulation: Any) -> Iterable[tuple[str, Atoms]]:
 
 
 def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Evaluation]:
-    """Round a frame to the precision of the state; return the rounded frame and mdnum's results for it."""
+    """Round a frame to the precision of the state, and evaluate it; return the rounded frame and results."""
     positions = atoms.get_positions()
     if simulation.policy.state == "float32":
         positions = positions.astype(np.float32).astype(np.float64)  # both are to see what the state can hold
@@ -212,7 +212,7 @@ def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Eval
 
 
 def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:
-    """Return mdnum's results for chosen atoms of the whole system, with the pairs of their cluster."""
+    """Select the results for a cluster's atoms from those for the whole system; add the cluster's pairs."""
     edges = edges_of(cluster, r_cut)
     once = edges.i < edges.j
     pairs = edges.i[once], edges.j[once], edges.r[once]
@@ -274,8 +274,8 @@ def _over(difference: float, scale: float) -> float:
 class _Scales:
     """Scales by which differences of energy, force and stress are divided.
 
-    Energy is scaled by the sum of |energies|, force by the largest force on an atom or along a pair, and
-    stress by the sum of absolute virial terms per volume; *_expected are differences expected from rounding.
+    The energy scale is the sum of |energies|, the force scale the largest force on an atom or along a pair,
+    and the stress scale the sum of |virial terms| per volume. *_expected are expected rounding errors.
     """
 
     energy: float
@@ -287,7 +287,7 @@ class _Scales:
 
     @classmethod
     def of(cls, simulation: Simulation, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]) -> _Scales:
-        """Return the scales of a frame, from sums over pairs for a pair potential and else from totals."""
+        """Return the scales of a frame, from sums over pairs or, for many-body potentials, from totals."""
         unit, places = unit_roundoff(narrowest(simulation)), unit_roundoff(_places(simulation))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
@@ -436,7 +436,7 @@ def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = 
 
 
 def _forces(simulation: Simulation) -> Reference:
-    """Return the reference calculator: ASE's class or, if that is slow (Tersoff, mixtures), plain numpy."""
+    """Return the reference calculator, from ASE or, if ASE is slow (Tersoff, mixtures), in plain numpy."""
     judge = reference(simulation)
     slow = isinstance(simulation.model, Tersoff) or len(simulation.symbols) > 1
     return independent(simulation) if slow and not isinstance(simulation.potential, EmbeddedAtom) else judge

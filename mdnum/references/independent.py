@@ -1,7 +1,7 @@
 """Energies, forces and stress from the formulas alone, computed in plain numpy on ASE's neighbor list.
 
-The numpy code is independent of the code used in a run (each cutoff has its own numpy `reference`). The numpy
-code is the only reference if ASE has no class for a potential or a cutoff, and otherwise a second reference.
+The numpy code is independent of the code used in a run. Each cutoff has its own numpy `reference`. If ASE has
+no class for a potential or a cutoff, the numpy code is the only reference.
 
 A model takes directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
 the total energy with respect to every d. Forces and stress follow from the gradient g of the energy with
@@ -47,8 +47,8 @@ def edges_of(atoms: Atoms, reach: float) -> Edges:
     """Return the pairs within slightly more than `reach`, in both directions, from ASE's neighbor list.
 
     ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster for 500 atoms than ASE's
-    neighbor_list. ASE lists only pairs with r < reach, while the model decides whether r = reach is inside;
-    the list therefore extends farther, by SLACK.
+    neighbor_list. ASE lists only pairs with r < reach, but the model must also receive pairs with r = reach.
+    The list therefore extends beyond reach, by SLACK.
     """
     arrays = (atoms.positions, atoms.numbers, atoms.cell.array, atoms.pbc)
     key = (*(array.tobytes() for array in arrays), reach)
@@ -285,7 +285,7 @@ class _OneSpecies(Model):
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:
-        """Return atomic energies and gradient, as for a `Model`, from edges within reach and unit vectors."""
+        """Return the energy of each atom and the gradient, given edges within reach and unit vectors."""
 
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
         gradient, inside = np.zeros_like(edges.d), edges.r < self.reach
@@ -295,7 +295,7 @@ class _OneSpecies(Model):
 
 
 class StillingerWeberModel(_OneSpecies):
-    """Stillinger-Weber potential for one species: Physical Review B 31, 5262 (1985), equations 2.1 to 2.5."""
+    """Stillinger-Weber potential for one species (Physical Review B 31, 5262, 1985, equations 2.1 to 2.5)."""
 
     def within(self, edges, unit):
         own = self.constants
@@ -325,7 +325,7 @@ class StillingerWeberModel(_OneSpecies):
 
 
 class TersoffModel(_OneSpecies):
-    """Tersoff's potential for one species: Physical Review B 38, 9902 (1988), in LAMMPS notation."""
+    """Tersoff potential for one species (Physical Review B 38, 9902, 1988), in LAMMPS notation."""
 
     def within(self, edges, unit):
         own, r = self.constants, edges.r

@@ -1,7 +1,7 @@
-"""LAMMPS as a reference for pair functions, which its pair style `lepton` evaluates and differentiates.
+"""LAMMPS as a reference for pair functions, by means of its pair style `lepton`.
 
-The function traced by jax is translated to an expression that LAMMPS parses and differentiates symbolically,
-so an independent program computes pairs, sums, energies and derivatives.
+The function traced by jax is translated to an expression, which LAMMPS parses and differentiates. Pairs,
+sums, energies and derivatives are thus computed by an independent program.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class NamedObject:
 
     @property
     def name(self) -> str:
-        """Last part of the dotted name without arguments; if there is no name, the file name's stem."""
+        """Last part of the dotted name, without arguments; the file's stem if no name is given."""
         return self.call.partition("(")[0].rpartition(".")[2].strip() or Path(self.home).stem
 
     def find(self, defaults: Sequence[str] = (), anew: bool = False) -> Any:
@@ -77,7 +77,7 @@ class NamedObject:
             ) from error
 
     def source(self) -> tuple[str, str]:
-        """Return import statements and an expression for the object, for a script without mdnum."""
+        """Return import statements and an expression that create the object in a script without mdnum."""
         first = self.call.partition("(")[0].partition(".")[0].strip()
         if not self.is_file:
             return f"from {self.home} import {first}\n", self.call

@@ -51,9 +51,9 @@ def rounding_bound(
 ) -> float:
     """Upper bound on the rounding error (length) of a computed distance that is close to r_cut.
 
-    The bound is valid for a code that wraps coordinates, adds a lattice vector, subtracts and takes the norm:
-    numbers are at most as large as the coordinates plus the cell, and each operation rounds once or twice.
-    Typical rounding errors are a tenth of this bound.
+    The bound is valid for a code that wraps coordinates, adds a lattice vector, subtracts and takes the norm.
+    Numbers in this code are at most as large as the coordinates plus the cell, and each operation rounds once
+    or twice. Typical rounding errors are a tenth of this bound.
 
     Args:
         positions: coordinates as passed to the code.

@@ -108,7 +108,7 @@ class Search:
 
 
 def all_searches(system: Simulation) -> tuple[Search, ...]:
-    """Return the neighbor searches of libraries, and of mdnum with the comparison (< or <=) of a system."""
+    """Return all neighbor searches: those of libraries, and those of mdnum set up for a system."""
     own = own_searches(system)
     return (*own, *(Search(one) for one in known() if not one.kept and one.package != "mdnum"))
 
@@ -116,8 +116,8 @@ def all_searches(system: Simulation) -> tuple[Search, ...]:
 def own_searches(system: Simulation) -> tuple[Search, ...]:
     """Return the neighbor searches of mdnum, set up for a system.
 
-    "mdnum force loop" is the cutoff decision in the force evaluation, without jit. "mdnum, host list" and
-    "mdnum, jax-md list" are the two list builders of mdnum, with the same cutoff decision made on the host.
+    The search "mdnum force loop" makes the cutoff decision of the force evaluation, without jit. The searches
+    "mdnum, host list" and "mdnum, jax-md list" use mdnum's two list builders, with the same decision.
     """
     compare, dtype = system.decider.compare, system.policy.decision
     unit = _SINGLE if "float32" in (dtype, system.policy.state) else 2.0**-53
@@ -244,8 +244,8 @@ def check_pairs(
     """Find the pairs inside the cutoff with every neighbor search, and compare them with brute force.
 
     Each neighbor search is run once for each cutoff radius of the species pairs. Brute force uses the
-    comparison (< or <=) of the system file, in rational arithmetic near the cutoff. If only decisions near
-    the cutoff differ, the result "differs at the cutoff" shows rounding or convention, not an error.
+    comparison (< or <=) of the system file, in rational arithmetic near the cutoff. The result "differs at
+    the cutoff" means that only decisions near the cutoff differ, by rounding or convention.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.

@@ -23,7 +23,7 @@ _LEAST_ROWS, _BLOCKS = 40, 10
 
 @dataclass(frozen=True)
 class Stays:
-    """Residence times of pairs inside and outside the cutoff, between two flips of a pair, in steps."""
+    """Residence times of pairs inside and outside the cutoff: numbers of steps between flips of a pair."""
 
     inside: Int[np.ndarray, "lengths"]  # from entering to leaving: how many stays last 0, 1, 2, ... steps
     outside: Int[np.ndarray, "lengths"]  # from leaving to entering again, likewise
@@ -39,7 +39,7 @@ class Stays:
 
 
 def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
-    """Return the median residence time, given how many stays lasted 0, 1, 2, ... steps; None if none did."""
+    """Return the median residence time from the numbers of stays of 0, 1, 2, ... steps, or None."""
     total = int(counts.sum())
     if not total:
         return None
@@ -66,8 +66,8 @@ class PairCounts:
 class Scan:
     """Statistics of a table of flips that may be larger than memory, read block by block.
 
-    A scan stores a row for each pair, a count for each step and for each residence time, the flips nearest to
-    their threshold, and the margin of every flip.
+    A scan keeps a row for each pair, counts by step and by residence time, the margin of every flip, and the
+    flips nearest to their threshold.
 
     Args:
         steps: number of steps in the run's series; flips happen at the steps 0 to steps - 1.
@@ -126,7 +126,7 @@ class Scan:
 
     @property
     def alternates(self) -> bool:
-        """True if every pair enters and leaves the cutoff alternately; otherwise a flip is missing."""
+        """True if entries and exits alternate for every pair; False shows that a flip is missing."""
         self._follow()
         return self._alternates
 
@@ -164,7 +164,7 @@ class Scan:
         )
 
     def matches(self, series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
-        """Return, for each step, whether the table has as many flips as the run counted."""
+        """Return, for each step, True if the table and the run's series have equal numbers of flips."""
         return (self.entered == series["entered"]) & (self.left == series["left"])
 
     def _follow(self) -> None:
@@ -249,7 +249,7 @@ class Conservation:
         kinetic: Float[np.ndarray, "rows"],
         least: float,
     ) -> Conservation | None:
-        """Compute the energy conservation from one energy per step; None for few steps or atoms at rest.
+        """Compute fluctuation and drift of the conserved energy; None for few steps or atoms at rest.
 
         The linear trend is removed before the fluctuation is computed, since the drift is reported
         separately. The first half of the run is omitted, because a run that starts from a lattice turns half

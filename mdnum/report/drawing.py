@@ -98,7 +98,7 @@ def line(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, label: str = "", 
 def envelope(
     x: np.ndarray, y: np.ndarray, most: int = POINTS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return (smallest, mean, largest, mean x) of points in at most `most` groups of equal size."""
+    """Divide points into at most `most` groups; return smallest, mean and largest y and mean x of each."""
     if len(y) <= most:
         return y, y, y, x
     starts = np.unique(np.linspace(0, len(y), most, endpoint=False).astype(int))
@@ -123,7 +123,7 @@ def legend(axes: Axes) -> None:
 
 
 def notes(plot: Figure | Plot) -> list[str]:
-    """Describe the values that a plot cannot show, with a sentence for each kind of value."""
+    """Return a sentence for each kind of value that a plot cannot show, such as infinite values."""
     if isinstance(plot, Figure) or not plot.series:
         return []
     sentences = []
@@ -198,7 +198,7 @@ def _values(plot: Plot, name: str) -> np.ndarray:
 
 
 def _base(plot: Plot, name: str) -> float:
-    """Return a number to subtract from axis values that differ only in their last digits; otherwise 0."""
+    """Return an offset for an axis whose values differ only in their last digits; otherwise 0."""
     values = _values(plot, name)
     span = np.ptp(values) if len(values) else 0.0
     # differences of neighboring floats are exact, so none of them is lost
@@ -218,7 +218,7 @@ def _coincide(one: Series, other: Series) -> bool:
 def _apart(
     marks: tuple[tuple[float, str], ...], base: float, limits: tuple[float, float]
 ) -> list[tuple[float, str]]:
-    """Return marked values with their labels; the labels of values that are too close together are joined."""
+    """Return marked values with labels, and join the labels of values that are too close together."""
     kept: list[tuple[float, str]] = []
     near = 0.025 * abs(limits[1] - limits[0])
     for value, word in sorted((value - base, word) for value, word in marks):

@@ -189,7 +189,7 @@ def _first(texts: str | Sequence[str], values: Mapping[str, Any]) -> str | None:
 
 
 def _known(text: str, values: Mapping[str, Any]) -> bool:
-    """Return True if every field of a text has a value; an element of a missing value is also missing."""
+    """Return True if every field of a text has a value other than None."""
     names = (name for _, name, _, _ in string.Formatter().parse(text) if name)
     with suppress(TypeError):
         return all(_Fields().get_field(name, (), values)[0] is not None for name in names)
@@ -221,7 +221,7 @@ class Verdict:
         return " ".join((self.headline, *self.evidence))
 
     def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a summary with the verdict and its findings; an empty summary becomes "unfinished"."""
+        """Return a summary with the verdict and its findings; an empty one has the status "unfinished"."""
         usual = {"status": "complete" if summary else "unfinished", "seconds": None}
         found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
         return headed(kind, {**usual, **summary, **found})
@@ -235,7 +235,7 @@ def conclude(
     best: Tone = "info",
     judged: bool = False,
 ) -> Verdict:
-    """Return a verdict; its tone follows from the most severe finding, which the headline also names.
+    """Return a verdict with the tone of the most severe finding, which is also named in the headline.
 
     Args:
         found: findings in the order in which they are to be read, regardless of severity.

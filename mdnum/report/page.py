@@ -123,7 +123,7 @@ def _render(template: str, **content: Any) -> str:
 
 
 def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
-    """Describe a system-file table in one phrase: its kind, then every other entry by name and value."""
+    """Describe a table of a system file in one phrase: its kind, then names and values of other entries."""
     parts = []
     for key, value in table.items():
         if isinstance(value, Mapping):
@@ -141,7 +141,7 @@ def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -
 
 
 def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield (name, text) for each entry of nested tables; all plain values of one table form one text."""
+    """Yield (name, text) for each entry of nested tables; plain values of the same table share one text."""
     for key, item in value.items():
         name = f"{prefix}{key}".replace("_", " ")
         if isinstance(item, Mapping):

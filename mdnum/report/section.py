@@ -97,7 +97,7 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Code:
-    """A file or a command to be copied; the report page shows only its title until a reader unfolds it."""
+    """A file or a command to copy; on the report page, the text is folded below its title."""
 
     title: str  # what it is
     text: str  # word for word
@@ -129,7 +129,7 @@ def positive(values: np.ndarray) -> np.ndarray:
 def curves(
     x: np.ndarray, lines: Mapping[str, np.ndarray], mark: Mark = "line", log: bool = True
 ) -> tuple[Series, ...]:
-    """Build one plot series for each line; the order of the lines determines the style of each line.
+    """Build a plot series for each line; the position of a line in `lines` determines its style.
 
     Args:
         x: positions shared by all lines.

@@ -49,13 +49,13 @@ def count(value: float | None) -> str:
 
 
 def plain(value: float | None, digits: int = 4) -> str:
-    """Format a number without trailing zeros, for values that were chosen and not measured."""
+    """Format a number that was chosen (not measured), without trailing zeros."""
     text = number(value, digits)
     return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
 
 
 def pair_name(pair: Mapping[str, Any]) -> str:
-    """Return the atom labels of a pair, and the potential's term if each term has its own cutoff."""
+    """Return the atom labels of a pair, with its potential term if every term has its own cutoff."""
     return f"{pair['i']}–{pair['j']}" + (f" ({pair['terms']})" if pair.get("terms") else "")
 
 

@@ -39,7 +39,7 @@ class Back(NamedTuple):
 
 
 class Stretched(NamedTuple):
-    """Steps recorded during time reversal, earliest first, with atoms in the order of the neighbor list."""
+    """Steps that time reversal has recorded, earliest first; atoms are in the order of the neighbor list."""
 
     first: int  # step of the first row
     rows: int  # how many there are; the record's other rows are void
@@ -71,7 +71,7 @@ def _before(program: EpochProgram, masses, order, back: Back) -> Back:
 
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
 def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord):
-    """Reverse steps until the list's skin is used up, the record is full, or lost bits must be restored."""
+    """Reverse steps until a new list is needed, the record is full, or lost bits must be restored."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
 
@@ -177,7 +177,7 @@ class BackwardRun:
         self._check_bath()
 
     def _change_bath(self) -> None:
-        """Restore the thermostat's bath (bits lost by friction) at steps at which the run emptied it."""
+        """Restore the thermostat's bath, which stores bits lost by friction, where the run emptied it."""
         step, period = int(self.back.step), self.simulation.propagator.pause
         if period is None or step % int(period):
             return

@@ -1,4 +1,4 @@
-"""Comparison of two runs, whose atoms and axes may differ by a permutation, a symmetry and a shift."""
+"""Comparison of two runs; their atom labels and axes may differ by a permutation, symmetry and shift."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class ReferenceFrame:
 
 @dataclass(frozen=True)
 class CrossFlip:
-    """Pair of atoms whose cutoff decision begins, or ceases, to differ between two runs at a step."""
+    """Pair of atoms whose cutoff decisions in two runs start or stop differing at a step."""
 
     step: int  # of the flip
     # i, j: the pair, labels of the first run, i < j
@@ -118,7 +118,7 @@ class CrossFlip:
 
 @dataclass(frozen=True)
 class PairFlips(Columns):
-    """Flips (changes of cutoff decisions) of one of two runs, as columns with the first run's labels."""
+    """Flips in one of two runs, as columns; pairs have the atom labels of the first run."""
 
     step: Int[np.ndarray, "flips"]  # of the flip
     key: Int[np.ndarray, "flips"]  # i * atoms + j of the pair, i < j
@@ -185,7 +185,7 @@ class CrossRecorder:
     def take(
         self, first: int, rows: int, a: PairFlips, b: PairFlips
     ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
-        """Return the number of pairs with different decisions at each step, and all changes as `CrossFlips`.
+        """Return, for each step, the number of pairs with different decisions; also return the `CrossFlips`.
 
         Args:
             first: step of the first row.
@@ -231,7 +231,7 @@ def _place(values, order, out):
 def in_user_order(
     values: Float[np.ndarray, "rows 3 atoms"], order: Int[np.ndarray, "atoms"]
 ) -> Float[np.ndarray, "rows 3 atoms"]:
-    """Return an array with one entry per atom in the user's order of atoms, in float64.
+    """Return vectors of atoms, such as positions, in the user's order of atoms and in float64.
 
     Args:
         order: atom k of the record is atom order[k].
@@ -296,7 +296,7 @@ def separations(
     b: Float[np.ndarray, "rows 3 atoms"],
     others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
-    """Return each step's largest distance between an atom's positions in two runs; NaN if one is NaN.
+    """Return, for each step, the largest distance between an atom's positions in two runs (or NaN).
 
     Args:
         cells: the box, or one box for each row; distances are minimum-image distances.
@@ -329,7 +329,7 @@ def overridden(
     species: Int[np.ndarray, "atoms"],
     r_cut: Float[np.ndarray, "channels species species"],
 ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
-    """Return the number of pairs whose decisions differ, and their largest distance from the cutoff.
+    """Return the number of pairs with different decisions, and the largest |r - r_cut| of these pairs.
 
     Args:
         cells: as for `separations`.

@@ -25,7 +25,7 @@ class Counterfactual:
     """A run with its own arithmetic, on which the cutoff decisions of another run (the leader) are imposed.
 
     The decisions that the run itself would make are computed, too; those that differ from the leader's are
-    counted. The object is called with each segment of the leader; `until` returns the steps.
+    counted. The object is called with each segment of the leader; `until` returns the simulated steps.
 
     Args:
         simulation: the run whose arithmetic is used.

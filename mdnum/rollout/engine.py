@@ -85,7 +85,7 @@ class Segment:
         return self.first + self.rows - 1
 
     def rows_of(self, name: str) -> np.ndarray:
-        """Return a recorded quantity at all steps; if the quantity was not recorded, recompute the steps."""
+        """Return a recorded quantity at all steps; steps are recomputed if the record lacks this quantity."""
         lacks = self.changes is not None and name in ("x", "v", "images", "bits")
         return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
 

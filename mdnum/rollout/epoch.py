@@ -118,7 +118,7 @@ class EpochState(NamedTuple):
 
 
 class StepInputs(NamedTuple):
-    """Inputs of a time step that are needed for its derivatives, without positions, box and virial."""
+    """Inputs of a time step for its derivatives, in addition to positions, box and virial."""
 
     v: Float[Array, "3 atoms"]  # velocities that lead there, as the step before left them
     extra: Any  # the extra state then
@@ -188,7 +188,7 @@ def empty_record(
     cells: bool = False,
     inputs: Any = (),
 ) -> EpochRecord:
-    """Allocate the record of an epoch; if `record` is False, allocate only one number per step.
+    """Allocate the record of an epoch; arrays with one entry per atom are empty if `record` is False.
 
     Args:
         changes: number of changes of decisions to allocate in place of rows of decisions and positions.

@@ -34,7 +34,7 @@ def _mixed(key):
 
 @njit
 def fingerprint_of_bits(bits, index, order):
-    """Return the number of pairs inside the cutoff and a hash of them, both independent of list order."""
+    """Count and hash the pairs inside the cutoff; the results do not depend on the order of the list."""
     count, total = 0, np.uint64(0)
     atoms, listed = order.shape[0], index.shape[0] // 8
     for w in range(bits.shape[0]):
@@ -216,12 +216,12 @@ class PairRecorder:
         return np.array([self._once(int(both)) for both in segment.rows_of("inside")], np.int64)
 
     def _stacked(self, cells: Sequence[Cell]) -> tuple[Any, Any]:
-        """Return boxes in float64, and also in the dtype of cutoff decisions if that is not float64."""
+        """Return boxes in float64 and, if cutoff decisions have another dtype, also in this dtype."""
         dtype = self.simulation.decider.dtype
         return stacked(cells), None if dtype == "float64" else stacked(cells, dtype)
 
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
-        """Bounds on the rounding errors, at each step, of the quantity (r or r²) compared with the cutoff."""
+        """Bounds on the rounding error of the compared quantity (r or r²) at each step."""
         decider = self.simulation.decider
         if not decider.grows and not segment.cells:
             return np.repeat([decider.bounds], segment.rows, axis=0)
@@ -258,10 +258,10 @@ class PairRecorder:
         return AmbiguousPairs.concatenate(parts)
 
     def flips(self, segment: Segment) -> FlipTable:
-        """Return a segment's flips sorted by step, i and j (user's atom labels; `type_of` explains i).
+        """Return a segment's flips sorted by step, i and j, with the user's atom labels (see `type_of`).
 
         Distance, margin and radial speed refer to the step of the flip. The margin (threshold minus r or r²)
-        has the same bits as in the run.
+        equals that of the run bit for bit.
 
         Raises:
             MdnumError: a flip was recorded for only one atom of a pair, or a margin contradicts its decision
@@ -371,7 +371,7 @@ class PairRecorder:
 def pair_keys(
     i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], atoms: int
 ) -> Int[np.ndarray, "pairs"]:
-    """Return sorted integer keys, one for each pair of atoms i < j; `Simulation.type_of` explains i."""
+    """Return sorted integer keys, one for each pair i < j; for the argument i, see `Simulation.type_of`."""
     return np.sort(i.astype(np.int64) * atoms + j)
 
 

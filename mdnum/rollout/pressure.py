@@ -111,7 +111,7 @@ _OWN = ("volume", "kinetic", "virial", "total")
 def _virials(
     simulation: Simulation, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], r: np.ndarray
 ) -> Mapping[str, float]:
-    """Return the sum of r · F over pairs for each term; `Simulation.type_of` explains the argument i."""
+    """Return the sum of r · F over pairs for each term; for the argument i, see `Simulation.type_of`."""
     found, channel, i = {}, i // simulation.atoms, i % simulation.atoms
     for number, part in enumerate(simulation.model.parts):
         here = channel == number

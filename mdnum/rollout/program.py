@@ -133,7 +133,7 @@ class MdProgram:
         return list(zip(whole[: len(free)], whole[len(free) :], strict=True))
 
     def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
-        """Return copies of the simulation with random displacements; the largest is about `size`.
+        """Return randomly displaced copies of the simulation; the largest displacement is about `size`.
 
         The largest displacement is at least one ulp, because rounding removes smaller displacements.
         """
@@ -219,7 +219,7 @@ class MdProgram:
         return Differing(nearest)
 
     def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], Simulation, np.ndarray]:
-        """Return the pairs inside the cutoff, the simulation with its box, and the positions at a step."""
+        """Return, for one step, the pairs inside the cutoff, the simulation in its box, and positions."""
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             if segment.last >= step:
                 row = step - segment.first
@@ -228,7 +228,7 @@ class MdProgram:
         raise IndexError(f"the run has no step {step}")
 
     def state_at(self, step: int, last: int) -> tuple[Simulation, Float[np.ndarray, "atoms 3"]] | None:
-        """Return the simulation with the box of a step, and wrapped positions; None after the run's end."""
+        """Return, for one step, the simulation in its box and wrapped positions; None after the run's end."""
         track = Track(self.simulation, last, self.begin, self.frame, flips=False)
         while track.segment() is not None:
             rows = track.until(track.ready)

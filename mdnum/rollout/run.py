@@ -186,7 +186,7 @@ class Rollout:
             self.shown(here, np.asarray(positions, np.float64))
 
     def _needs_rows(self) -> bool:
-        """True if recorded steps are needed so often that storing is faster than recomputing."""
+        """True if steps are read so often that storing them is faster than computing them again."""
         simulation = self.simulation
         policy = simulation.policy
         # in single precision most steps have a margin within its bound, and a bad list misses pairs
@@ -272,7 +272,7 @@ class Rollout:
         self.folder.checkpoint_beside(lambda: state if held is None else {**state, "held": held()})
 
     def _to_dict(self, point: Start) -> dict[str, Any]:
-        """Return the data for resuming the run, including the pairs inside the cutoff from the last list."""
+        """Return the data from which the run can be resumed."""
         last = None if self.done.last is None else np.asarray(self.done.last).T
         frames = {"first": self.done.first, "last": last}
         return {

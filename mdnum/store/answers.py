@@ -25,7 +25,7 @@ NAME = "answers.json"
 
 
 class Timed(Protocol):
-    """Protocol of a state that can be stored: a dataclass of plain values with the elapsed time (s)."""
+    """Protocol of a state that can be stored: a dataclass of plain values with the elapsed `seconds`."""
 
     seconds: float
 
@@ -46,7 +46,7 @@ class Answers(Generic[T]):
         self._before, self._began, self._due = state.seconds, monotonic(), 0.0
 
     def save(self, urgent: bool = True) -> None:
-        """Save the state of a command for resuming the command; a non-urgent save may be skipped."""
+        """Save the state for resuming the command; without `urgent`, save about once per second."""
         now = monotonic()
         self.state.seconds = self._before + now - self._began
         if urgent or now >= self._due:

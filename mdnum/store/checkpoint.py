@@ -146,7 +146,7 @@ class FrameFile:
                 raise
 
     def mark(self) -> tuple[int, int, int]:
-        """Return the number of frames, the offset table's position, and the file size (0 without frames)."""
+        """Return the number of frames, the position of the offset table, and the size of the file."""
         if not self.path.exists() or self.path.stat().st_size < _FRAMES_AT + _HEADER.size:
             return (0, 0, 0)
         with opened(self.path) as file:

@@ -44,7 +44,7 @@ _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Convert operating-system errors for a path into a FolderError with a remedy."""
+    """Convert operating-system errors at a path to a FolderError, which suggests a remedy."""
     try:
         yield
     except OSError as error:
@@ -111,9 +111,9 @@ def subfolder(root: Path, name: str) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Yield a temporary file that replaces the file at path when closed; path never holds partial data.
+    """Yield a temporary file that replaces the file at `path` when closed, so `path` never has partial data.
 
-    If path is a symbolic link, the link is replaced, and the file to which the link refers is unchanged.
+    A symbolic link at `path` is replaced; the file to which the link refers is not changed.
     """
     if path.parent.name in SUBFOLDERS and path.parent.is_symlink():
         raise _linked(path.parent)
@@ -300,7 +300,7 @@ def place(path: Path) -> tuple[Path, str]:
 
 
 def foretell(path: Path, new: str) -> None:
-    """Add the digest of a file's new contents to the manifest; the old digest also remains valid."""
+    """Add the digest of a file's new contents to the manifest, beside that of its present contents."""
     root, name = place(path)
     if name == NAME or not (root / NAME).exists():
         return

@@ -191,7 +191,7 @@ class RunFolder:
         return self._layout
 
     def read_as(self, layout: Layout) -> None:
-        """Read a folder from an earlier version of mdnum as if it had the command's present layout."""
+        """Read a folder of an earlier version of mdnum with the present layout of its command."""
         self._layout = layout
 
     @property
@@ -213,7 +213,7 @@ class RunFolder:
         self._stream(table).append(columns)
 
     def look_up(self, table: str, of: str, columns: Mapping[str, Any]) -> None:
-        """Add columns with values that are looked up by a column of indices (see `TableStream.look_up`)."""
+        """Add columns with values that are looked up by index; see `TableStream.look_up`."""
         self._stream(table).look_up(of, columns)
 
     def append_frame(self, atoms: Atoms) -> None:
@@ -339,7 +339,7 @@ class RunFolder:
             self._list_files()
 
     def write_provenance(self, provenance: Mapping[str, Any]) -> None:
-        """Write provenance.json, when the folder contains all input files of the run."""
+        """Write provenance.json after all input files of the run have been written to the folder."""
         self._write_json("provenance.json", provenance)
         if self._owner:
             names = {entry.name for entry in self.path.iterdir() if not entry.name.startswith(".")}

@@ -148,7 +148,7 @@ class TableStream:
             self.flush()
 
     def look_up(self, of: str, columns: Mapping[str, Any]) -> None:
-        """Declare columns with values that are looked up from a column of indices when rows are written.
+        """Declare columns whose values are looked up, by an index in each row, when rows are written.
 
         Args:
             of: name of the column of indices.
@@ -294,7 +294,7 @@ class TableStream:
             return file.metadata.num_rows
 
     def _replace(self, path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
-        """Write rows into a file of this table; the file's digest is in the manifest before the file exists.
+        """Write rows into a file of this table; the manifest lists the file's digest before the file exists.
 
         Every page of the file has a checksum that readers can verify.
         """
@@ -333,7 +333,7 @@ class TableStream:
 
 
 class _Writing:
-    """A file that a background thread writes from a queue of tables, mostly without holding Python's GIL."""
+    """A file to which a background thread writes queued tables, mostly without holding Python's GIL."""
 
     def __init__(self, write: Callable[[Iterator[pa.Table]], None]):
         # with a limit: where the disk is slower than what makes the rows, that waits
@@ -358,7 +358,7 @@ class _Writing:
         self._done.get()
 
     def end(self, whole: bool = True) -> None:
-        """Wait until all tables are written; if `whole` is False, discard the file and ignore errors."""
+        """Wait until all tables are written, or discard the file and ignore errors if not `whole`."""
         self._whole = whole
         with nullcontext() if whole else suppress(Exception):
             self.put(None)
@@ -367,13 +367,13 @@ class _Writing:
 
 
 def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Concatenate tables with the same columns; one text can stand for a column of equal texts."""
+    """Concatenate tables with the same columns; a column of equal texts may be given as one text."""
     columns = {name: [part[name] for part in parts] for name in parts[0]}
     return {name: one[0] if isinstance(one[0], str) else np.concatenate(one) for name, one in columns.items()}
 
 
 def _repeats(values: Any, value: Any) -> bool:
-    """Return True if a column is stored as one value for all its rows, and that value is the given one."""
+    """Return True if a column is stored as a single value that equals the given value."""
     if isinstance(values, np.ndarray) and values.strides == (0,):
         values = values[0]
     return value is not None and np.ndim(values) == 0 and bool(values == value)

@@ -25,27 +25,27 @@ _ENDS = {
 
 @dataclass(frozen=True)
 class EndComparison:
-    """Comparison of results for one value of a varied choice, or for one setting, with converged results."""
+    """Comparison of one value of a choice, or of a whole setting, with converged results."""
 
     value: Any
     by_measure: Mapping[str, Within]
 
     @property
     def worst(self) -> str | None:
-        """Measure outside its tolerance; if there is none, the undecided one that needs the most seeds."""
+        """Measure outside its tolerance or, if none is, the undecided measure that needs most seeds."""
         each = self.by_measure
         ranked = sorted(each, key=lambda name: (each[name].inside is not False, -each[name].more))
         return next((name for name in ranked if each[name].inside is not True), None)
 
     @property
     def inside(self) -> bool | None:
-        """True if all measures are within their tolerances, or None if errors are too large to tell."""
+        """True if all measures are within tolerance, False if one is not, None if errors are too large."""
         each = [one.inside for one in self.by_measure.values()]
         return False if False in each else None if None in each else True
 
     @property
     def more(self) -> float:
-        """Factor by which the number of seeds must increase for a decision on all tolerances."""
+        """Factor by which the number of seeds must increase to decide on all tolerances."""
         return max((one.more for one in self.by_measure.values()), default=1.0)
 
 
@@ -125,7 +125,7 @@ def compared_with_end(
     tolerances: Mapping[str, float],
     comparisons: int,
 ) -> EndComparison:
-    """Compare the results of a value, or of a whole setting, with the converged results.
+    """Compare results for one value of a choice, or for a whole setting, with the converged results.
 
     Args:
         key: its label in `found`. found, tolerances: as for `advise`. comparisons: their number.

@@ -171,7 +171,7 @@ def _dask(address: str, workers: int | None) -> TaskEngine:
 
 
 def _executorlib(file: str, workers: int | None) -> TaskEngine:
-    """Return an engine from executorlib; a TOML file gives its class (default: SLURM jobs) and keywords."""
+    """Return an executorlib engine; a TOML file gives its class (by default SLURM jobs) and keywords."""
     try:
         import executorlib  # pyright: ignore[reportMissingImports]
         from executorlib.api import ExecutorlibSocketError  # pyright: ignore[reportMissingImports]

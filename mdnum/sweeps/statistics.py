@@ -48,8 +48,8 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
 
     The error of a mean is the error estimated from its runs, multiplied by the ratio of the scatter between
     seeds to the estimated errors. One ratio is used for all settings of a measure; more settings make the
-    ratio more precise. If the resulting error has fewer degrees of freedom than the scatter between seeds of
-    a single setting, the scatter is used instead.
+    ratio more precise. The scatter between the seeds of a single setting is used instead if it has more
+    degrees of freedom.
 
     Args:
         found: (value, standard error, independent samples) of each run; nan if unknown.
@@ -165,7 +165,7 @@ def paired(
 
 
 def _quantile(chance: float, freedom: float) -> float:
-    """Return the value that Student's t exceeds with probability `chance`."""
+    """Return the value that Student's t exceeds with probability `chance`, given its degrees of freedom."""
     from scipy.special import stdtrit
 
     # scipy.stats has the same, and takes a hundred times as long

@@ -139,9 +139,9 @@ def _keep(trial: Trial, box: str) -> None:
 
 
 class _Moved:
-    """Changes of the energy when the atom with the most neighbors is moved by a lattice vector.
+    """Energy changes when the atom with the most neighbors is displaced by lattice vectors.
 
-    Energies in the sheared box include only pairs that have the same nearest image in both boxes.
+    Energies in the sheared box include only pairs whose nearest image is the same as in the original box.
     """
 
     def __init__(self, trial: Trial):
@@ -156,7 +156,7 @@ class _Moved:
         self.whole = np.where(whole, near, n).astype(np.int32)
 
     def by(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
-        """Return copies of the positions with one atom moved by each vector, then the original positions."""
+        """Return a copy of the positions per vector, with one atom moved by this vector, and the original."""
         x, moved = self.trial.x, np.arange(self.trial.n) == self.central
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 
@@ -238,7 +238,7 @@ def _check(trial: Trial) -> None:
 
 
 def _over_both_lists(trial: Trial) -> dict[str, float]:
-    """Return the energy for a list of the pairs inside the cutoff, and for a list that includes the skin."""
+    """Return the energy for the pairs inside the cutoff only, and for all pairs of the neighbor list."""
     return {"inside": trial.energy(), "skin": trial.energy(idx=trial.idx)}
 
 
@@ -346,7 +346,7 @@ def _at_the_cutoff(trial: Trial) -> None:
 
 
 def _threes(trial: Trial) -> tuple[Any, Any, np.ndarray]:
-    """Return functions that arrange the atoms in groups of three that do not interact with each other.
+    """Return functions that arrange atoms in groups of three, without interactions between groups.
 
     Returns:
         a function that returns the neighbor list of chosen groups; a function that places the third atom of
@@ -383,9 +383,9 @@ def _adds(trial: Trial) -> bool:
 
 
 def _reach(trial: Trial) -> tuple[float | None, float]:
-    """Return the largest distance at which a listed pair has a force, and the largest tested distance.
+    """Return the largest distance at which two listed atoms exert a force, and the largest tested distance.
 
-    The first returned value is None if the pair has no force at any tested distance.
+    The first returned value is None if there is no force at any tested distance.
     """
     r_cut, (listed, placed, third) = trial.model.r_cut, _threes(trial)
     furthest = min(2 * r_cut, 0.49 * trial.width if trial.pbc.any() else np.inf)
@@ -408,7 +408,7 @@ def _reach(trial: Trial) -> tuple[float | None, float]:
 
 
 def second_derivative(simulation: Simulation) -> str:
-    """Return the first operation that makes second derivatives infinite or NaN, or "" if all are finite."""
+    """Return the first operation with infinite or NaN second derivatives; "" if all are finite."""
     if not isinstance(simulation.model, EnergyFunction):
         return ""
     with jaxmd.standard_promotion():

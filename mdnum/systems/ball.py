@@ -25,7 +25,7 @@ MethodName = Literal["unrolled", "implicit", "frozen", "event-aware", "smoothed"
 
 
 def _numbers(value: Any) -> Any:
-    """Validate a number or an array of numbers; a union type would report each error twice."""
+    """Validate a number or an array of numbers, with one error message (a union type would give two)."""
     for item in value if isinstance(value, list | tuple) else (value,):
         if isinstance(item, bool) or not isinstance(item, int | float):
             raise PydanticKnownError("float_type")

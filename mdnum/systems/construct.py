@@ -210,7 +210,7 @@ def _integrator(
 
 
 def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -> Mapping[str, Any]:
-    """Return the options of an integrator in system-file units; options of built-in ones are validated."""
+    """Return an integrator's options in system-file units; those of built-in integrators are validated."""
     if kind not in (INTEGRATORS[one] for one in INTEGRATORS.shipped):
         return numbers
     table = {key: one.item() if hasattr(one, "item") else one for key, one in numbers.items()}
@@ -219,7 +219,7 @@ def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -
 
 
 def _check_instance(integrator: Integrator, units: Units, where: str) -> None:
-    """Check that the numbers of an integrator object, in system-file units, are allowed in a system file.
+    """Check that the numbers of an integrator object are allowed in a system file (in its units).
 
     Raises:
         InputError: a number is not a finite float64 scalar, or is out of range.
@@ -327,7 +327,7 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
 
 
 def common(terms: Mapping[str, Term]) -> Cut:
-    """Return a cutoff whose comparison (such as r < r_cut) is the same for all terms.
+    """Return the cutoff of the first term; all terms must use the same comparison (such as r < r_cut).
 
     Raises:
         InputError: there are no terms, or the terms have different comparisons.
@@ -378,7 +378,7 @@ def _is_array(value: Any) -> bool:
 
 
 def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, "types"]:
-    """Return an array with one number per pair type, from one number for all or one per pair of species.
+    """Return one number per pair type, given one number for all types or one per pair of species.
 
     Raises:
         InputError: the number of a pair is missing or not finite.

@@ -91,7 +91,7 @@ def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any
 
 
 def reduction_word(reduction: Any) -> str:
-    """Return the name of a summation order in system files, or its Python representation if unnamed."""
+    """Return a summation order's name in system files, or its Python representation if it has no name."""
     return next((word for word, known in BY_NAME.items() if known == reduction), repr(reduction))
 
 
@@ -168,7 +168,7 @@ def _leaves(tree: Any) -> dict[str, Any]:
 
 
 def _code(function: Any) -> dict[str, Any]:
-    """Return source code and digest of a user's function (a digest of bytecode, if there is no source)."""
+    """Return source code and digest of a user's function; without source code, the digest of its bytecode."""
     if function is None:
         return {}
     try:

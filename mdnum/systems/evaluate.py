@@ -119,7 +119,7 @@ class Evaluator:
         return float(energy), found
 
     def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
-        """Return the simulation in a cell, wrapped positions, neighbor list, and positions in list order."""
+        """Prepare an evaluation: the simulation in a cell, its neighbor list, and positions in list order."""
         check_not_forked()
         own = self.simulation
         same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))

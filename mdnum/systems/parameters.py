@@ -6,9 +6,10 @@ A parameter is a number or an array of numbers, and its name is a path. Paths ar
 (as in system files), "position.17.x", "velocity.17.x" or "potential.layers.0.weight.3.2" (a path with
 indices).
 
-Drawn velocities scale with the square root of `dynamics.temperature`, which is also the temperature of the
-thermostat; velocities of the structure do not change. `velocity.scale` scales all velocities, drawn or not.
-`cutoff.radius` also sets the onset of a cutoff without switching. `box.scale` scales box and positions.
+`dynamics.temperature` is the temperature of the thermostat. Drawn velocities scale with the square root of
+temperature; velocities of the structure do not change. `velocity.scale` scales all velocities, drawn or not.
+If a cutoff has no switching function, `cutoff.radius` also sets its onset. `box.scale` scales box and
+positions.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class Parameter:
 
 
 def parameters(simulation: Simulation) -> dict[str, Parameter]:
-    """Return all parameters of a simulation by path; `changed` returns a simulation with other values.
+    """Return all parameters of a simulation by path; use `changed` to change their values.
 
     Example:
         >>> mdnum.parameters(sim)["potential.sigma"].value
@@ -121,7 +122,7 @@ def number(simulation: Simulation, name: str) -> float:
 
 
 def with_number(simulation: Simulation, name: str, given: float) -> Simulation:
-    """Return the simulation with another value of a scalar parameter; compiled functions are used again."""
+    """Return the simulation with a changed scalar parameter, without compiling its functions again."""
     return with_values(simulation, {name: np.full(value(simulation, name).shape, given)})
 
 
@@ -169,7 +170,7 @@ def unit(simulation: Simulation, name: str) -> str:
 
 
 def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
-    """Return the value of a parameter: a scalar if there is one pair type, else one entry per pair type."""
+    """Return the value of a parameter, as a scalar if there is only one pair type."""
     place = entry(simulation, name)
     if place.index:
         return np.asarray(value(simulation, place.whole)[place.index] * place.factor)
@@ -188,7 +189,7 @@ def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
 
 
 def leaf_of(model: Any, name: str) -> Any:
-    """Return the array, of a potential or of its cutoff, that contains a parameter."""
+    """Return the array that contains a parameter of a potential or of its cutoff."""
     if not isinstance(model, CutPotential | Channels):
         return quantities_of(model)[name.removeprefix("potential.")]
     return pair_leaves(model)[name]
@@ -198,8 +199,8 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
     """Return the parameter arrays of pair potentials and of their cutoffs, by path.
 
     The argument `shared` adds arrays that do not depend on the pair type, and `species` adds arrays with one
-    entry per species. The path `cutoff.radius` is the radius of all terms if all radii agree. If radii
-    differ, each term has its own path, and terms with equal radii refer to the same array.
+    entry per species. If all radii agree, the path `cutoff.radius` is the radius of all terms. If radii
+    differ, each term has its own path, and terms with equal radii share one array.
     """
     found: dict[str, Any] = {}
     for part in model.parts:
@@ -218,7 +219,7 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
 
 
 def shared_radius(model: Any, name: str) -> tuple[str, ...]:
-    """Return all terms that share the cutoff radius to which a path refers (none if only one term has it)."""
+    """Return the terms that share a cutoff radius, given the path of the radius; none if it is not shared."""
     table, term, key = (*name.split(".", 2), "", "")[:3]
     if table != "terms" or key != "cutoff.radius":
         return ()
@@ -289,7 +290,7 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
 
 
 def _heated(simulation: Simulation, new: float) -> Simulation:
-    """Set the temperature of drawn velocities; velocities that were changed after the draw are scaled."""
+    """Set the temperature of initial velocities: draw them again, or scale them if they were changed."""
     old = simulation.draw
     heated = replace(simulation, draw=replace(old, temperature=new))
     if not (old.temperature and old.drawn) and "temperature" in simulation.integrator.numbers():

@@ -650,7 +650,7 @@ class SystemSpec(TomlTable):
 
     @staticmethod
     def follow(data: dict[str, Any], values: Mapping[Key, Any]) -> None:
-        """Set the velocities of an NVE system to be drawn again if its temperature or seed is changed."""
+        """Request new random velocities for an NVE system if its temperature or seed is changed."""
         structure, dynamics = data.get("structure"), data.get("dynamics")
         if not isinstance(structure, dict) or not isinstance(dynamics, dict) or dynamics.get("kind") != "nve":
             return

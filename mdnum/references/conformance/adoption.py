@@ -26,7 +26,7 @@ from mdnum.references.conformance.suite import Examiner, examine
 
 
 class NeighborListConformance:
-    """Tests of a neighbor list; subclass it under a name that pytest collects, and set `pairs`."""
+    """Tests of a neighbor list; a subclass sets `pairs` and has a name that pytest collects."""
 
     # a function of (positions, cell, pbc, r_cut) in `staticmethod`, a class or an object with `allocate` and
     # `update` (`KeptList`), or a word that `load` knows

@@ -1,4 +1,4 @@
-"""Convert the pairs that a neighbor list returns, in one of several forms, to named arrays.
+"""Convert the pairs that a neighbor list returns to named arrays; several forms of pairs are accepted.
 
 This file is copied into the scripts that reproduce a failure; it requires only numpy.
 """

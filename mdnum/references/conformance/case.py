@@ -154,7 +154,7 @@ def sequence(
 
 
 def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
-    """Return the pairs among some of the atoms, renumbered by each atom's index in `atoms`."""
+    """Return the pairs between the given atoms; atoms are renumbered by their index in `atoms`."""
     most = int(max(atoms.max(initial=-1), pairs.i.max(initial=-1), pairs.j.max(initial=-1))) + 1
     new = np.full(most, -1)
     new[atoms] = np.arange(len(atoms))
@@ -165,7 +165,7 @@ def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
 
 
 def gas(count: int, cell, seed: int, low: float = 0.0, high: float = 1.0) -> ndarray:
-    """Return random coordinates, uniform over a range of fractional coordinates of a cell."""
+    """Return random positions whose fractional coordinates are uniform between `low` and `high`."""
     return np.random.default_rng(seed).uniform(low, high, (count, 3)) @ matrix(cell)
 
 

@@ -55,7 +55,7 @@ class Truth(PairSet):
 
 
 def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DOUBLE) -> Truth:
-    """Compute the exact set of pairs that one neighbor-list call of a test case must or may return.
+    """Compute the exact pairs that a neighbor list must return, and those that it may return, at one call.
 
     Args:
         reach: largest distance of the pairs, length; the cutoff by default.
@@ -84,7 +84,7 @@ def conditioning(cell: ndarray, pbc: ndarray) -> float:
     """Factor, at least 1, by which conversion to fractional coordinates and back can amplify rounding errors.
 
     Source: Higham, Accuracy and Stability, 2nd ed., section 7.1. The factor is the condition number of the
-    periodic lattice vectors, each scaled to length 1 because lengths alone have no effect.
+    periodic lattice vectors. Each vector is first scaled to length 1, because lengths alone have no effect.
     """
     if not pbc.any():
         return 1.0
@@ -150,7 +150,7 @@ def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
     """Return all errors in the pairs from a neighbor list; the result is empty if there are no errors.
 
     A pair within rounding error of the cutoff (`Truth.scale` times the unit roundoff) may be listed or
-    omitted, but its two atoms must agree.
+    omitted, if the lists of its two atoms agree.
 
     Args:
         truth: exact pairs, including all distances at which pairs may be listed.
@@ -309,7 +309,7 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """Return the rounding error of pairs that are correct at least for float32; None for wrong pairs."""
+    """Return the rounding error of the listed pairs, or None if pairs are wrong even for float32."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))

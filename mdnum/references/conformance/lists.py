@@ -1,4 +1,4 @@
-"""Neighbor lists under test: how they are called, their declared limits, and their creation from objects."""
+"""Conversion of functions and classes to neighbor lists under test, with declared limits."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class KeptList(Protocol):
 
     `allocate` builds a new neighbor list and may be called again on the same object; `update` receives the
     current positions. The returned pairs must include every pair within r_cut at the current positions, and
-    may include pairs that are farther apart by less than the skin. If a neighbor list has its own padding
-    instead of the given skin, its attribute `skin` must contain this padding (length), which is read after
-    each `allocate`.
+    may include pairs that are farther apart by less than the skin. If a neighbor list uses its own padding
+    instead of the given skin, its attribute `skin` must contain this padding (length). The attribute is read
+    after each `allocate`.
     """
 
     def allocate(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float, skin: float) -> Any:

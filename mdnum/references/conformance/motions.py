@@ -1,12 +1,12 @@
 """Test updatable neighbor lists with sequences of the smallest motions that require a rebuild of the list.
 
-If a pair is just beyond r_cut + padding when the list is built, it is inside the cutoff after its two atoms
-have approached by the padding; the smallest such motion is along the line between the two atoms. A rebuild
-criterion is sufficient if it tests whether any two atoms could have approached each other by the padding, in
-any direction and for any motion of other atoms. Each sequence of `motions` brings a pair closer by slightly
-more than the padding. Sequences differ in direction (axis, diagonal, random), in how the motion is divided
-between the two atoms, in the other atoms (none, at rest, with small motions, with the same motion or a common
-drift), and in time (one step, slowly, back and forth).
+Two atoms just beyond r_cut + padding when the list is built are inside the cutoff after they have approached
+by the padding. The smallest such motion is along the line between the atoms. A rebuild criterion is
+sufficient if it detects every approach of two atoms by the padding, in any direction and for any motion of
+other atoms. Each sequence of `motions` brings a pair closer by slightly more than the padding. Sequences
+differ in direction (axis, diagonal, random), in the distance that each of the two atoms moves, and in time
+(one step, slowly, back and forth). Other atoms are absent, at rest, or move slightly, in parallel or with a
+common drift.
 """
 
 from __future__ import annotations
@@ -205,7 +205,7 @@ def _reuse() -> Iterator[Case]:
 
 
 def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = None) -> Case:
-    """Return a test case in which a new list is built at every step, or only at steps with a given skin."""
+    """Return a test case that builds a new list at every step or, with `skins`, at each step with a skin."""
     case = sequence(name, "reuse", path, _L, _R, max(filter(None, skins)) if skins else _SKIN)
     starts = zip(case.stills, skins or [None] * len(path), strict=True)
     stills = (replace(still, fresh=skin is not None or not skins, skin=skin) for still, skin in starts)
@@ -213,7 +213,7 @@ def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = Non
 
 
 def motions(padding: float | None = None) -> Iterator[Case]:
-    """Yield sequences of small motions, short sequences first; `Case.motions` counts these motions.
+    """Yield sequences of small motions that require a rebuild of the list, short sequences first.
 
     Args:
         padding: measured or declared padding of the list, in units of the given skin; if None, the given skin
@@ -275,7 +275,7 @@ def _ways() -> list[ndarray]:
 
 
 def _closing(room: float) -> float:
-    """Return the decrease of a pair distance from just beyond r_cut + padding to just inside the cutoff."""
+    """Return the distance by which two atoms approach, from beyond r_cut + padding to inside the cutoff."""
     return (1 + 2 * HAIR) * room
 
 
@@ -288,7 +288,7 @@ def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
 def _walk(
     room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float] = (0.0, 1.0)
 ) -> list[ndarray]:
-    """Return a path of two atoms that approach; the first makes a given fraction of the smallest motion."""
+    """Return a path of two atoms that approach each other; the first moves by `share` of the approach."""
     start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
@@ -323,7 +323,7 @@ def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: f
 
 
 def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:
-    """Return a path of two approaching atoms among ten others; all drift across or along the approach."""
+    """Return a path of two approaching atoms among ten others; all twelve atoms also drift together."""
     start, end = _with(gas(12, edge, 180 + n), [4, 5], _walk(room, way, 0.5, edge, n))
     across = np.cross(way, np.roll(way, 1) + np.array([0.3, -0.2, 0.1]))
     across /= np.linalg.norm(across)

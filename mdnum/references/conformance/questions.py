@@ -120,7 +120,7 @@ def _outside() -> Named:
 
 
 def _across_walls() -> ndarray:
-    """Return pairs along x: one atom is just below a multiple of the cutoff, its partner almost r_cut lower.
+    """Return pairs along x with a distance just below r_cut; one atom is just below a multiple of r_cut.
 
     If rounding to float32 assigns an atom to the next cell, its partner is two cells away.
     """
@@ -177,8 +177,8 @@ def vast() -> Iterator[Case]:
 def lattice(edge: int, seed: int = 0) -> Case:
     """Return atoms on a cubic integer lattice with vacancies, in random order and random periodic images.
 
-    The neighbors of each atom are on the 26 sites around it. Index arithmetic modulo the edge finds them
-    without search or rounding.
+    The neighbors of each atom are on the 26 sites around it. Neighbors are found from site indices modulo the
+    edge, without a search and without rounding.
 
     Args:
         edge: number of sites along an edge.
@@ -309,7 +309,7 @@ def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
 def _positions(
     place: str, count: int, cell: ndarray, pbc: ndarray, r_cut: float, rng: np.random.Generator
 ) -> tuple[ndarray, float]:
-    """Return positions and a cutoff; for atoms "at the cutoff", the cutoff equals the distance of a pair."""
+    """Return positions and a cutoff, which equals a pair distance if `place` is "at the cutoff"."""
     full = completed(cell, pbc)
     # free axes have vectors of length 1, which would be no room
     room = np.where(pbc, 1.0, np.maximum(1.0, 3.0 * r_cut / np.linalg.norm(full, axis=1)))
@@ -426,7 +426,7 @@ def drawn(count: int, seed: int) -> list[Case]:
 
 
 def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
-    """Yield variants of a test case as (description, whether the pairs must not change, variant)."""
+    """Yield (description, whether the pairs must stay the same, variant) for variants of a test case."""
     yield "when it is asked anew", True, case
     if case.atoms > 1:
         yield "with its atoms in reverse order", True, case.only(np.arange(case.atoms)[::-1])

@@ -100,7 +100,7 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
 
 
 def _calls(case: Case) -> Iterator[tuple[Still, bool, float]]:
-    """Yield, for each call of a test case, positions and cell, whether a list is built, and its skin."""
+    """Yield positions and cell of each call, whether a new list is built, and the skin of the list."""
     atoms = None
     for still in case.stills:
         count = len(still.positions)
@@ -145,7 +145,7 @@ def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | Non
 
 
 def _array(values: np.ndarray) -> str:
-    """Return a Python expression that evaluates to an array with the same bits."""
+    """Return a Python expression that recreates an array bit for bit."""
     if len(values) > _PRINTED:
         sink = io.BytesIO()
         np.save(sink, np.ascontiguousarray(values))

@@ -232,7 +232,7 @@ def _called_module(place: TracebackType) -> str:
 
 
 def _value(name: ast.expr, place: TracebackType) -> Any:
-    """Return the value of a variable, or of its attribute, in the stack frame of an exception, or None."""
+    """Return the value of a variable or attribute in an exception's stack frame; None if it is unknown."""
     if isinstance(name, ast.Attribute):
         return getattr(_value(name.value, place), name.attr, None)
     if not isinstance(name, ast.Name):
@@ -342,7 +342,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Kill a process that exceeds its time limit, and append a description of the delay to `late`."""
+    """Kill a process that exceeds its time limit, and append a phrase about the time used to `late`."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):
@@ -380,7 +380,7 @@ def _received(stream: BinaryIO | Any) -> Any:
 
 
 def serve(word: str, parent: int) -> None:
-    """Run test cases read from stdin on a neighbor list; the main function of a `RemoteSession` process."""
+    """Run test cases from stdin on a neighbor list; this is the main function of a separate process."""
     from mdnum.references.conformance.peers import load
 
     # a list may print: what it writes to stdout must not be taken for an answer

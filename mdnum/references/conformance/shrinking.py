@@ -32,7 +32,7 @@ Failures = Callable[[Case], Sequence[Failure]]
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
     """Return the smallest test case, among those tried before the deadline, that fails with the same code.
 
-    `failures` runs a test case on the neighbor list; a new object is created for an updatable list.
+    `failures` runs a test case and returns its failures; an updatable list is created anew for each run.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)
@@ -73,7 +73,7 @@ def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None)
 
 
 def _only(case: Case, atoms: list[int]) -> Case:
-    """Return the test case with only some atoms; the precomputed pairs of a small test case are discarded."""
+    """Return the test case with only the given atoms; up to 400 atoms, precomputed pairs are dropped."""
     smaller = case.only(np.array(atoms, int))
     return replace(smaller, known=None) if len(atoms) <= 400 else smaller
 
@@ -130,8 +130,8 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 def deepest(failures: Failures, failed: Failed) -> Failed:
     """Move the two atoms of a missing pair closer together as long as the list still omits the pair.
 
-    Both atoms continue along their path, so that the reported failure shows the smallest distance at which
-    the list omits the pair.
+    Both atoms continue along their path. The reported failure then shows the smallest distance at which the
+    list omits the pair.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:

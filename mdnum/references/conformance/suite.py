@@ -137,7 +137,7 @@ class Examiner:
             report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
 
     def unusable(self) -> str | None:
-        """Return the error if every simple test case raised an exception or gave malformed pairs, or None."""
+        """Return the first error if every simple test case raised an exception or gave malformed pairs."""
         reasons = [
             f"asked about {case.name}, {'it raised ' * (why.code == 'RAISED')}{why.text}"
             for case, outcome in self.opening
@@ -146,7 +146,7 @@ class Examiner:
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """Return the errors at the first wrong call of a test case, or () if it exceeds a declared limit."""
+        """Return the errors at the first wrong call of a test case; none if the case exceeds a limit."""
         return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
@@ -184,7 +184,7 @@ class Examiner:
     def _judge(
         self, case: Case, step: int, answer: ListAnswer, how: Conventions
     ) -> tuple[list[Failure], tuple[float, float] | None, tuple[int, int]]:
-        """Return failures, the error of results correct only in float32, and counts of pairs at r_cut."""
+        """Return failures, the rounding error if only float32 is reached, and numbers of pairs at r_cut."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
@@ -224,7 +224,7 @@ def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
 
 
 def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
-    """Return the exact pairs at a call and at all earlier calls since the neighbor list was built."""
+    """Return the exact pairs of a call, together with those of earlier calls since the list was built."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
@@ -357,7 +357,7 @@ def examine(
 
 
 def _keeps_order(examiner: Examiner) -> bool | None:
-    """Return whether three identical calls give the same pairs in the same order; None if one gives none."""
+    """Return whether three identical calls return the same pairs in the same order; None if a call fails."""
     for case in (once("order", "reuse", gas(40, 6.0, 120), 6.0), once("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
@@ -368,7 +368,7 @@ def _keeps_order(examiner: Examiner) -> bool | None:
 
 
 def _too_long(report: Report, case: Case) -> str | None:
-    """Return why a large test case would take too long, estimated from the previous one; otherwise None."""
+    """Return the reason for skipping a large test case that would take too long, or None."""
     if report.large is None:
         return None
     atoms, seconds = report.large
@@ -378,7 +378,7 @@ def _too_long(report: Report, case: Case) -> str | None:
 
 
 def _refusals(examiner: Examiner) -> list[RefusalKind]:
-    """Return each kind of rejected test case, with variants of it for which the neighbor list returns pairs.
+    """Return the kinds of rejected test cases, with variants that the neighbor list does not reject.
 
     Each variant of a test case is run in a new process, or with a new object.
     """
@@ -398,8 +398,8 @@ def _refusals(examiner: Examiner) -> list[RefusalKind]:
 def distinct(failed: Iterable[Failed]) -> list[Failed]:
     """Return the smallest failure of each kind, since one error can cause failures in many test cases.
 
-    Failures with the same code and equal numbers of atoms, calls and periodic axes are counted as one error;
-    exceptions and malformed results are the same error if their messages differ only in numbers.
+    Failures with the same code and equal numbers of atoms, calls and periodic axes are counted as one error.
+    Exceptions and malformed results count as one error if their messages differ only in numbers.
     """
 
     def size(failure: Failed) -> tuple[bool, bool, int, int, int]:
