@@ -155,7 +155,7 @@ def completed(cell: Vectors, pbc: Axes) -> Vectors:
 
 
 def _within(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):
-    """Yield (i, j, shift, distance) of the pairs within `reach`, in several blocks of pairs."""
+    """Yield (i, j, shift, distance) of the pairs within `reach`, one block of pairs at a time."""
     n, stored, width = len(positions), np.where(pbc[:, None], cell, 0.0), widths(cell)
     fractional = np.linalg.solve(cell.T, positions.T).T
     # |normal component| <= reach, so when reach is under half a width the image in reach can only be

@@ -202,7 +202,7 @@ def scan(flips: Flips, steps: int | None = None, nearest: int = 0) -> Scan:
 
 
 def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
-    """Return the ratio of |margin| to its rounding bound for each flip; ambiguous flips have ratios up to 1.
+    """Return |margin| divided by its rounding bound for each flip; ambiguous flips have ratios up to 1.
 
     If the bound is zero (an exact comparison), the ratio of any nonzero margin is infinite.
     """

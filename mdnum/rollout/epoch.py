@@ -49,7 +49,7 @@ class Pins:
     def rows(
         self, table: PairTable, first: int, count: int, channels: int = 1
     ) -> tuple[UInt8[np.ndarray, "rows words atoms"], UInt8[np.ndarray, "rows words atoms"]]:
-        """Return imposed decisions as packed bits, and a mask, for consecutive steps with one neighbor list.
+        """Return the decisions imposed at consecutive steps as packed bits, with a mask of imposed entries.
 
         No decision can be imposed on a pair that is not in the neighbor list, because it is too distant.
 

@@ -198,7 +198,7 @@ class PairRecorder:
         self._by_type = np.stack([thresholds, *simulation.jumps()])
 
     def inside(self, bits: UInt8[np.ndarray, "words atoms"]) -> int:
-        """Return the number of pairs inside the cutoff; a full neighbor list contains each pair twice."""
+        """Return the number of pairs inside the cutoff; pairs that a list contains twice are counted once."""
         return self._once(int(count_set(bits)))
 
     def _once(self, both: int) -> int:

@@ -278,7 +278,7 @@ def update(
     finished: bool | None = None,
     layout: Layout | None = None,
 ) -> None:
-    """Add files to a manifest, remove other files, and change the state; do nothing without a manifest."""
+    """Add files to a manifest, remove others, and change its state; do nothing if there is no manifest."""
     made = load(root)
     if made is None:
         return

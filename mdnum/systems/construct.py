@@ -360,7 +360,7 @@ def weights(weight: Any, atoms: Atoms, term: str) -> tuple[Any, ...]:
 
 
 def closest(model: Any, units: str) -> float:
-    """Return the distance (a length) below which two atoms of a structure are considered an error."""
+    """Return the smallest allowed distance (a length) between two atoms of a structure."""
     if not isinstance(model, CutPotential | Channels):
         return smallest_distance(model.name, units)
     each = [term.potential for term in model.terms.values()]

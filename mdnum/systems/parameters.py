@@ -8,8 +8,7 @@ indices).
 
 `dynamics.temperature` is the temperature of the thermostat. Drawn velocities scale with the square root of
 temperature; velocities of the structure do not change. `velocity.scale` scales all velocities, drawn or not.
-If a cutoff has no switching function, `cutoff.radius` also sets its onset. `box.scale` scales box and
-positions.
+Without switching, the onset of a cutoff follows `cutoff.radius`. `box.scale` scales box and positions.
 """
 
 from __future__ import annotations

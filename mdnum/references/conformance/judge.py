@@ -33,7 +33,7 @@ SILENT = ("CRASHED", "NO_ANSWER", "RAISED")  # those of cases in which nothing c
 
 @dataclass(frozen=True)
 class Truth(PairSet):
-    """Exact pairs at one call of a test case: those inside the cutoff, and those somewhat farther apart."""
+    """Exact pairs at one call of a test case, including pairs slightly beyond the cutoff."""
 
     # positions, cell: as the list was given them; rows of axes that do not repeat are zero
     positions: ndarray

@@ -73,7 +73,7 @@ class ListLimits:
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
-        """Yield (whether a test case exceeds a limit, name of the limit); the fastest checks come first."""
+        """Yield (whether a test case exceeds a limit, name of the limit), cheap checks first."""
         pbc, cells = np.array(case.pbc), [still.cell for still in case.stills]
         least = min(len(still.positions) for still in case.stills)
         yield least < self.atoms, f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"
@@ -159,7 +159,7 @@ LISTS: Registry[PairList] = Registry("neighbor list", "mdnum.neighbor_lists")
 
 
 def source_of(made: Any) -> str:
-    """Return the source code of a function or class without decorators; "" if there is no source code."""
+    """Return the source code of a function or class, without its decorators; "" if it is not available."""
     try:
         lines = inspect.getsource(made).splitlines(keepends=True)
     except (OSError, TypeError):
@@ -169,7 +169,7 @@ def source_of(made: Any) -> str:
 
 
 def from_object(made: Any, name: str | None = None, source: str | None = None) -> PairList:
-    """Return a `PairList` made from a function, from a class of updatable lists, or from an updatable list.
+    """Return a `PairList` made from a function, a class of updatable lists, or an updatable list.
 
     The properties of the neighbor list are read from the attributes `full` (bool), `unit` (roundoff),
     `superset` (bool) and `limits` (`ListLimits`) of the object, if present.

@@ -148,7 +148,7 @@ def deepest(failures: Failures, failed: Failed) -> Failed:
 
 
 def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline) -> Failed:
-    """Reduce a failure to few atoms and calls, and run the script that reproduces it if possible."""
+    """Reduce a failure to few atoms and calls, and run the script that reproduces the failure."""
 
     def failures(case: Case) -> Sequence[Failure]:
         with suppress(TimeUp):
