@@ -73,7 +73,7 @@ class Program(Protocol):
     def repeats(
         self, others: Sequence[Any], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Return the distances between this run and perturbed runs, without and with imposed decisions.
+        """Return distances of perturbed runs from this run, without and with this run's decisions imposed.
 
         Args:
             others: the same program with perturbed starts.
@@ -84,7 +84,7 @@ class Program(Protocol):
         ...
 
     def nudged(self, size: float, count: int, seed: int) -> list[Any]:
-        """Return programs with random displacements of the initial state, of about `size` or less."""
+        """Return programs whose initial states have random displacements of about `size` or less."""
         ...
 
     def decision(self, other: Any, flips: Sequence[Any], separation: float) -> Decision:

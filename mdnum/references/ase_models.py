@@ -15,8 +15,8 @@ Differences between mdnum and ASE, and conversions of ASE's results that remove 
 | an energy function | no ASE class | the function on ASE's neighbor list, named in the label |
 | all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), named in the label |
 
-ASE's LennardJones keeps a pair at r == rc (it drops r² > rc²), but ASE's neighbor lists omit it (r < rc). For
-shifted and switched cutoffs, the energy of a pair at r == rc is zero; only the force can differ.
+ASE's LennardJones keeps a pair at r == rc, but ASE's neighbor lists omit this pair. For shifted and switched
+cutoffs, the energy of a pair at r == rc is zero; only the force can differ.
 """
 
 from __future__ import annotations

@@ -167,7 +167,7 @@ def _labels(plan: Plan, axis: Axis) -> dict[str, Setting]:
 
 
 def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[str, ...], Raw]:
-    """Return the change of each measure for each value of each choice, relative to the system's own value."""
+    """Return the change of each measure if one choice has a value other than the system's own."""
     found = {}
     for axis in plan.axes:
         each = _along(means, results, _labels(plan, axis), plan.origin, plan.names)
@@ -254,7 +254,7 @@ def _advice(
 
 
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the settings of all recommended and of all converged values (none if the settings are equal).
+    """Return the setting of all recommended values and that of all converged values; none if they are equal.
 
     Each choice was varied alone; runs with the two returned settings show the combined effect of all choices.
     """

@@ -1,7 +1,7 @@
 """Test cases for neighbor lists: past failures by name, dense clusters, lattices, and random test cases.
 
-For the tests of a library: `@given(cases())` draws test cases with all kinds of boxes and positions, and with
-cutoffs at and between neighbor shells; `boxes()` draws only (cell, pbc, description).
+For the tests of a library: `@given(cases())` draws test cases with all kinds of boxes and positions. Their
+cutoffs are at and between neighbor shells. `boxes()` draws only (cell, pbc, description).
 """
 
 from __future__ import annotations

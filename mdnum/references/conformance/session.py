@@ -342,7 +342,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Kill a process that exceeds its time limit, and append a phrase about the time used to `late`."""
+    """Kill a process that exceeds its time limit; append a phrase about the used time to `late`."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):
