@@ -14,8 +14,8 @@ if __name__ == "__main__" and not sys.flags.safe_path and sys.path[:1] == [os.ge
 def main() -> None:
     """Run the command line and exit.
 
-    Control-C ends the process immediately before results exist and after they are saved, because an
-    interrupted import of a package fails in unpredictable ways.
+    While packages are imported, and after the results are saved, control-C ends the process immediately. An
+    interrupted import would otherwise fail in unpredictable ways.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:

@@ -17,7 +17,7 @@ from mdnum.vectors import lowest_bit
 
 @njit
 def _scan(before, rows, columns, row, slot, column, values):
-    """Record bits that differ in successive rows, up to the buffer size; return the number of changes."""
+    """Record bits that change from row to row, as many as fit in the arrays; return the number of changes."""
     at, room = 0, row.shape[0]
     for r in range(rows.shape[0]):
         # the eight slots that the scan is in, and the places of their bytes
@@ -43,7 +43,7 @@ def changes_in_time(
 ) -> tuple[
     Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]
 ]:
-    """Find all decisions of a neighbor list that change in time, given packed bits with one row per step.
+    """Find all decisions (packed bits) of a neighbor list that change from one step to the next.
 
     Args:
         before: decisions before the first row.

@@ -24,7 +24,7 @@ _missed: list[Any] = []  # what could not be kept
 
 
 def njit(function: Any = None, /, **options: Any) -> Any:
-    """`numba.njit` without the global lock; compiled functions are cached on disk if a cache is writable."""
+    """`numba.njit` that releases Python's global lock and, if possible, caches compiled functions on disk."""
     if function is None:
         return lambda function: njit(function, **options)
     return _kept(lambda keep: numba.njit(cache=keep, nogil=True, **options)(function))

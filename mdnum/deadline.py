@@ -50,7 +50,7 @@ class Deadline:
         return max(0.0, self._end - time.monotonic())
 
     def part(self, share: float) -> Deadline:
-        """Return an earlier deadline, before which only a fraction of the remaining time passes."""
+        """Return an earlier deadline, which allows only a fraction of the remaining time."""
         sooner = Deadline()
         sooner._end = time.monotonic() + share * self.left
         return sooner

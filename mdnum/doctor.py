@@ -275,7 +275,7 @@ def subnormals() -> DoctorRow:
 
     XLA flushes subnormal numbers to zero on CPUs, and a loaded library can make the processor flush all
     subnormal numbers. The test also uses arrays large enough for XLA to split the work among its own threads.
-    Results are compared as integers, because a processor that treats subnormals as zero considers them zero.
+    Results are compared as integers, since a comparison of floats can treat subnormal numbers as zero.
     """
 
     def power(exponent: int, count: int) -> np.ndarray:

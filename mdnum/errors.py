@@ -31,8 +31,8 @@ def json_escape(character: str) -> str:
 def printable(text: str, escape: Callable[[str], str] = python_escape) -> str:
     """Escape all characters of untrusted text that a terminal would interpret.
 
-    Escape sequences, other control characters (except line ends and tabs) and characters that reorder or hide
-    text are written in Python notation, such as ``\\x1b``.
+    Control characters, except line ends and tabs, are written in Python notation, such as ``\\x1b``. So are
+    characters that reorder or hide text.
     """
     return _CONTROL.sub(lambda found: escape(found[0]), text)
 

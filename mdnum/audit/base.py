@@ -58,7 +58,7 @@ class Meter:
     """Counts the calls to a calculator, and enforces limits on the number of calls and on the elapsed time.
 
     The number of calculator calls of each check is limited, so that results do not depend on the load of the
-    machine. Only a deadline ends a check earlier.
+    machine. A deadline can end a check before the limit on its calls is reached.
     """
 
     calls: int = 0
@@ -79,7 +79,7 @@ class Meter:
 
     @property
     def up(self) -> type[TimeUp] | None:
-        """Exception class for a limit on calls or time that has been reached; None if no limit is reached."""
+        """`TimeUp` if the deadline has passed, `CallsUp` if no more calls are allowed, None otherwise."""
         return TimeUp if self.deadline.passed else CallsUp if self.calls >= self.most else None
 
     @contextmanager
@@ -226,7 +226,7 @@ class AuditCheck:
 
 
 def _above_limits(result: CheckResult) -> Iterator[Observed]:
-    """Yield a finding for each number of a result that exceeds its limit, unless the check reported it."""
+    """Yield a finding for each number above its limit that the check itself has not reported."""
     codes = {one.code for one in result.findings}
     for name, (limit, reports) in result.limits.items():
         value = result.numbers.get(name)

@@ -243,7 +243,7 @@ def water(edge: int = 4) -> Atoms:
 
 
 def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Return the smaller of two measured processor times (s) of an energy and force calculation.
+    """Measure the processor time of one energy and force calculation twice; return the smaller value (s).
 
     The processor time includes that of the calculator's child processes. The time of other programs is not
     included, so that the chosen structure does not depend on the load of the machine.

@@ -200,7 +200,7 @@ def find_jumps(
 
 
 def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
-    """Measure the jumps between `low` and `high`, and estimate the apparent jumps of a smooth curve.
+    """Measure the jumps between `low` and `high`, and the jumps that a smooth curve would show there.
 
     Energy and force on either side are medians over the four nearest coordinates, so that a single rounding
     error has no effect. The curvature is computed from one-sided differences of the force.
@@ -231,7 +231,7 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
-    """Return the exponent with which the force vanishes at the end of its range; None if it is unclear.
+    """Return the power p of the force |F| ~ (edge - x)^p near `edge`; None if the power is unclear.
 
     Args:
         edge: end of the interaction, approached from smaller distances; no other threshold is within `room`.
@@ -270,7 +270,7 @@ def smallest_steps(
 def _outliers(
     curve: Curve, places: Float[np.ndarray, "points"]
 ) -> tuple[list[tuple[float, float, float]], Float[np.ndarray, "intervals"]]:
-    """Return intervals in which predictions from both sides disagree, and smallest detectable force steps.
+    """Find the intervals in which the predictions from left and right disagree.
 
     Returns:
         (relative difference, left, right) of each outlier, the largest first; and the smallest detectable
@@ -303,11 +303,11 @@ def _outliers(
 
 
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
-    """Return three mismatches for each interval: of the energy, of the force, and of energy change and work.
+    """Return three mismatches for each interval, which are small where the curve is smooth.
 
-    The mismatch of energy or force is the absolute difference at the midpoint between the predictions from
-    left and right. The mismatch of energy change and work falls with the fifth power of the spacing if the
-    curve is smooth, and is the most sensitive of the three to jumps of the energy alone.
+    The first two are differences at the midpoint between predictions from left and right: of the energy and
+    of the force. The third is the energy change plus the work of the force. On a smooth curve, the third
+    falls with the fifth power of the spacing. It is the most sensitive to jumps of the energy alone.
     """
     values = curve.many(places)
     windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
@@ -374,7 +374,7 @@ def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, fl
 
 
 def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float], float]:
-    """Return a function that is constant except for jumps: force minus a line, or energy plus the work."""
+    """Remove the smooth change from the energy or force; the returned function changes only at jumps."""
     if row == 1:
         back = left - (right - left)
         slope_before = (curve(left)[1] - curve(back)[1]) / (left - back)
@@ -405,7 +405,7 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """Locate a jump of the energy's third derivative, using the force's second derivative on both sides.
 
-    The fit uses the one of several widths at which halving the width changes the result least.
+    Several widths of the fit are tried. The one whose result changes least when it is halved is used.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

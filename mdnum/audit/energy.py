@@ -140,7 +140,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy and force on the line between two time steps; if `ends`, the ends have the values of the run."""
+    """Energy and force on the line between two time steps; if `ends`, reuse the run's values at both ends."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:
@@ -218,7 +218,7 @@ class HiddenJumps:
 
     @property
     def share(self) -> float:
-        """Fraction of the unexplained energy change, in the searched time steps, that is due to jumps."""
+        """Fraction of the unexplained energy change that jumps explain, in the time steps searched."""
         whole = sum(abs(rest) for rest in self.steps.values())
         left = sum(abs(rest - self.brought(step)) for step, rest in self.steps.items())
         return max(1.0 - left / whole, 0.0) if whole else 0.0
@@ -228,7 +228,7 @@ class HiddenJumps:
         return sum(jump.energy for jump in self.jumps if jump.step == step)
 
     def energies(self, rest: Steps) -> Steps:
-        """Energy change (eV) per step due to hidden jumps; estimated with `share` at steps not searched."""
+        """Energy change (eV) of each step due to hidden jumps; for steps not searched, `share` is used."""
         found = np.zeros(len(rest))
         for step in self.candidates:
             found[step] = self.brought(step) if step in self.steps else self.share * rest[step]
@@ -236,7 +236,7 @@ class HiddenJumps:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Most frequent k for which neighbors k and k+1 of an atom swap at a jump, and how often they do."""
+        """Rank k of the neighbors k and k+1 that swap most often at jumps, and the number of such jumps."""
         return _most_frequent(k for jump in self.jumps for k in {k for _, k in jump.ties})
 
     @property
@@ -320,7 +320,7 @@ class EnergyBalance:
 
     @property
     def filled(self) -> Steps:
-        """Energy change (eV) of each step that jumps do not explain; unmeasured steps have the mean value."""
+        """Unexplained energy change of each step minus its jumps, eV; the mean value at unmeasured steps."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 
@@ -333,7 +333,7 @@ class EnergyBalance:
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
 
     def by_means(self, crossed: Sequence[RunCrossing], steps: int) -> Steps:
-        """Estimate the energy change (eV) per step due to another run's flips from mean jumps of this run."""
+        """Estimate the energy changes (eV) by the flips of another run from this run's mean jumps."""
         jumps, means = np.zeros(steps), self.means
         for one in crossed:
             jumps[one.step] += one.sign * means.get(one.threshold, 0.0)

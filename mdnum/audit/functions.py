@@ -172,7 +172,7 @@ def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float
 
 
 def _share(four: np.ndarray, width: float) -> np.ndarray:
-    """Relative difference between the energy change and the force's work, from cubics through four points."""
+    """Relative difference between the energy change and the work of a force interpolated by cubics."""
     u, f = np.moveaxis(four, -1, 1)
     with np.errstate(invalid="ignore"):
         change, work = u[2] - u[1], (13 * (f[1] + f[2]) - f[0] - f[3]) * width / 24

@@ -128,7 +128,7 @@ class Staircase:
 
 
 def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
-    """Detect discrete steps in energies and forces: values that stay constant to the last bit, then change.
+    """Detect energies and forces that stay exactly constant as an atom moves, and then change in steps.
 
     If an atom moves by 1e-4 Å, every smooth energy or force changes, even in single precision. Points with
     the same energy and forces as the previous point are ignored, because they may be cached.
@@ -195,11 +195,11 @@ def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "c
 def order_change(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, rng: np.random.Generator
 ) -> tuple[float, NoiseFloor]:
-    """Return the largest energy change (eV) when atoms are reordered, and the noise if rounding explains it.
+    """Reorder the atoms; return the largest energy change (eV), and the noise if rounding explains it.
 
-    The noise level is 0 if rounding does not explain the energy change, or if no change exceeds the noise
-    measured along a line. While atoms move along a line, the rounding error of a sum varies randomly, but an
-    error due to missing terms varies smoothly.
+    The noise is 0 if rounding does not explain the energy change. It is also 0 if no energy or force changes
+    by more than the noise measured along a line. While atoms move along a line, the rounding error of a sum
+    varies randomly, but an error due to missing terms varies smoothly.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
@@ -290,8 +290,8 @@ def settled(
     """Displace atoms slightly, so that no pair is at a threshold; return the structure and its noise.
 
     In a perfect crystal, a whole neighbor shell can lie exactly at a cutoff, which would disturb the checks
-    that do not test thresholds. An energy step along the sampled line appears as noise, so of several random
-    displacements the one with the least noise is used.
+    that do not test thresholds. A step of the energy along the sampled line would be counted as noise. Of
+    several random displacements, the one with the least noise is therefore used.
 
     Args:
         at_least: minimum number of atoms; a smaller periodic cell is repeated.
@@ -375,7 +375,7 @@ class Digits:
 
 
 def digits(values: np.ndarray) -> Digits:
-    """Return the decimal places and bits that values use; full precision for too few distinct values."""
+    """Return how many decimal places and bits values have; few distinct values count as unrounded."""
     found = np.unique(np.asarray(values, dtype=np.float64))
     found = found[np.isfinite(found) & (found != 0.0)]
     if len(found) < _FEWEST:
@@ -391,8 +391,8 @@ def digits(values: np.ndarray) -> Digits:
 def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
     """Yield a finding, QUANTIZED or LOW_PRECISION, if energies or forces carry fewer digits than a double.
 
-    Discrete steps are measured along a line of structures, because digits may not show them: forces rounded
-    before a unit conversion, or computed from rounded positions, use all digits of a double.
+    Discrete steps are measured along a line of structures, because they can be invisible in the digits. For
+    example, forces that are rounded before a unit conversion use all digits of a double.
     """
     stairs = steps(subject, atoms)
     size, typical = largest(stairs.energies), rms(stairs.forces)

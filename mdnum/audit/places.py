@@ -19,7 +19,7 @@ _PLACES, _CANDIDATES = 48, 4  # places that are tried, and of them for an ordina
 
 @dataclass(frozen=True)
 class WrongPlaces:
-    """Indices in the list of atoms at which energy or forces are wrong, whichever atom has the index."""
+    """Atom indices at which energy or forces are wrong, regardless of which atom has the index."""
 
     places: tuple[int, ...]
     count: int  # of atoms
@@ -44,8 +44,8 @@ def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) 
     """Find atom indices at which results are wrong, by exchanging atoms of one species between two indices.
 
     Exchanging two equal atoms between correct indices changes neither energy nor forces. An error tied to an
-    index appears at this index for any order of the atoms. An error that depends on the whole order of atoms,
-    such as neglected neighbors, appears at nearly all indices, or at other indices for another order.
+    index appears at this index for any order of the atoms. An error that depends on the order of all atoms,
+    such as a neglected neighbor, appears at nearly all indices, or moves if atoms are reordered.
 
     Returns:
         None if energy and forces are correct at all indices, or if they are wrong at nearly all indices.

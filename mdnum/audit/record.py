@@ -139,7 +139,7 @@ class AuditState:
 
     @property
     def shown(self) -> list[CheckResult]:
-        """All results so far: those of finished checks, of checks in brief form and of interrupted checks."""
+        """All results so far, including those of shortened and interrupted checks."""
         return [*self.results, *(self.cut[name] for name in self.left if name in self.cut)]
 
     @property

@@ -62,7 +62,7 @@ class Repeats:
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
-        """Compare the first energy or force of new calculator object number `which` with an earlier one's."""
+        """Compare the first energy or force of calculator object `which` with that of an earlier object."""
         before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
@@ -127,11 +127,11 @@ class LoadedCalculator:
 class CalculatorSubject:
     """An ASE calculator and the structure for which it is audited.
 
-    ASE returns its cached energy if no coordinate moved by more than 1e-15 Å. A coordinate near zero changes
-    by such a move, so this class clears the cache if any bit differs. If no bit differs, cached energies and
-    forces are used; the method `forget` forces another calculation. The calculator is attached to the atoms,
-    as in a run, since some calculators require this. An evaluation may raise a `CalculatorError`: the
-    calculator raised an exception or returned nan. The structure is then saved.
+    ASE returns its cached energy if no coordinate moved by more than 1e-15 Å. A smaller move can change a
+    coordinate near zero, so this class clears the cache if any bit differs. If no bit differs, cached
+    energies and forces are used; the method `forget` forces another calculation. The calculator is attached
+    to the atoms, as in a run, since some calculators require this. An evaluation may raise a
+    `CalculatorError`: the calculator raised an exception or returned nan. The structure is then saved.
 
     Args:
         name: the calculator as the user named it.
@@ -189,7 +189,7 @@ class CalculatorSubject:
         return other
 
     def used(self) -> CalculatorSubject:
-        """Return a copy of the subject without its safeguards, to test how a calculator detects changes."""
+        """Return a copy that does not clear the cache, to test whether a calculator detects changes."""
         other = self.fresh()
         other.forgets = other.renews = False
         return other
@@ -245,7 +245,7 @@ class CalculatorSubject:
         return self.energy(atoms), self.forces(atoms)
 
     def try_both(self, atoms: Atoms) -> Answered:
-        """Return energy and forces, or the error of the calculator; no structure is saved."""
+        """Return energy and forces, or the calculator's error; in either case, save no structure."""
         try:
             with self.trying():
                 return self.both(atoms)
@@ -268,8 +268,8 @@ class CalculatorSubject:
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
         """Evaluate a structure again with the same calculator object, and count any difference in `repeats`.
 
-        A difference counts as random only if the second result agrees with that of a new calculator object;
-        otherwise earlier evaluations by this object may be the reason.
+        A difference counts as random only if the second result agrees with that of a new calculator object.
+        If it does not agree, earlier evaluations by this object may be the reason.
 
         Args:
             energy: the earlier energy, eV; the energy or the forces are required.

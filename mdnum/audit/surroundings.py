@@ -1,10 +1,10 @@
 """Search for discontinuities of the energy among many atoms, using moving atoms and dense clusters.
 
-A pair of atoms may interact differently among many atoms (embedding, angles): an energy jump may have another
-size, and a threshold that is smooth for two atoms may jump. To find jumps among many atoms, atoms and triples
-are moved through the pair thresholds and beyond. To detect a limit on the number of neighbors, one more atom
-is moved past all neighbors of a crowded central atom. A calculator that keeps only k neighbors replaces the
-k-th neighbor by the moving atom when the two are equally far away; then the energy or a force jumps. If a
+In a many-body potential, the interaction of a pair depends on other atoms. The energy may then jump at a
+threshold where it is smooth for two isolated atoms. Atoms and triples of atoms are therefore moved through
+all pair thresholds, and also through other distances. To detect a limit on the number of neighbors, one more
+atom is moved past all neighbors of a crowded central atom. A calculator that keeps only k neighbors replaces
+the k-th neighbor by the moving atom when the two are equally far away; then the energy or a force jumps. If a
 calculator keeps the first k neighbors in the order of the list, reordering the atoms reveals the limit.
 """
 
@@ -324,7 +324,7 @@ def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
 
 
 class CrowdOrder(NamedTuple):
-    """How the order of the atoms in a dense cluster affects energy and forces."""
+    """Changes of energy and forces when the atoms of a dense cluster are reordered."""
 
     # number of neighbors at which it starts to matter, None if it never does
     start: int | None = None
@@ -422,8 +422,8 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     def change(place: float, without: int | None = None) -> tuple[float, Float[np.ndarray, "atoms"]]:
         """Return the jumps of energy and forces as an atom moves from `place - side` to `place + side`.
 
-        The first value is |energy change plus work of the force|. The second value is, for each atom, |change
-        of its force minus the mean change over the adjacent intervals of the same length|.
+        The energy jump is the energy change plus the work of the force. The force jump of an atom is the
+        change of its force minus the mean change over the two adjacent intervals. Both are absolute values.
         """
         first, before = subject.both(walker(place - side, without))
         second, after = subject.both(walker(place + side, without))
@@ -468,7 +468,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
 
 
 def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int) -> CrowdOrder:
-    """Find the number of neighbors above which reordering the atoms changes the results, and the change."""
+    """Find the smallest number of neighbors for which the order of atoms affects energy or forces."""
     low, high, changed = 1, None, (0.0, 0.0)
     larger = iter([*(count for count in (4, 16, 64) if count < most), most])
     while count := next(larger, None) if high is None else (low + high) // 2 * (high - low > 1):
@@ -491,7 +491,7 @@ def _permuted(
 ) -> tuple[float, float] | None:
     """Return the changes of energy and force when atoms are reordered; None if rounding explains the changes.
 
-    If `aside`, the last neighbor is moved out of the range of all other atoms.
+    If `aside`, the last neighbor is moved so far away that it interacts with no atom.
     """
     atoms, _ = cluster(walk.pair, radius, count)
     if aside:

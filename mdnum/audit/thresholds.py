@@ -247,10 +247,10 @@ def _seen(
     rounding: float,
     known: Sequence[float],
 ) -> tuple[float, float, float, float] | None:
-    """Return first and last distance, and the median and maximum of the smallest detectable force steps.
+    """Return the range of examined distances, and median and maximum of the smallest detectable force steps.
 
-    Distances beyond the end of the interaction are not counted, nor distances close to a known threshold,
-    which would hide another threshold.
+    Distances beyond the end of the interaction are omitted. Distances close to a known threshold are omitted
+    too, because a second threshold would be hidden there.
     """
     felt = places < end
     for radius in known:
@@ -284,10 +284,10 @@ def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairTh
 def _end_of(
     coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]
 ) -> tuple[float, float] | None:
-    """Return the last distance with a nonzero interaction, and the next double; None if all are zero.
+    """Return the largest distance at which the atoms interact, and the next double; None if there is none.
 
-    A smooth switching function may round to zero at some distances before its end, so the search continues
-    outward from any nonzero interaction found at a larger distance.
+    A smooth switching function may round to zero before its end. If the interaction is nonzero at a larger
+    distance, the search therefore continues from there.
     """
     last = next((k for k in range(len(coarse) - 2, -1, -1) if alive(float(coarse[k]))), None)
     if last is None:
@@ -342,9 +342,8 @@ def _with_end(
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
     """Extrapolate a power law of the force to find the distance at which an interaction ends.
 
-    If the last distance with a nonzero force is within the error of the extrapolation, this distance is
-    returned instead. The power law holds only close to the end, while the distance is exact unless the force
-    was lost in rounding.
+    If the last distance with a nonzero force agrees with the extrapolation within its error, this distance is
+    returned instead. It is more exact, unless rounding made the force zero.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])
     far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
@@ -447,7 +446,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 
 
 def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
-    """Energy change from the last point to infinity for a power-law force; inf if it decays too slowly."""
+    """Energy change from the last point to infinity if the force follows a power law; may be infinite."""
     first, last = abs(float(forces[0])), abs(float(forces[-1]))
     if not last or not first:
         return np.inf

@@ -37,10 +37,10 @@ def rounded(value: float, name: str) -> float:
 
 
 def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") -> dict[str, float]:
-    """For each role, return the smallest solver tolerance (m) that the role's floating-point format allows.
+    """For each role, return the smallest tolerance (m) that a solver can reach in the role's number format.
 
-    A penetration no longer decreases when `gain` times the penetration rounds to zero, and a tolerance below
-    the smallest number of a format rounds to zero. A usable tolerance is at least as large as every returned
+    Iterations no longer reduce a penetration once `gain` times the penetration rounds to zero. A tolerance
+    below the smallest number of a format rounds to zero. A usable tolerance is at least the largest returned
     value.
 
     Args:
@@ -58,7 +58,7 @@ def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") ->
 
 
 def _stuck(name: str, gain: float) -> float:
-    """Return the smallest penetration above which an iteration always changes the rounded penetration."""
+    """Return the penetration above which each iteration still changes the rounded penetration."""
     if name == "float16":
         # of n grains the iteration takes gain * n, which rounds to none up to one half
         return (math.floor(0.5 / gain) + 1) * smallest(name)

@@ -115,7 +115,7 @@ class BallProblem:
         return float(_loss(problem.bare, problem.world, *problem.start_arrays, imposed))
 
     def origin(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return the arguments for differentiating `loss_at`: parameter values, and zero for y0 and v0.
+        """Return the arguments at which `loss_at` is differentiated: parameter values, and 0 for y0 and v0.
 
         Raises:
             InputError: a parameter does not exist.

@@ -281,7 +281,7 @@ class BallProgram:
 
 
 def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float:
-    """Return the threshold minus the recorded residual at one iteration of a solver that all balls share."""
+    """Return the margin of a stop decision: the threshold minus the residual of the solver's iteration."""
     if run.history is None or not isinstance(run.world.contact, Projection):
         return margin
     rule = run.world.contact.stop
@@ -333,7 +333,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
 
 
 def _guarded(separation: np.ndarray, furthest: np.ndarray, guard: float | None) -> np.ndarray:
-    """Set the distances between two runs to NaN after a contact is first imposed too far from the floor."""
+    """Set distances between two runs to NaN after a contact was imposed on a ball far from the floor."""
     beyond = furthest > (np.inf if guard is None else guard)
     if beyond.any():
         separation[int(beyond.argmax()) + 1 :] = np.nan

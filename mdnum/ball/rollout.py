@@ -28,7 +28,7 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """Record of a finished run. Row s of an array of steps describes the step that ends in state s + 1.
+    """Record of a finished run. In an array with one row per step, row s describes the step to state s + 1.
 
     Attributes:
         world: the bouncing-ball model that was simulated.
@@ -242,7 +242,7 @@ def height_bound(
 def residual_bound(world: World, residual: Any, terms: int) -> Any:
     """Return a bound on the rounding error of a residual, in the unit of the residual.
 
-    All terms of a residual have one sign; the relative error of their sum is at most Higham's gamma_n.
+    All terms of a residual have the same sign, so the relative error of the sum is at most Higham's gamma_n.
 
     Args:
         residual: residual that a stop decision compares with its threshold.
@@ -427,7 +427,7 @@ def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
 
 
 def _counted(run: BallRun) -> str:
-    """Return the name of what a run counts as an iteration, such as "impacts"."""
+    """Return what the iteration count of a run refers to, such as "impacts"."""
     contact, scheme = run.world.contact, run.world.integrator
     if isinstance(scheme, EventLocated):
         return "impacts"

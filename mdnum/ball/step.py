@@ -279,7 +279,7 @@ class _Forceless(eqx.Module):
 
 
 class Penalty(eqx.Module):
-    """Force k p - damping v on a ball in contact; p is -y or, in a smooth contact, a softplus of -y.
+    """Contact by a spring and a damper: the force is k p - damping v, where p is the depth below the floor.
 
     If contact is imposed, the force is -k y for either sign of y. The contact force thus continues smoothly
     above the floor, like an imposed pair force beyond its cutoff.

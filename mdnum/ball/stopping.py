@@ -66,11 +66,11 @@ class StopRule(Protocol):
     def measure(
         self, terms: Float[Array, "balls"], accumulate: Any, decision: Any, zero: Int[Array, ""]
     ) -> Float[Array, "..."]:
-        """Sum terms in the dtype `accumulate`, and return the residual rounded to the dtype `decision`."""
+        """Compute the residual: sum terms in the dtype `accumulate`, then round to the dtype `decision`."""
         ...
 
     def threshold(self, first: Float[Array, "..."], iteration: Int[Array, "..."]) -> Float[Array, "..."]:
-        """Return the threshold at an iteration, given the residual before the first iteration."""
+        """Return the threshold of an iteration; `first` is the residual before the first iteration."""
         ...
 
 
@@ -138,7 +138,7 @@ class HysteresisStop(eqx.Module):
         return self.rule.measure(terms, accumulate, decision, zero)  # type: ignore[attr-defined]
 
     def threshold(self, first, iteration):
-        """Return the upper threshold before the first iteration, later the threshold of the inner rule."""
+        """Return `enter` before the first iteration, and the threshold of the inner rule at later ones."""
         enter = jnp.asarray(self.enter).astype(first.dtype)
         return jnp.where(iteration == 0, enter, self.rule.threshold(first, iteration))
 
@@ -249,9 +249,9 @@ def elementwise(function: Map) -> Map:
     """Return a version of a function with a `while_loop` that is differentiable in forward and reverse mode.
 
     JAX has no reverse mode for a `while_loop`, because the required memory is not known in advance. A
-    function that treats each ball separately has a diagonal Jacobian. All entries of a diagonal Jacobian
-    follow from a few tangents that are computed in the loop, so iterations need not be stored. The derivative
-    is taken at fixed decisions. The solve's record and the inputs in `rest` have no derivative.
+    function that treats each ball separately has a diagonal Jacobian, which follows from a few tangents. The
+    tangents are computed in the loop, so iterations need not be stored. Decisions are held fixed in the
+    derivative. The record of the solve and the inputs in `rest` are not differentiated.
 
     Args:
         function: a function whose outputs for ball b depend only on the inputs for ball b (and on `rest`).

@@ -143,7 +143,7 @@ _EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number"
 
 
 def _said(error: Any) -> str:
-    """Return the message of a usage error, with the invalid text if a number was expected."""
+    """Return the message of a usage error; if a number was expected, the message quotes the invalid text."""
     details = getattr(error.__cause__, "errors", None)
     if details is None or details()[0]["type"] not in _EXPECTED:
         return error.format_message()

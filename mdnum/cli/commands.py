@@ -249,7 +249,7 @@ def _folder(path: Path) -> Any:
 
 
 def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert options to arguments of a function, and permit the code in a file given on the command line."""
+    """Convert options to function arguments; permit execution of a Python file named on the command line."""
     options = {}
     for name in given.keys() & said["options"].keys():
         off = said["options"][name].get("type") == "flag" and name.startswith("no_")

@@ -1,7 +1,7 @@
 """Forks: where two runs diverge, which decision made them diverge, and whether the divergence mattered.
 
-The package works for molecular dynamics and the bouncing ball. A choice (`forks.choices`) or two run folders
-(`forks.folders`) define a pair of programs (`Twin`); `fork` compares the runs of both programs.
+The package works for molecular dynamics and the bouncing ball. `fork` compares the runs of two programs
+(`Twin`) that differ in a choice (`forks.choices`) or belong to two run folders (`forks.folders`).
 `forks.boundaries` finds parameter values at which decisions change; `forks.exact` uses exact arithmetic. Four
 modules are for molecular dynamics only: `forks.replays` (overridden decisions, minimal causes),
 `forks.linearized` (exponents and forecasts), `forks.processes` (compilers) and `forks.benign` (ensembles).

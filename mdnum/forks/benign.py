@@ -1,14 +1,14 @@
 """Test whether a fork is benign, that is, whether two programs with diverging runs give the same averages.
 
 Runs of program B are compared with an ensemble of runs of program A at one step. A calibration determines
-this step. At early steps, the runs of the ensemble differ from one another by less than rounding errors can
-change a run. At late steps, every run has forgotten its start, and a changed program has the same scatter as
-the ensemble. The steps suitable for a comparison depend on the system. For calibration, programs with
-deliberate changes are run; at the chosen step, all deliberate changes are distinguishable from rounding.
+this step. At early steps, rounding errors can change a run by more than the runs of the ensemble differ. At
+late steps, every run has forgotten its start, and a changed program has the same scatter as the ensemble. The
+steps suitable for a comparison depend on the system. For calibration, programs with deliberate changes are
+run; at the chosen step, all deliberate changes are distinguishable from rounding.
 
 The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
 Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
-run is an outlier if at least two of its principal components exceed the limit; a program fails the test if at
+run is an outlier if at least two of its principal components exceed the limit. A program fails the test if at
 least two of its three runs are outliers. Equivalently, a program fails if the median of the second-largest
 component over its three runs exceeds the limit.
 """
@@ -111,8 +111,8 @@ class Space:
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations above which a principal component counts as an outlier.
 
-    The limit is two standard deviations, or more if over a tenth of the ensemble's runs would be outliers.
-    Each run is judged by components of the other runs, because a run influences its own components.
+    The limit is two standard deviations. It is larger if a tenth of the ensemble's runs would exceed it. Each
+    run is judged by components of the other runs, because a run influences its own components.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -285,7 +285,7 @@ def calibrate(
 
 
 def choose(windows: Sequence[Window], name: str) -> Window:
-    """Return the latest step at which every deliberate change is detected, or else the best step.
+    """Return the latest step at which all deliberate changes are clear, or else the most sensitive step.
 
     Raises:
         InputError: at no step are the deliberate changes distinguishable from rounding.

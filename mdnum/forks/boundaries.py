@@ -34,7 +34,7 @@ MOST, MOST_BALL = 24, 64
 
 @dataclass(frozen=True)
 class Side:
-    """The run on one side of a boundary, for the parameter value next to the boundary."""
+    """A run with the parameter value that is next to a boundary, on one side of the boundary."""
 
     at: float  # the number, as the float next to the boundary
     digest: str  # of its decisions
@@ -299,7 +299,7 @@ def _run(task: tuple[NumberLine | bytes, int]) -> DecisionHistory:
 def _searched(
     task: tuple[NumberLine | bytes, dict[int, DecisionHistory], int],
 ) -> list[tuple[Boundary | None, dict[int, DecisionHistory]]]:
-    """Return the lowest boundaries in a grid cell and the runs made for each; runs at both ends are known."""
+    """Find the lowest boundaries in a grid cell; return each with the runs that were made to find it."""
     own, ends, most = task
     line = _line_of(own)
     line.known |= ends

@@ -1,10 +1,10 @@
 """Certify the decisions of one run, and the agreement of its decisions with those of another run.
 
 Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound: exact arithmetic
-would give the same decisions for the same states. Up to the end of *protection*, no pair distance was closer
-to its cutoff than two runs can differ in this distance. Up to the certified horizon and the end of
-protection, the decisions of the two runs agree. If one of two programs is at least as precise as the other in
-every role, both make the same decisions up to the *shadow horizon*.
+would give the same decisions for the same states. Up to the end of *protection*, every pair distance was
+farther from its cutoff than the two runs can differ. Up to the certified horizon and the end of protection,
+the decisions of the two runs agree. If one of two programs is at least as precise as the other in every role,
+their decisions agree up to the *shadow horizon*.
 
 Decisions are certified only for the actual states of the run. A run whose decisions are correct for its
 states may have left the exact history long ago (`forks.exact.certify` finds the step).
@@ -95,7 +95,7 @@ def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray
     """For each step, return the smallest |pair distance - cutoff|, and the value needed for equal decisions.
 
     If positions of atoms differ between the two runs by at most d, a pair distance differs by at most 2 d.
-    The pair distances are those of the run with the smaller rounding error; this error is added to the
+    Pair distances are taken from the run with the smaller rounding error. This rounding error is added to the
     required value.
     """
     deciders = {"A": fork.twin.a.simulation.decider, "B": fork.twin.b.simulation.decider}
@@ -207,8 +207,8 @@ def exact_margin(
     """Compute the margin of a pair without rounding errors, and the decision that results from the margin.
 
     The positions are the floating-point numbers of the state, taken as exact. The threshold and the lattice
-    vectors are the double-precision numbers of the system, as in the exact program, whatever the dtype of the
-    decision. The margin, expressed as a distance, is accurate to 400 binary digits; the decision is exact.
+    vectors have double precision, as in the exact program, even if the run decides in another dtype. The
+    margin, expressed as a distance, is accurate to 400 binary digits; the decision is exact.
 
     Args:
         start, end: positions of the two atoms, length.

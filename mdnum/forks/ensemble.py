@@ -42,7 +42,7 @@ _NUMBERS = (
 
 
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
-    """Return the distances at which the hat functions of the pair histogram peak, and the histogram's end.
+    """Return the peak positions of the hat functions of the pair histogram, followed by the histogram's end.
 
     The distances extend from the closest pairs of the initial state to the largest distance that is counted.
     """
@@ -107,8 +107,8 @@ def hats(
 ) -> Float[np.ndarray, "hats"]:
     """Count pair distances with hat functions: each distance contributes to the two nearest nodes.
 
-    The contribution to a node grows linearly as the distance approaches the node. Distances below the first
-    node count for this node. The last node marks the end of the range: a pair that leaves it causes no jump.
+    The contribution to a node grows linearly as the distance approaches the node. A distance below the first
+    node counts as this node. No count jumps when a distance passes the last node, which ends the range.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)

@@ -79,8 +79,8 @@ class Slope:
 class ForcesCheck(AuditCheck):
     """Are the forces minus the gradient of the energy, and of which energy?
 
-    For step h, the error of a finite difference D(h) is |D(h) - D(h/4)| after extrapolation, plus noise
-    divided by h. Of nine steps, the one with the smallest error is used. If the deviation of a finite
+    The slope of the energy is a finite difference D(h). Its error is estimated as |D(h) - D(h/4)| plus noise
+    divided by h. Of nine steps h, the one with the smallest error is used. If the deviation of a finite
     difference from the force grows like 1/h, the check reports a jump of the energy and not a wrong force.
     """
 
@@ -257,11 +257,11 @@ def slope(
 def _best(
     gaps: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
 ) -> tuple[int, float]:
-    """Return the index and the error of the most accurate finite-difference step that other steps confirm.
+    """Find the most accurate finite difference that other step lengths confirm; return its index and error.
 
-    If the energy jumps at flips, two finite-difference steps may include the same jumps by chance and give
-    the same wrong slope. A wrong force, in contrast, causes equal deviations for all sufficiently accurate
-    finite-difference steps.
+    If the energy jumps at flips, finite differences with two step lengths may by chance contain the same
+    jumps, and agree on a wrong slope. A wrong force, in contrast, causes equal deviations for all
+    sufficiently accurate finite-difference steps.
 
     Args:
         gaps: finite difference minus force for each step, from the longest step to the shortest.
@@ -296,7 +296,7 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
 def _drowned(
     worker: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, known: float, scale: float
 ) -> list[Observed]:
-    """Return a finding if the noise exceeds rounding errors and hides the forces or energy differences."""
+    """Return a finding if the calculator's noise is so large that it hides forces or energy changes."""
     stairs = steps(worker, atoms)  # which are another finding
     size = max(noise.force, 0.0 if stairs.energy else known)
     if size <= max(_DROWNED * scale, stairs.force):

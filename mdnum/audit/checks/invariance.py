@@ -88,9 +88,9 @@ class _Difference:
 class InvarianceCheck(AuditCheck):
     """Do energy and forces of a structure depend on its representation?
 
-    The allowed differences are measured: the calculator's noise along a line, and the largest change under
-    random displacements as large as the rounding of coordinates. A transformation that the calculator does
-    not support is skipped. If two representations differ in energy or forces, `structures` contains both.
+    Differences within the calculator's noise are allowed, as are differences that rounding of the coordinates
+    can cause. Both are measured. A transformation that the calculator does not support is skipped. If two
+    representations differ in energy or forces, `structures` contains both.
     """
 
     name, title, order, calls = "invariance", "Invariance", 40, 450
@@ -184,7 +184,7 @@ class InvarianceCheck(AuditCheck):
     def _without_topology(
         self, wrong: dict[str, list[_Difference]], judge: _Judge
     ) -> dict[str, list[_Difference]]:
-        """Omit differences due to the atom order if it defines the molecules; otherwise return all."""
+        """Omit differences caused by reordering atoms if the atom order defines the molecules."""
         rng = np.random.default_rng(self.seed + 1)
         grouped = by_molecule(judge.atoms, rng)
         try:
@@ -436,8 +436,8 @@ def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     """Yield a supercell of a dense four-atom cell, for comparison with the four-atom cell.
 
     In cells at least two cutoffs wide, no atom interacts with two images of another atom. The four-atom cell
-    has one species, or two in equal numbers as in a salt; structures with more species are not tested, since
-    the result would be ambiguous.
+    has one species, or two in equal numbers. Structures with more than two species are not tested, since the
+    result would be ambiguous.
     """
     species = list(dict.fromkeys(atoms.symbols))
     nearest = nearest_distance(atoms)

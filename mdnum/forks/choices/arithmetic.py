@@ -1,8 +1,8 @@
 """Choices of arithmetic: the floating-point format of each role, and the order in which sums are computed.
 
-The order of a sum is set by the reduction or the neighbor list, whose order of pairs depends on how and when
-it is built. A different order of a sum does not change which pairs interact if every list is rebuilt before
-motion exceeds the skin. If sums do not depend on their order, a different order must have no effect.
+The order of a sum is set by the reduction or the neighbor list. The order of pairs in a list depends on how
+and when the list is built. If every list is rebuilt in time, the order of a sum does not change which pairs
+interact. If sums do not depend on their order, a different order must have no effect.
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ class Order(Summed):
 
 @choice("format")
 class FormatChoice(Summed):
-    """The neighbors of each atom in the order in which another neighbor-list format adds their forces."""
+    """The forces of an atom's neighbors added in the order of another neighbor-list format."""
 
     screened = "format=dense format=sparse format=ordered-sparse format=ordered-sparse@exact"
     shown = True
@@ -328,7 +328,7 @@ class RebuildChoice(Summed):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """True if sums do not depend on order and lists are rebuilt before a pair can be missed."""
+        """True if sums do not depend on order, and neighbor lists contain all pairs inside the cutoff."""
         return super().must_hold and self.every in (1, None)
 
     @classmethod

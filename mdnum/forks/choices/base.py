@@ -269,7 +269,7 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice that can set how both runs sum; the runs must agree if their sums do not depend on order."""
+    """A choice that can set how both runs sum; if their sums do not depend on order, the runs must agree."""
 
     worlds = ("md",)
     both: str | None = None  # reduction of both runs; None for the system's own

@@ -94,8 +94,8 @@ class Relabel(Summed):
 class Rotate(Summed):
     """The axes of the box exchanged or reversed.
 
-    An exchange of axes is exact, but afterwards squared components of a distance vector are added in another
-    order. If the sign of an axis changes, positions are rounded once more when they are wrapped into the box.
+    An exchange of axes is exact, but it changes the order in which squared components of a distance are
+    added. If the sign of an axis changes, positions are rounded once more when they are wrapped into the box.
     """
 
     screened = "rotate rotate@exact"
@@ -176,8 +176,8 @@ class Images(Choice):
     """Atoms that start in other periodic images.
 
     Positions are wrapped before the first step, so this choice changes no bit if images are exact. Usually,
-    however, the sum of a position and a lattice vector is rounded. Both runs start from positions with exact
-    images, at most one ulp of the lattice vector away from the positions in the file.
+    however, the sum of a position and a lattice vector is rounded. Both runs therefore start from positions
+    with exact images. These differ from the positions in the file by at most one ulp of the lattice vector.
     """
 
     worlds = ("md",)
@@ -217,7 +217,7 @@ class Images(Choice):
 def exact_images(
     cell: Any, positions: Float[np.ndarray, "atoms 3"], images: Int[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"], int]:
-    """Return wrapped positions near given ones, their images, and the number of atoms without exact images.
+    """Move atoms slightly to make images exact; return positions, images and the number of inexact images.
 
     Wrapping an exact image restores the wrapped position, bit for bit. In an orthogonal box, wrapping a
     rounded image gives a position with an exact image, because the lattice vector is subtracted exactly

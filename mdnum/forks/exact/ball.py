@@ -204,7 +204,7 @@ class _ExactBall:
 
 
 class _ExactRule:
-    """A solver's stopping rule in exact numbers, applied to the residual of the batch or of each ball."""
+    """A solver's stopping rule in exact numbers, for one residual of all balls or one residual per ball."""
 
     def __init__(self, world: World):
         rule: Any = world.contact.stop  # type: ignore[attr-defined]

@@ -163,7 +163,7 @@ def _certify_md(system: Simulation, last: int, policies: Mapping[str, Roles], no
     matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
 
     def reduced(x: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Wrap positions into a box at the origin; minimum images then require at most one lattice vector."""
+        """Wrap positions into the box, so that nearest images are at most one lattice vector away."""
         return x - np.floor(x @ np.asarray(simulation.cell.inverse)) @ matrix
 
     rows = []
@@ -254,7 +254,7 @@ def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
 
 
 def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
-    """Return how many bits closer to the exact positions one run is than another before a wrong decision.
+    """Return how many more bits of the exact positions one run reproduces than another run.
 
     The number of bits is the median over the second half of the steps before the first wrong decision. The
     median, unlike the step of a wrong decision, does not depend on which pair approaches its cutoff.

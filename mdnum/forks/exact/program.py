@@ -49,10 +49,10 @@ _U = 2.0**-53
 def pull_of(
     potential: PairPotential, constants: Mapping[str, float], cutoff: str, r_cut: float, r_onset: float
 ) -> Callable[[Any], Any]:
-    """Return a function that computes 2 du/d(r²) for a pair inside the cutoff from an interval of r².
+    """Return a function of an interval of r² that computes 2 du/d(r²) for a pair inside the cutoff.
 
     The factor 2 du/d(r²) multiplies the displacement x_j - x_i in the force on i. Constants are exact
-    doubles; values derived from these constants are intervals in Arb's precision at the call.
+    doubles. Values derived from constants are intervals in the current precision of Arb.
 
     Raises:
         TypeError: the potential uses an operation that ball arithmetic does not support.
@@ -402,8 +402,8 @@ class _Run:
         """Make all decisions of a step with double-precision bounds, or with intervals if these do not
         suffice.
 
-        If double precision and exact arithmetic choose different nearest images, both images are further away
-        than r_cut, because half the box exceeds r_cut by more than the rounding errors.
+        Double precision and exact arithmetic may choose different nearest images. Both images are then
+        outside the cutoff, because half the box exceeds r_cut by more than the rounding errors.
         """
         program = self.program
         i, j, matrix = program._i, program._j, program._matrix
