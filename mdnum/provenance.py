@@ -1,8 +1,8 @@
 """Record of the software and the machine of a run, which helps to explain differences between runs.
 
 Two runs of the same system file and structure should agree bit for bit if their fingerprints agree. The
-fingerprint includes everything on which code generation and arithmetic depend: versions, instruction set of
-the processor, devices, XLA's flags, jax's settings and dtypes.
+fingerprint includes everything that affects code generation and arithmetic: versions, instruction set of the
+processor, devices, XLA's flags, jax's settings and dtypes.
 """
 
 from __future__ import annotations
@@ -146,10 +146,10 @@ def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
 def hashes(system: _System) -> dict[str, str | None]:
     """Return SHA-256 digests of the system file, of the settings that it defines, and of the structure.
 
-    The settings are all parameters except the structure, with defaults and overrides. Any change of a value
-    changes the hash of the settings; a change of the system's name does not. The structure is hashed as
-    numbers (species, masses, positions, velocities, cell, periodicity), so the same atoms in another file
-    format have the same hash.
+    The settings are all parameters except the structure, with defaults and overrides. The hash of the
+    settings changes with every value, but not with the system's name. The structure is hashed as numbers
+    (species, masses, positions, velocities, cell, periodicity). The same atoms in another file format
+    therefore have the same hash.
 
     Returns:
         digests by name: file (None without a system file), program, and structure (None without atoms).

@@ -1,8 +1,8 @@
 """Protection against importing Python code from the current folder in place of installed packages.
 
-With `-m` and `-c`, Python puts the current folder first on its import path: a file `jax.py` or `numpy.py` in
-an untrusted folder would be imported in place of the package. Therefore mdnum starts every Python process
-with the option `-P`, which processes of Python's multiprocessing inherit.
+With `-m` and `-c`, Python puts the current folder first on its import path. A file `jax.py` or `numpy.py` in
+an untrusted folder would then be imported in place of the package. Therefore mdnum starts every Python
+process with the option `-P`, which processes of Python's multiprocessing inherit.
 """
 
 from __future__ import annotations

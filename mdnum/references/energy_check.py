@@ -399,8 +399,8 @@ class DynamicsReport:
 def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
     """Compare a run with a velocity Verlet run of ASE that starts from the same positions and velocities.
 
-    A thermostat is switched off. A hard cutoff gives the same forces as ASE's shifted potential, so the
-    trajectories must agree although the energies differ by constants.
+    A thermostat is switched off. A hard cutoff gives the same forces as ASE's shifted potential. The
+    trajectories must therefore agree, although the energies differ by constants.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.

@@ -1,6 +1,6 @@
 """Load a Python object named by `package.module:thing(argument=value)` or `file.py:thing(argument=value)`.
 
-A module is imported or a file is executed, and the object is looked up by name; if arguments are given, the
+A module is imported or a file is executed, and the object is looked up by name. If arguments are given, the
 object is called. Arguments must be literals; nothing else is evaluated.
 """
 

@@ -140,8 +140,8 @@ class Scan:
     def stays(self) -> Stays:
         """Residence times of pairs inside and outside the cutoff.
 
-        Stays before the first flip and after the last flip of a pair are incomplete and not counted, so long
-        stays are underrepresented in short runs.
+        Stays before the first flip and after the last flip of a pair are incomplete and not counted. Long
+        stays are therefore underrepresented in short runs.
         """
         self._follow()
         return Stays(inside=self._lengths[1], outside=self._lengths[0])

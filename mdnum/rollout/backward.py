@@ -1,8 +1,8 @@
 """Exact time reversal of a run with a fixed-point (integer) state, from the last step to the first.
 
-Every step is reversed by subtracting the integers that were added in this step, so all states of the forward
-run are recovered bit for bit. The reversed run can use other neighbor lists than the forward run, because
-sums of integers do not depend on the order of pairs.
+Every step is reversed by subtracting the integers that the step added to the state. All states of the forward
+run are therefore recovered bit for bit. The reversed run can use other neighbor lists than the forward run,
+because sums of integers do not depend on the order of pairs.
 """
 
 from __future__ import annotations

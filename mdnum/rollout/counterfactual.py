@@ -24,8 +24,8 @@ from mdnum.systems.simulation import Simulation
 class Counterfactual:
     """A run with its own arithmetic, on which the cutoff decisions of another run (the leader) are imposed.
 
-    The decisions that the run itself would make are computed, too; those that differ from the leader's are
-    counted. The object is called with each segment of the leader; `until` returns the simulated steps.
+    The run's own decisions are also computed, and those that differ from the leader's are counted. The object
+    is called with each segment of the leader; `until` returns the simulated steps.
 
     Args:
         simulation: the run whose arithmetic is used.

@@ -1,8 +1,8 @@
 """Control of a simulation run: neighbor lists, calls of the compiled time-stepping loop, and records.
 
 The engine builds a neighbor list, starts the compiled loop over the steps that use it, and yields the loop's
-records. A record is yielded only after the next loop has been started, so that the caller processes this
-record while the device computes the next record.
+records. The caller processes a record while the device computes the next one, because a record is yielded
+only after the next loop has been started.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Execution of tasks by a `concurrent.futures.Executor`, by default in processes on all cores.
 
-An engine (executor) only starts worker processes. The folder of a point shows whether the point was computed;
-a worker process that dies therefore loses only its current point.
+An engine (executor) only starts worker processes. The folder of a point shows whether the point was computed.
+A worker process that dies therefore loses only its current point.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ _LOOK = 5.0
 def _pinned(width: int) -> None:
     """Restrict this process to reserved cores, because XLA uses all visible cores despite OMP_NUM_THREADS.
 
-    A core is reserved by a file lock, which is released when the process ends, so that sweeps on the same
-    machine use different cores. If no core is free, two processes use the same core.
+    A core is reserved by a file lock, which is released when the process ends. Sweeps on the same machine
+    therefore use different cores. If no core is free, two processes use the same core.
     """
     with suppress(ImportError, AttributeError, OSError):
         import fcntl

@@ -9,9 +9,9 @@
       claims/ADDRESS.N                the process that is computing it
 
 The address of a point is defined as in signac: the MD5 hash of the state point as JSON. A point is computed
-in a temporary folder, which a single rename moves to the address, so that a killed process leaves no partial
-result. To claim a point, a process creates a claim file with O_EXCL, so that only one process can succeed. If
-the claiming process ends without a result, another process creates a claim with the next number.
+in a temporary folder, which a single rename moves to the address. A killed process therefore leaves no
+partial result. To claim a point, a process creates a claim file with O_EXCL, so that only one process can
+succeed. If the claiming process ends without a result, another process creates a claim with the next number.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Schema of a system file of a bouncing ball (`world = "ball"`): pydantic models with units.
 
 Heights are in m, velocities in m/s, times in s. Stiffness and damping are per mass (1/s², 1/s), so no mass is
-needed; the gain of the projection contact has no unit.
+needed. The gain of the projection contact has no unit.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Potential constants and cutoff radii for every pair of species, and the longest interaction radius.
 
 A system file gives one set of constants, or one set per pair of species. No mixing rule is applied: the file
-must list every pair of species in the structure, and a forgotten cross term is an error.
+must list every pair of species in the structure. A forgotten cross term is an error.
 """
 
 from __future__ import annotations

@@ -51,12 +51,12 @@ def read(given: Any) -> ListAnswer:
     """Return the pairs in a neighbor list's return value as a `ListAnswer`.
 
     A neighbor list may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance,
-    vector), or i and j with some of the optional arrays. The arrays are recognized by shape: one number per
-    row is a distance, the first array with three integers per row is the shift, and another array with three
-    numbers per row is the vector. A mapping with the keys i, j, shift, distance and vector, or an object with
-    attributes of these names, is also accepted. A list of tuples (i, j), or one array with a row (i, j) for
-    each pair, is accepted too. A Python list of lists is always read as arrays, not as pairs, since some such
-    lists would be ambiguous.
+    vector), or i and j with some of the optional arrays. The arrays are recognized by shape. An array with
+    one number per row contains distances. The first array with three integers per row contains shifts, and
+    another array with three numbers per row contains vectors. A mapping with the keys i, j, shift, distance
+    and vector, or an object with attributes of these names, is also accepted. A list of tuples (i, j), or one
+    array with a row (i, j) for each pair, is accepted too. A Python list of lists is always read as arrays,
+    not as pairs, since some such lists would be ambiguous.
 
     Raises:
         Malformed: the value has none of the supported forms.

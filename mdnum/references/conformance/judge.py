@@ -514,7 +514,7 @@ class Report:
     def reach(self, case: Case) -> float:
         """Return the largest distance allowed for a pair in a list that may include pairs beyond the cutoff.
 
-        Both atoms of a pair may have moved as far as the skin allows since the neighbor list was built.
+        Since the neighbor list was built, both atoms of a pair may have moved as far as the skin allows.
         """
         usual = case.r_cut + 2 * case.skin if case.skin else 1.5 * case.r_cut
         own = 0.3 * (self.padding or 1.0)  # asked with a skin of 0.3 cutoffs

@@ -165,8 +165,8 @@ def _crowds() -> Named:
 def vast() -> Iterator[Case]:
     """Yield few atoms in a volume so large that a cell grid needs too much memory or 64-bit indices.
 
-    For very large volumes, a neighbor list is called in a separate process, since a process that allocates a
-    huge cell grid may be killed.
+    Very large volumes are tested in a separate process, because a process that allocates a huge cell grid may
+    be killed.
     """
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
     yield once("two pairs thousands of cutoffs apart, free", "axes", apart)

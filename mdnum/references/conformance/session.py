@@ -245,7 +245,7 @@ def _value(name: ast.expr, place: TracebackType) -> Any:
 class RemoteSession:
     """Calls of one named neighbor list in a separate process.
 
-    If the process ends, a new process is started: a crash is a finding and must not end the suite.
+    If the process crashes, the crash is a finding, and a new process is started.
     """
 
     most = np.inf  # seconds that an answer may take, where that is less than usual
