@@ -17,7 +17,7 @@ H = np.array([[5.0, 0.1, 0.3], [0.0, 6.0, -0.2], [0.4, 0.0, 7.0]])
 NUMBERS: dict[str, Any] = {"timestep": 0.01, "kT": 0.8, "pressure": 0.7, "relaxation": 0.2}
 NUMBERS |= {"pressure_relaxation": 2.0}
 OWN: dict[type, dict[str, Any]] = {
-    MTK: {}, CellRescaling: {"compressibility": 0.1, "key": jax.random.key(0)}
+    MTK: {}, CellRescaling: {"compressibility": jnp.float64(0.1), "key": jax.random.key(0)}
 }  # fmt: skip
 
 
@@ -33,11 +33,12 @@ def test_the_excess_is_what_numpy_makes_of_its_formula(kind, box: str, atoms: in
     numbers = {name: jnp.asarray(one) for name, one in NUMBERS.items()}
     integrator = kind(**numbers, **OWN[kind], box=box)
     cell = jax.tree.map(jnp.asarray, Cell.create(H, (True,) * 3))
-    at = AtStep(v, np.trace(tensor), tensor, cell, masses, 0, np.arange(atoms))
     wide = v.astype(np.float64)
+    v, m = jnp.asarray(v), jnp.asarray(masses)
+    at = AtStep(v, jnp.trace(tensor), jnp.asarray(tensor), cell, m, jnp.int64(0), jnp.arange(atoms))
     whole = (masses * wide) @ wide.T + tensor - 0.7 * np.linalg.det(H) * np.eye(3)
-    found = integrator.excess(integrator.motion(v, masses), at)
+    found = integrator.excess(integrator.motion(v, m), at)
     expected = whole if box == "full" else np.trace(whole) / 3
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-12)
     kinetic = 0.5 * np.sum(masses * np.sum(wide**2, axis=0))
-    np.testing.assert_allclose(integrator.kinetic(v, masses), kinetic, rtol=1e-13)
+    np.testing.assert_allclose(integrator.kinetic(v, m), kinetic, rtol=1e-13)

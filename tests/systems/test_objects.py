@@ -256,7 +256,11 @@ def object_of(kind, timestep=0.2, **numbers):
     """An integrator object with plain numbers, in internal units."""
     numbers = {"timestep": timestep} | numbers
     numbers = {key: jnp.float64(one) if isinstance(one, float) else one for key, one in numbers.items()}
-    return kind(**numbers, **({"key": jax.random.key(0)} if kind in (Langevin, CSVR) else {}))
+    # an array in the place of a number: the annotations, if they are checked, allow none when an object is made
+    arrays = {key: numbers[key] for key in numbers if np.ndim(numbers[key])}
+    numbers |= dict.fromkeys(arrays, jnp.float64(1.0))
+    made = kind(**numbers, **({"key": jax.random.key(0)} if kind in (Langevin, CSVR) else {}))
+    return eqx.tree_at(lambda one: [getattr(one, key) for key in arrays], made, list(arrays.values()))
 
 
 @pytest.mark.parametrize(
@@ -264,10 +268,10 @@ def object_of(kind, timestep=0.2, **numbers):
     [
         (VelocityVerlet, {"timestep": -0.2}, r"timestep: .*-0\.00203\d* ps.*above 0"),
         (VelocityVerlet, {"timestep": np.nan}, r"timestep: .*nan.*finite"),
-        (VelocityVerlet, {"timestep": np.float32(0.2)}, r"timestep: .*0\.2.*float64"),
+        (VelocityVerlet, {"timestep": jnp.float32(0.2)}, r"timestep: .*0\.2.*float64"),
         (Langevin, {"friction": -1.0, "kT": 0.01}, r"friction = -98\.2.*above 0"),
         (NoseHooverChain, {"kT": 0.0, "relaxation": 1.0}, r"temperature = 0.0.*above 0"),
-        (NoseHooverChain, {"kT": np.ones(2), "relaxation": 1.0}, r"temperature: .*1\., 1.*finite number"),
+        (NoseHooverChain, {"kT": jnp.ones(2), "relaxation": 1.0}, r"temperature: .*1\., 1.*finite number"),
         (NoseHooverChain, {"kT": 0.01, "relaxation": 1.0, "chain": 0}, r"chain = 0.*at least 1"),
         (CSVR, {"kT": 0.01, "relaxation": -1.0}, r"relaxation = -0\.0101.*above 0"),
         (Own, {"timestep": 0.0, "wind": 3.0}, r"timestep: .* 0 ps.*above 0"),
