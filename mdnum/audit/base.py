@@ -118,7 +118,7 @@ class Observed:
 def finding(
     code: str, severity: Severity, *variants: str | None, tests: Collection[str] = (), **values: Any
 ) -> Observed:
-    """Return a finding whose text consists of the named variants; a variant that is None is ignored.
+    """Return a finding whose text combines the given text variants; a variant that is None is left out.
 
     Args:
         tests: names (keys of `causes.TESTS`) of the tests that were made and that leave this cause possible.

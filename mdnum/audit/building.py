@@ -131,7 +131,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return the crystal of the first supported element; if `paired`, test two atoms of each element."""
+        """Return the crystal of the first supported element; if `paired`, two atoms determine the cutoff."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():
@@ -376,7 +376,7 @@ def _least_distance(cell: Atoms) -> float:
 def _least_energy(
     subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
 ) -> tuple[float, bool]:
-    """Return the lattice scale factor of lowest energy, starting at `start`, and whether a minimum exists."""
+    """Search from `start` for the lattice scale of lowest energy; return it, and whether a minimum exists."""
 
     def energy(scale: float) -> float:
         try:

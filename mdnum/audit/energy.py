@@ -1,7 +1,7 @@
 """Energy balance of a run: jumps of the energy at thresholds and elsewhere, work of the forces, drift.
 
-If the force is minus the gradient of the energy, a step's energy change plus the work of the forces along the
-straight line is zero for every integrator. If an energy change at a distance threshold is not explained by
+If the force is minus the gradient of the energy, energy change plus work is zero along the straight line
+between two time steps, for every integrator. If an energy change at a distance threshold is not explained by
 the work of the forces, it is the energy jump of a flip. An unexplained change at a single point that is not a
 distance threshold is due to a limit on the number of neighbors or a selection of nearest neighbors. An
 unexplained change spread over many points means that the force is not minus the gradient of the energy.

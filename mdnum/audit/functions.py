@@ -116,7 +116,7 @@ def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
 
 
 def _order(derivatives: np.ndarray) -> int:
-    """Return how many derivatives of the energy are continuous at the last of the given distances."""
+    """Return the order of the last continuous derivative of the energy at the cutoff; -1 if none is."""
     for order, row in enumerate(derivatives):
         usual = float(np.median(np.abs(row[np.isfinite(row)]))) if np.isfinite(row).any() else 0.0
         if not abs(row[-1]) <= _NOTHING[min(order, 1)] * usual:

@@ -68,7 +68,7 @@ class NoiseFloor:
     freedom: float = math.inf  # independent values that the standard deviations were estimated from
 
     def louder(self, other: NoiseFloor) -> NoiseFloor:
-        """Combine two noise levels: the larger noise of each quantity, and the smaller degrees of freedom."""
+        """Combine two noise levels: take the larger noise, and the smaller number of degrees of freedom."""
         return NoiseFloor(
             max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical),
             min(self.freedom, other.freedom),

@@ -205,7 +205,7 @@ class CalculatorSubject:
         self._seen += 1
 
     def energy(self, atoms: Atoms) -> float:
-        """Return the potential energy (eV); of two energies, return the one consistent with the forces."""
+        """Return the potential energy (eV) that is consistent with the forces."""
         return self.energies(atoms)[0]
 
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:

@@ -3,8 +3,8 @@
 In a many-body potential, the interaction of a pair depends on other atoms. The energy may then jump at a
 threshold where it is smooth for two isolated atoms. Atoms and triples of atoms are therefore moved through
 all pair thresholds, and also through other distances. To detect a limit on the number of neighbors, one more
-atom is moved past all neighbors of a crowded central atom. A calculator that keeps only k neighbors replaces
-the k-th neighbor by the moving atom when the two are equally far away; then the energy or a force jumps. If a
+atom is moved past all neighbors of a crowded central atom. If a calculator keeps only k neighbors, the moving
+atom replaces the k-th neighbor when both are equally far away. The energy or a force then jumps. If a
 calculator keeps the first k neighbors in the order of the list, reordering the atoms reveals the limit.
 """
 

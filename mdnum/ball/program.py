@@ -199,7 +199,7 @@ class BallProgram:
         return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
 
     def decision(self, other: BallProgram, flips: Sequence[CrossDecision], separation: float) -> Decision:
-        """Return the first decision that differs between two runs; contacts precede stops within a step."""
+        """Return the first decision that differs between two runs; in a step, contacts come before stops."""
         first = flips[0]
         return Decision(
             channel=first.channel,

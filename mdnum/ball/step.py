@@ -281,8 +281,8 @@ class _Forceless(eqx.Module):
 class Penalty(eqx.Module):
     """Contact by a spring and a damper: the force is k p - damping v, where p is the depth below the floor.
 
-    If contact is imposed, the force is -k y for either sign of y. The contact force thus continues smoothly
-    above the floor, like an imposed pair force beyond its cutoff.
+    In a smooth contact, p is a softplus of -y. If contact is imposed, the force is -k y for either sign of y.
+    The force thus continues smoothly above the floor, like an imposed pair force beyond its cutoff.
 
     Source: soft contact of the discrete element method (Cundall and Strack 1979).
     """

@@ -44,7 +44,7 @@ class Reason(IntEnum):
 
 
 class Solve(NamedTuple):
-    """Record of one iterative solve; arrays have shape (balls,) if each ball stops separately, else ()."""
+    """Record of an iterative solve; shape (balls,) if each ball stops separately, else () for all balls."""
 
     iterations: Int[Array, "..."]  # how often it went on
     reason: Int[Array, "..."]  # a `Reason`

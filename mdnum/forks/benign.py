@@ -77,7 +77,7 @@ class Space:
 
     @classmethod
     def of(cls, features: Float[np.ndarray, "runs features"]) -> Space:
-        """Compute 2 to 10 principal components that explain the variance, at most one per three runs."""
+        """Compute 2 to 10 principal components, which explain most of the variance of the features."""
         mean, spread = features.mean(axis=0), features.std(axis=0, ddof=1)
         # nothing can be said of a feature that is constant, such as a distance that no pair has
         spread = np.where(spread > _ROUNDING * np.abs(mean), spread, np.inf)
@@ -111,8 +111,8 @@ class Space:
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations above which a principal component counts as an outlier.
 
-    The limit is two standard deviations. It is larger if a tenth of the ensemble's runs would exceed it. Each
-    run is judged by components of the other runs, because a run influences its own components.
+    The limit is two standard deviations. It is larger if a tenth of the ensemble's runs would exceed it. The
+    components for a run are computed from other runs, because a run influences its own components.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -156,7 +156,7 @@ class Planted:
 
     @property
     def ok(self) -> bool:
-        """True if a harmful change was always detected, or a harmless change was rejected only by chance."""
+        """True if a harmful change always failed the test, or if a harmless change failed only by chance."""
         if self.must_fail:
             return self.failures == self.tries
         return bounds(self.failures, self.tries)[0] <= ACCEPTED
@@ -173,7 +173,7 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest score, relative to the limit, of the changes that must be detected; infinity if none."""
+        """Smallest ratio of score to limit among the changes that must be detected; infinity without any."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property

@@ -182,7 +182,7 @@ class NumberLine:
             yield a, b, runs
 
     def boundary(self, below: int, above: int) -> Boundary | None:
-        """Find the first decision that differs between runs at two ordinals; None if a run ends before it."""
+        """Find the first decision that differs between runs at two ordinals; None if a run ends earlier."""
         places = (below, above)
         runs = [self.run(place) for place in places]
         step = runs[0].first_difference(runs[1])

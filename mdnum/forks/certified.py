@@ -92,7 +92,7 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 
 
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """For each step, return the smallest |pair distance - cutoff|, and the value needed for equal decisions.
+    """For each step, return the smallest |pair distance - cutoff| and the value that ensures equal decisions.
 
     If positions of atoms differ between the two runs by at most d, a pair distance differs by at most 2 d.
     Pair distances are taken from the run with the smaller rounding error. This rounding error is added to the

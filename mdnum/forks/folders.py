@@ -225,8 +225,8 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """Return the numerical choices to which keys with different values belong. The dtypes of all roles form
-    one choice; a cutoff and its parameters form another.
+    """Return the numerical choices that differ, given the keys with different values. The dtypes of all roles
+    form one choice; a cutoff and its parameters form another.
     """
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}

@@ -1,16 +1,16 @@
 """The linearized run: how a small perturbation of the start grows, and which decisions this growth changes.
 
-The tangent (the derivative of the state) is propagated along the recorded states with the same neighbor
-lists, so that the reference is the recorded run, bit for bit. The exponential growth rate of the tangent is
-the largest Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn
-1980) and, unlike the distance between two runs, does not saturate.
+The tangent (the derivative of the state) is propagated along the recorded states, with the neighbor lists of
+the run. The reference is therefore the recorded run, bit for bit. The exponential growth rate of the tangent
+is the largest Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and
+Strelcyn 1980) and, unlike the distance between two runs, does not saturate.
 
 Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation: to first order
 the decision flips at a = -m / (dm/da). At each step, a perturbation below the smallest flip amplitude flips
-no decision, as long as the perturbed run remains close to the reference run and makes the same decisions. If
-the force jumps at the cutoff, the first flip changes the momenta of both atoms. The forecast ends there,
-because the linearization no longer describes the perturbed run. If the force is continuous at the cutoff, a
-flip does not change the motion to first order.
+no decision. This holds as long as the perturbed run remains close to the reference run. If the force jumps at
+the cutoff, the first flip changes the momenta of both atoms. The forecast ends at this flip, because the
+linearization no longer describes the perturbed run. If the force is continuous at the cutoff, a flip does not
+change the motion to first order.
 """
 
 from __future__ import annotations
@@ -244,8 +244,8 @@ class Lyapunov:
     def steps_to(self, start: float, end: float) -> float | None:
         """Return the step at which a displacement has grown from an initial length to a given length.
 
-        Growth is that of the tangent during the run, and is extrapolated exponentially beyond the run's end.
-        The method returns None for a run that is not chaotic if the displacement does not reach `end`.
+        During the run, a displacement grows like the tangent. Later growth is extrapolated exponentially. The
+        method returns None for a run that is not chaotic if the displacement does not reach `end`.
 
         Args:
             start: largest displacement of an atom at the start, length; for example one rounding unit.
@@ -320,8 +320,8 @@ class ForecastRange(NamedTuple):
 class Forecast:
     """First-order prediction of the decisions flipped by perturbations of the start along one direction.
 
-    Error: neglected second-order terms and a few rounding units; flips that are uncertain within this error
-        are not predicted. `good_until` returns the last step for which the forecast is valid.
+    Error: second-order terms are neglected; rounding adds a few units. Flips that are uncertain within this
+        error are not predicted. `good_until` returns the last step for which the forecast is valid.
     """
 
     # simulation, steps: the run
@@ -383,7 +383,7 @@ class Forecast:
         return _each_pair_once(flips, count)
 
     def nearest(self, count: int = 10) -> tuple[PredictedFlip, ...]:
-        """Return the flips predicted at the smallest amplitudes of either sign, one for each pair of atoms.
+        """Return the predicted flips of smallest positive or negative amplitude, one for each pair of atoms.
 
         A flip is included only if the forecast is valid up to the step of the flip. If the force jumps at the
         cutoff, only the first flip can be predicted.

@@ -173,7 +173,7 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Return whether to impose A's decisions on B, whether to impose B's on A, and the number of repeats.
+    """Return whether to run B with A's decisions, whether to run A with B's, and how often to repeat B.
 
     Raises:
         InputError: a requested counterfactual run or repeat is not possible.
@@ -191,7 +191,7 @@ def counterfactuals(
 
 
 def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such runs are disabled") -> int:
-    """Return how often run B may be repeated: as requested, or the default if decisions can be imposed.
+    """Return the number of repeats of run B: the requested number, or a default if none is requested.
 
     Raises:
         InputError: the number is negative or too small for a significant result, or no repeats can be run.
@@ -219,9 +219,9 @@ def _beyond(step: int) -> int:
 def displacements(fork: Fork) -> tuple[float, float]:
     """Return two initial displacements for repeats: the early distance between the runs, and a smaller one.
 
-    With a hundredth of the first displacement, the rounding errors of a repeat begin to equal those of the
-    compared runs. With a much smaller displacement, the repeat equals the compared runs and is no evidence.
-    If a hundredth of the first displacement is below one ulp, the second may be larger than the first.
+    The second displacement is a hundredth of the first. A repeat with a much smaller displacement would have
+    the rounding errors of the compared runs, and would be no evidence. If a hundredth of the first
+    displacement is below one ulp, the second may be larger than the first.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]

@@ -3,7 +3,7 @@
 Programs of one system (compiled, uncompiled, batched, differentiated, or for other processors) compute the
 same formulas, but may round differently. XLA flags apply to a whole process, so each variant of a program
 runs in its own process. Variants whose positions have equal hashes at every step are numerically the same
-program; if the hashes differ, the pattern of agreement between variants reveals the cause.
+program. If hashes differ, the cause follows from which variants agree.
 
 `python -m mdnum.forks.processes FILE` executes the task described in a JSON file, and writes a file with an
 array of positions.
@@ -131,8 +131,8 @@ def variants(
 ) -> Variants:
     """Run a system in several variants of its program, two processes at a time, and find which results agree.
 
-    All variants use one neighbor list, with a doubled skin if the box is large enough, and stop before an
-    atom moves too far. Groups may differ between machines, since some processors lack fused multiply-add.
+    All variants use one neighbor list, whose skin is doubled if the box is large enough. Variants stop before
+    an atom moves too far. Groups may differ between machines, since some processors lack fused multiply-add.
 
     Args:
         system: a system that was loaded from a file and has a pair potential.
@@ -225,11 +225,11 @@ def clustered(rows: Sequence[Ran]) -> list[Ran]:
 
 
 def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
-    """Find why variants differ, as codes, from which of them agree; variants without a result are ignored.
+    """Return codes for the causes of differences between variants; variants without a result are ignored.
 
-    Codes "fused", "others" and "not_fused" concern programs without fused operations, "eager_..." the program
-    without a compiler, "reversed" the reversed sums, and "same", "fuses", "orders" and "leaves" the program
-    in "program". If a variant differs from the reference, "step" is the first step at which they differ.
+    The codes "fused", "others" and "not_fused" describe programs without fused operations, "eager_..." the
+    program without a compiler, and "reversed" reversed sums. Other codes describe the program in "program".
+    If a variant differs from the reference, "step" is the first step at which they differ.
     """
     by_name = {row.variant.name: row for row in rows if not row.failed}
     reference = next(iter(by_name.values()))

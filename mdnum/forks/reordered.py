@@ -2,14 +2,14 @@
 
 The two forces of a pair are exactly opposite, so that a list format changes only the order of sums. Dense and
 sparse lists contain each pair twice, and each entry contributes half of the pair force. For a sparse list,
-the halves from an atom's own row form one sum, and the halves from other atoms' rows form another; both sums
-are added. If the rows are sorted, one loop over atom labels gives the same result. For a dense list, the
-neighbors' halves are added one by one to the sum of an atom's own halves. An ordered-sparse list contains
-each pair once: the terms of an atom with later atoms form one sum, those with earlier atoms another sum.
+the half forces in an atom's own row form one sum, and those in other rows form a second sum; the two sums are
+added. If rows are sorted, a loop over atom labels gives the same result. For a dense list, half forces from
+other rows are added one by one to the sum of the own row. An ordered-sparse list contains each pair once.
+Forces from later atoms form one sum, and forces from earlier atoms form another.
 
-Source: jax_md.smap.pair_neighbor_list and the transpose of its gathers, whose forces have these orders bit
-for bit (tests/forks/test_choices.py, jax-md 0.2.29). The module does not reproduce that XLA sums rows with
-more than 32 slots in blocks of 32.
+Source: jax_md.smap.pair_neighbor_list of jax-md 0.2.29, whose forces are reproduced bit for bit
+(tests/forks/test_choices.py). XLA sums rows of more than 32 slots in blocks of 32, which this module does not
+reproduce.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class ReorderedSimulation(Simulation):
 
     @classmethod
     def of(cls, simulation: Simulation, order: str | int) -> ReorderedSimulation:
-        """Create a simulation with reordered neighbor lists; order-dependent sums follow the list format."""
+        """Create a simulation with reordered neighbor lists; sequential sums follow the order of the list."""
         same = _fields(Simulation, simulation)
         if isinstance(order, str) and simulation.reduction == Sequential():
             same["reduction"] = _SUMS[order]

@@ -2,7 +2,7 @@
 
 To override a decision of run B, the decision of run A is imposed on B; B makes all other decisions itself.
 The smallest set of overridden pairs that keeps run B close to run A is found by bisection and delta
-debugging; Verrou uses delta debugging to find the instructions that cause an error.
+debugging. The tool Verrou finds instructions that cause an error by delta debugging.
 """
 
 from __future__ import annotations
@@ -332,7 +332,7 @@ def _required(keys: list[int], search: _Search, until: int) -> list[int]:
     """Find a sufficient set of pairs by bisection, one necessary pair after another (QuickXplain).
 
     For n pairs, QuickXplain needs about log2(n) runs per necessary pair; delta debugging needs about n² runs.
-    QuickXplain assumes that imposing more decisions never causes a split; it stops after `until` runs.
+    The search assumes that imposing more decisions never causes a split. It stops after `until` runs.
 
     Source: Junker, QuickXplain, AAAI 2004.
     """

@@ -35,7 +35,7 @@ class DecisionTape:
 
     @cached_property
     def changes(self) -> dict[int, tuple[int, ...]]:
-        """For each pair, by its integer key, the steps at which the decision on the pair flips, ascending."""
+        """Map from the integer key of each pair to the ascending steps at which the decision on it flips."""
         order = np.argsort(self.key, kind="stable")
         keys, begins = np.unique(self.key[order], return_index=True)
         steps = np.split(self.step[order], begins[1:])

@@ -48,7 +48,7 @@ def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Pro
 def packed(system: Simulation | BallSystem, *more: Any) -> bytes:
     """Pickle a system and other objects for another process, where `unpacked` restores them bit for bit.
 
-    A system from a file is loaded again from this file, because its code is a module only in this process.
+    A system from a file is read again from the file, because code in the file exists only in this process.
     """
     import cloudpickle
 
@@ -98,7 +98,7 @@ def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> 
 
 def alike(a: Any, b: Any) -> tuple[Any, Any]:
     """Return two systems whose decisions can be compared. If terms of the potential share decisions in only
-    one system, both systems then make separate decisions for each term.
+    one system, both returned systems decide separately for each term.
     """
     if isinstance(a, BallSystem) or not (a.pairwise and b.pairwise):
         return a, b

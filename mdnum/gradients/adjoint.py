@@ -116,8 +116,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return reduce(add, (d[a] * turned[a] for a in range(3))), turned
 
     def through(r2, along, inside, types, weights):
-        """Return a function that computes energy and du/d(r²) of each neighbor slot, the parameters of every
-        slot, and the cotangents of energy and du/d(r²).
+        """Return a function that computes energy and du/d(r²) of each neighbor slot. Also return the
+        parameters of every slot, and the cotangents of energy and du/d(r²).
         """
         # each slot has parameters of its own, so that no sum over slots stands inside the loop
         slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
@@ -152,8 +152,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
     def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
-        """Return contributions to cotangents: of each neighbor slot to positions, forces, scale and
-        parameters of its pair type (in this order), and of each block of slots to shared parameters.
+        """Return, in this order, each neighbor slot's contributions to the cotangents of positions, forces,
+        scale and pair-type parameters. Also return each block's contributions to those of shared parameters.
         """
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
@@ -220,7 +220,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
 
 def _differences(cell, own, other):
-    """Return differences of pairs' positions and vectors, products of weights, and the weights of atom j."""
+    """Return differences of positions and vectors, products of weights, and the weights of second atoms."""
     d = [b - a for a, b in zip(own[:6], other[:6], strict=True)]
     products = (a * b for a, b in zip(own[6:], other[6:], strict=True))
     return [*cell.minimum_image(*d[:3]), *d[3:], *products, *other[6:]]
@@ -306,8 +306,8 @@ class AdjointCarry(NamedTuple):
 
     A trace is an `AdjointCarry` that contains the cotangents at every step, but not those of the first frame.
     Row k of a trace contains the cotangents of positions and half-kicked velocities at the beginning of step
-    first + k, without contributions of the cutoff crossings that lead to this state. Atoms in a trace are in
-    the order of the neighbor list. Unused rows at the end of a trace are undefined.
+    first + k. Cutoff crossings that lead to this state do not contribute. Atoms in a trace are in the order
+    of the neighbor list. Unused rows at the end of a trace are undefined.
     """
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
@@ -477,7 +477,7 @@ def transposed(
         return end.x, end.kicked, ahead, end.cell.matrix, end.v
 
     def look(row):
-        """From cotangents of the summed observations, compute those of a frame and of the first frame."""
+        """Compute cotangents of a frame and of the first frame from those of the summed observations."""
 
         def seen_at(x, v, potential, virial, origin, timestep, *box):
             here = (in_box(around, *box) if box else around)._replace(timestep=timestep)

@@ -209,9 +209,9 @@ def density(
     """Estimate the weighted sum of the pair density at the cutoff, delta(r_cut - r_ij), over all frames.
 
     The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
-    of the width; extrapolation from three widths, each half of the previous width, removes the second and
-    fourth powers. The result is the extrapolation from the widest kernels that agrees with the extrapolations
-    from all narrower kernels within twice the standard error of their difference.
+    of the width. Extrapolation from three widths (w, w/2, w/4) removes the second and fourth powers. The
+    result is the extrapolation from the widest kernels that agrees with those from all narrower kernels. Two
+    of them agree within twice the standard error of their difference.
 
     Args:
         weights: one per frame and pair type. reach: the largest width, length.

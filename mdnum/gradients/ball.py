@@ -4,8 +4,8 @@ The methods in this module differentiate the executed operations (unrolled), the
 fixed (frozen), or the loss averaged over random parameters (randomized). Methods that replace the contact by
 another model are in `ball_contacts`.
 
-JAX returns a derivative of 0.0 both if the run did not use a parameter and if the derivative underflowed or
-was clamped to zero; the function `dependence` distinguishes the two cases.
+JAX returns a derivative of 0.0 if the run did not use a parameter, but also if the derivative underflowed or
+was clamped to zero. The function `dependence` distinguishes the two cases.
 """
 
 from __future__ import annotations
@@ -294,7 +294,7 @@ class Frozen(BallMethod):
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """Compute derivatives by reverse mode, and central differences at fixed decisions as a check.
 
-        Error: rounding only for the derivative; about u^(2/3) (relative, unit roundoff u) for differences.
+        Error: rounding for the derivative; about u^(2/3) (relative, u: unit roundoff) for the differences.
         """
         run = problem.run(keep=False)
         decisions = jax.tree.map(jnp.asarray, run.decisions())
@@ -311,7 +311,7 @@ class Frozen(BallMethod):
 
 
 def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
-    """Return the largest magnitude among the entries of each parameter; 1 if all entries are 0."""
+    """Return the largest absolute value in the array of each parameter; 1 if all values are 0."""
     at = problem.values(names)
     return {name: float(np.max(np.abs(np.asarray(value, np.float64)))) or 1.0 for name, value in at.items()}
 

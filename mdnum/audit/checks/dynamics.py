@@ -158,7 +158,7 @@ class TwoRuns:
     period: float  # of the fastest vibration, internal time
 
     def shares(self) -> dict[str, Drift]:
-        """Energy drift (meV/atom/ps): total, due to flips, due to the integrator (two methods), the rest."""
+        """Energy drift (meV/atom/ps): the total, and the drifts due to flips, integrator and other causes."""
         one, other = self.whole, self.half
         rest, elsewhere = self.balance.filled, self.balance.elsewhere
         flips = wandering(one.time, self.balance.jumps)

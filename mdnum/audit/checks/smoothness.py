@@ -285,7 +285,7 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
 
 
 def _steepness(walk: PairWalk) -> tuple[float, float] | None:
-    """Return the largest curvature beyond the energy minimum, in units of the minimum's, and its distance."""
+    """Return the largest curvature beyond the minimum divided by that at the minimum, and its distance."""
     curvature = -np.gradient(walk.force, walk.distance)
     bottom = int(np.argmin(walk.energy))
     if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:

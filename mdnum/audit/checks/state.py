@@ -170,7 +170,7 @@ class Comparison:
 
 
 def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
-    """Return sequences in which two atoms approach to the cutoff distance, and reasons if there are none."""
+    """Return sequences in which two atoms come within the cutoff; if there are none, return the reasons."""
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)
