@@ -83,7 +83,7 @@ def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
 def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
     """Estimate the noise of energy and force (two columns) just below `low` and just above `high` (two rows).
 
-    Several spacings are tried and the largest estimate is used: float32 values at close points can be equal.
+    The largest estimate of several spacings is used, because float32 values at close points can be equal.
     """
     sides = []
     for start, sign in ((low, -1.0), (high, 1.0)):
@@ -163,8 +163,8 @@ def find_jumps(
 
     The smallest detectable jump depends on the curvature of the curve. The function `smallest_steps` returns
     the smallest detectable jump of the force. At a spacing of 0.025 Å, the scan finds 199 of 200 force jumps
-    of 1e-6 eV/Å at random distances in five potentials, and all larger jumps. The smallest energy jumps found
-    are 3e-6 eV on a repulsive wall of ε = 1 eV, and 1e-8 eV on a soft wall.
+    of 1e-6 eV/Å at random distances in five potentials. It finds all larger jumps. The smallest energy jumps
+    found are 3e-6 eV on a repulsive wall of ε = 1 eV, and 1e-8 eV on a soft wall.
 
     Args:
         curve: energy and force, which must be defined slightly beyond both ends.

@@ -426,7 +426,7 @@ def drift(time: Steps, values: Steps) -> Drift:
 def wandering(time: Steps, increments: Steps) -> Drift:
     """Return the drift of a quantity that changes by uncorrelated increments, such as energy jumps.
 
-    The deviation of a random walk from a fitted line is itself a random walk; the standard error is therefore
+    The deviation of a random walk from a fitted line is itself a random walk. The standard error is therefore
     computed from sums over blocks and not from this deviation.
 
     Args:

@@ -130,8 +130,8 @@ class CalculatorSubject:
     ASE returns its cached energy if no coordinate moved by more than 1e-15 Å. A smaller move can change a
     coordinate near zero, so this class clears the cache if any bit differs. If no bit differs, cached
     energies and forces are used; the method `forget` forces another calculation. The calculator is attached
-    to the atoms, as in a run, since some calculators require this. An evaluation may raise a
-    `CalculatorError`: the calculator raised an exception or returned nan. The structure is then saved.
+    to the atoms, as in a run, since some calculators require this. An evaluation raises a `CalculatorError`
+    if the calculator raised an exception or returned nan. The structure is then saved.
 
     Args:
         name: the calculator as the user named it.
@@ -212,7 +212,7 @@ class CalculatorSubject:
         """Return (the energy consistent with the forces, the energy that a run writes to its log), eV.
 
         ASE calls the energy consistent with the forces `free_energy` and the logged energy `energy`; the
-        logged energy is None if a calculator has only one.
+        logged energy is None if a calculator has only one energy.
         """
         asked = self._ask(atoms)
         both = self._answer(lambda: self._energies(asked), asked, "energy")

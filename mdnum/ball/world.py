@@ -146,7 +146,7 @@ class World(eqx.Module):
     # -- decide ----------------------------------------------------------------------------------------
 
     def touches(self, height: Balls, before: Bool[Array, "balls"]) -> Bool[Array, "balls"]:
-        """Return whether balls touch the floor: height < 0 or, with hysteresis, until height > lift."""
+        """Return whether balls touch the floor: height < 0 or, if `lift` is given, until height > lift."""
         height = height.astype(self.policy.dtype("decision"))
         enter = Threshold(jnp.zeros((), height.dtype), "<", "height")
         if self.lift is None:

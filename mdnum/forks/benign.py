@@ -111,8 +111,8 @@ class Space:
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations above which a principal component counts as an outlier.
 
-    The limit is two standard deviations. It is larger if a tenth of the ensemble's runs would exceed it. The
-    components for a run are computed from other runs, because a run influences its own components.
+    The limit is two standard deviations. It is larger if over a tenth of the ensemble's runs would exceed it.
+    The components for a run are computed from other runs, because a run influences its own components.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):

@@ -1,6 +1,6 @@
 """Certify the decisions of one run, and the agreement of its decisions with those of another run.
 
-Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound: exact arithmetic
+Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound. Exact arithmetic
 would give the same decisions for the same states. Up to the end of *protection*, every pair distance was
 farther from its cutoff than the two runs can differ. Up to the certified horizon and the end of protection,
 the decisions of the two runs agree. If one of two programs is at least as precise as the other in every role,

@@ -5,12 +5,12 @@ the run. The reference is therefore the recorded run, bit for bit. The exponenti
 is the largest Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and
 Strelcyn 1980) and, unlike the distance between two runs, does not saturate.
 
-Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation: to first order
-the decision flips at a = -m / (dm/da). At each step, a perturbation below the smallest flip amplitude flips
-no decision. This holds as long as the perturbed run remains close to the reference run. If the force jumps at
-the cutoff, the first flip changes the momenta of both atoms. The forecast ends at this flip, because the
-linearization no longer describes the perturbed run. If the force is continuous at the cutoff, a flip does not
-change the motion to first order.
+Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation. To first
+order, the decision flips at a = -m / (dm/da). At each step, a perturbation below the smallest flip amplitude
+flips no decision. This holds as long as the perturbed run remains close to the reference run and makes the
+same decisions. If the force jumps at the cutoff, the first flip changes the momenta of both atoms. The
+forecast ends at this flip, because the linearization no longer describes the perturbed run. If the force is
+continuous at the cutoff, a flip does not change the motion to first order.
 """
 
 from __future__ import annotations

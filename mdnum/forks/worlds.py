@@ -60,7 +60,7 @@ def packed(system: Simulation | BallSystem, *more: Any) -> bytes:
 
 @lru_cache(1)
 def unpacked(data: bytes) -> tuple[Any, ...]:
-    """Restore objects pickled by `packed`; keep the last one, so that its programs are compiled once."""
+    """Restore objects pickled by `packed`; keep the last system, so that its programs are compiled once."""
     import cloudpickle
 
     own, *more = cloudpickle.loads(data)

@@ -3,7 +3,7 @@
 The derivative of an average with respect to a parameter has up to three contributions. First, at fixed
 positions, the value of the observable in each frame changes. Second, if the observable jumps when a pair
 enters the cutoff, the average changes with the cutoff radius. The contribution of this jump is its height
-times the density of pairs at the cutoff; derivatives at fixed decisions omit this contribution. Third, with a
+times the density of pairs at the cutoff. Derivatives at fixed decisions omit this contribution. Third, with a
 thermostat, the statistical weight exp(-U/kT) of each frame changes.
 """
 
@@ -320,7 +320,7 @@ class Reweighting(Method):
     """Gradient method: differentiable trajectory reweighting, for averages over a canonical ensemble.
 
     The derivative is the explicit derivative of the loss (see `BoundaryTerm`) minus cov(loss, dU/dp) / kT,
-    where U is the energy and p the parameter; the second term describes how the weights of the frames change.
+    where U is the energy and p the parameter. The second term describes how the weights of the frames change.
 
     Error: the error is statistical; `details` contains a standard error from block averages. The standard
     error is large for few independent frames, and it covers only fluctuations within one run. Source: Thaler

@@ -46,8 +46,8 @@ FORMATS = ("dense", "sparse", "ordered-sparse")
 class PrecisionChoice(Choice):
     """Another floating-point format for one or several roles, such as for the forces.
 
-    In molecular dynamics, 16-bit floats are allowed only for pair forces: in any other role, 16-bit floats
-    would change the model, not only the rounding (`mdnum.numerics.roles.check_role` gives the reason).
+    In molecular dynamics, 16-bit floats are allowed only for pair forces. In any other role, 16-bit floats
+    would change the model, not only the rounding (see `mdnum.numerics.roles.check_role`).
     """
 
     screened: ClassVar = {
