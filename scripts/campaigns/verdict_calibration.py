@@ -267,43 +267,23 @@ def below(false: int, of: int) -> float:
 
 
 def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]]) -> str:
-    """What was aimed at, for which rows it is shown, and how often the word is undecided."""
-
-    def named(kept: list[tuple[str, str, int, int]], bounds: bool) -> str:
-        words: dict[str, list[str]] = {}
-        for name, word, no, of in kept:
-            bound = f" ({no} of {of}, below {100 * below(no, of):.2f} %)" * bounds
-            words.setdefault(name, []).append(f"{word}{bound}")
-        return "; ".join(f"{name}: {', '.join(told)}" for name, told in words.items())
-
-    shown = [one for one in wrong if below(*one[2:]) < TARGET]
-    short = [one for one in wrong if one not in shown]
-    fewer = min(of for *_, of in wrong)
-    most = max(of for *_, of in wrong)
-    open_ = "; ".join(
-        f"{name}: {row[WORDS.index('undecided')]} of {of}"
-        for name, of, *row in rows
-        if row[WORDS.index("undecided")]
-    )
-    target = f"{100 * TARGET:.0f} %"
-    met = f"With 95 % confidence, the target is met for {'' if short else 'all rows: '}{named(shown, False)}."
+    """What was aimed at, for how many kinds it is shown, and how often the word is undecided."""
+    shown = sum(below(*one[2:]) < TARGET for one in wrong)
+    fewer, most = min(of for *_, of in wrong), max(of for *_, of in wrong)
+    column, target = WORDS.index("undecided"), f"{100 * TARGET:.0f} %"
+    open_ = [(name, row[column], of) for name, of, *row in rows if row[column]]
     sentences = (
         f"The target is that each kind of false verdict occurs for fewer than {target} of the starting "
-        "states.",
-        *([met] if shown else []),
-        *(
-            [
-                "The results do not yet show with 95 % confidence that the target is met for the following "
-                f"rows and verdicts (number of false verdicts, upper bound): {named(short, True)}."
-            ]
-            if short
-            else []
-        ),
-        f"Each row has {fewer} to {most} starting states (see the tables); with fewer starting states, the "
-        f"upper bound is larger. The verdict was undecided for these starting states: {open_ or 'none'}; in "
-        "the other rows the verdict was never undecided.",
+        "states. The target is met with 95 % confidence if the upper bound of the rate of false verdicts is "
+        f'below {target}. The upper bounds are listed in the column "below" of a table further below. '
+        f"{shown or 'None'} of the {len(wrong)} upper bounds {'are' if shown > 1 else 'is'} below {target}. "
+        f"Each upper bound is based on {fewer} to {most} starting states. With more starting states, the "
+        "upper bounds would be smaller.",
+        'The verdict is "undecided" for some starting states. The following table gives the number of these '
+        "starting states. In systems that are not listed, the verdict was never undecided.",
     )
-    return "\n\n".join(fill_text(one, 118, break_on_hyphens=False) for one in sentences)
+    told = [fill_text(one, 118, break_on_hyphens=False) for one in sentences]
+    return "\n\n".join([*told, markdown(("system", "undecided", "starting states"), open_)])
 
 
 def tables(store: Path, seeds: int) -> tuple[str, str]:
