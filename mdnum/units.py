@@ -22,8 +22,8 @@ _BOLTZMANN_EV_PER_K = 8.617330337217213e-05
 class Units:
     """Unit labels and conversion factors of a unit system.
 
-    Internally, lengths, energies and masses are in the units of the system file, and times are in units of
-    length * sqrt(mass / energy), so that acceleration = force / mass without a conversion factor.
+    Internally, lengths, energies and masses have the units of the system file. The unit of time is length *
+    sqrt(mass / energy), so that acceleration = force / mass without a conversion factor.
 
     Attributes:
         time_factor: user time * time_factor = internal time.

@@ -115,7 +115,7 @@ def moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any
 
 @intrinsic
 def kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: Any, at: Any) -> Any:
-    """Append those of eight labels whose mask is true to an array; return the next free position."""
+    """Append to an array those of eight labels for which the mask is true; return the next free position."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits, to = (_Vectors(context, builder, one.dtype, EIGHT) for one in (mask, labels))
@@ -172,7 +172,7 @@ def turned(typingctx: Any, rows: Any, place: Any, apart: Any, out: Any, at: Any,
 
 @intrinsic
 def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: Any) -> Any:
-    """Return a bit mask of the atoms in a shifted cluster within a squared distance `reach` of a box.
+    """Return a bit mask of the atoms in a shifted cluster that are near a box (squared distance <= `reach`).
 
     The shifted coordinates are written to `out`.
     """
@@ -193,7 +193,7 @@ def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: 
 
 @intrinsic
 def near_atom(typingctx: Any, atom: Any, atoms: Any, low: Any, high: Any) -> Any:
-    """Return bit masks of the atoms in a cluster within the squared distances `low` and `high` of an atom."""
+    """Return two bit masks of a cluster's atoms: squared distance from an atom below `low`, and `high`."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         atom, atoms, low, high = args

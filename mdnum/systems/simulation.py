@@ -143,7 +143,7 @@ class Simulation:
 
     @property
     def pairwise(self) -> bool:
-        """True if the potential is a pair potential or a sum of pair potentials, which have faster code."""
+        """True if the potential is a pair potential or a sum of pair potentials."""
         return isinstance(self.model, CutPotential | Channels)
 
     @property
@@ -168,12 +168,12 @@ class Simulation:
 
     @property
     def r_cut(self) -> float:
-        """Longest interaction radius, length."""
+        """Longest interaction radius, in length units."""
         return max(self.decider.r_cut)
 
     @cached_property
     def force(self) -> PairForce | ManyBodyForce:
-        """Function for use inside jit that computes forces and cutoff decisions for a neighbor list."""
+        """Function that computes forces and cutoff decisions from a neighbor list; callable inside jit."""
         # kept for later calls, so it must hold no tracer even where its first use is inside a jit
         with jax.ensure_compile_time_eval():
             parts = (self.model, self.cell, self.decider, self.policy, self.reduction)
@@ -197,7 +197,7 @@ class Simulation:
 
     @property
     def smooth(self) -> Simulation:
-        """The same system with a floating-point state, because integers have no derivatives."""
+        """The same system with a floating-point state, which can be differentiated."""
         return self if self.fixed_point is None else replace(self, fixed_point=None)
 
     @property
@@ -215,7 +215,7 @@ class Simulation:
         describe.write(self, Path(folder))
 
     def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-        """Return the unwrapped positions and the velocities of step 0, rounded as in the state."""
+        """Return the unwrapped positions and the velocities of step 0, in the precision of the state."""
         if self.fixed_point is None:
             return self.positions, self.velocities
         scheme, masses = self.propagator, jnp.asarray(self.masses)
@@ -235,7 +235,7 @@ class Simulation:
         return len(self.decider.r_cut) // self.channels
 
     def type_of(self, i, j) -> Int[np.ndarray, "..."]:
-        """Return an index of a pair's cutoff radius, which depends on both species and the group of terms.
+        """Return the index of each pair's cutoff radius; radii differ by species and by group of terms.
 
         Args:
             i: index of the first atom, plus the number of atoms times the index of the channel.
@@ -246,21 +246,21 @@ class Simulation:
         return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
 
     def first_atoms(self, i: Any) -> dict[str, Any]:
-        """Return the first atom of each cutoff decision, and the term if each term has its own decisions."""
+        """Return the first atom of each cutoff decision, and the potential term if decisions are per term."""
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """Return a table column with the term of each cutoff decision (none if all terms share decisions)."""
+        """Return a table column with the potential term of each decision; no column if terms share them."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])
         return {"terms": names[kind // self.pair_types]}
 
     def pair_of(self, i: int, j: int) -> dict[str, Any]:
-        """Return a table row with both atoms of a pair, and the term if each term has its own decisions."""
+        """Return a table row with both atoms of a pair, and the potential term if decisions are per term."""
         return {key: np.asarray(one).item() for key, one in self.first_atoms(i).items()} | {"j": int(j)}
 
     def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
@@ -286,7 +286,7 @@ class Simulation:
         return np.stack([np.asarray(own[0]) if own else np.ones(self.atoms) for own in each])
 
     def jumps_of(self, i, j) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """Return the jumps of energy and radial force when pairs enter the cutoff; `type_of` explains i."""
+        """Return the jumps of energy and radial force when pairs enter the cutoff; for i, see `type_of`."""
         kind, weights = self.type_of(i, j), self._weights
         if weights is None:
             energy, force = (jump[kind] for jump in self.jumps())
@@ -308,7 +308,7 @@ class Simulation:
 
     @property
     def _guard(self) -> float:
-        """Allowance (a length) for rounding errors of displacements that are compared with the skin."""
+        """Length allowed for rounding errors when displacements are compared with the skin."""
         coarsest = max(unit_roundoff(self.policy.dtype(role)) for role in ("state", "decision"))
         return 16 * coarsest * float(np.linalg.norm(self.decider.reach.coordinate))
 
@@ -368,13 +368,13 @@ class Simulation:
 
     @property
     def continuous(self) -> Simulation:
-        """The system with unchanged forces, and with an energy that is continuous at the cutoff."""
+        """The same system with an energy that is continuous at the cutoff; the forces do not change."""
         if not self.pairwise or self.cutoff.smoothness >= 0:
             return self
         return self._ended(lambda end: end.continuous)
 
     def with_policy(self, policy: PrecisionPolicy = PrecisionPolicy()) -> Simulation:
-        """Return the system with a floating-point state and the dtypes of a policy (default: float64)."""
+        """Return the system with a floating-point state, in the precision of a policy (default: float64)."""
         decider = replace(self.decider, dtype=policy.decision, state=policy.state)
         return replace(self, policy=policy, decider=decider, fixed_point=None)
 

@@ -37,7 +37,7 @@ _SMALLEST_IN_SIGMA = 0.4
 
 @dataclass(frozen=True)
 class Draw:
-    """Settings by which the velocities of step 0 are drawn, if those of the structure are not used."""
+    """Settings for random velocities at step 0, used instead of the structure's velocities."""
 
     temperature: float  # Maxwell-Boltzmann's, and a thermostat's, in the unit of the simulation
     seed: int = 0  # of the draw and of a thermostat's noise
@@ -271,12 +271,12 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
 
 
 def repeats(cell: Cell, r_list: float) -> str:
-    """Return the number of repeats of the box along a, b and c that the minimum-image convention requires."""
+    """Return how often the box must be repeated along a, b and c for the minimum-image convention."""
     return " x ".join(str(max(1, math.ceil(2 * r_list / width))) for width in cell.widths)
 
 
 def smallest_distance(kind: str, units: str, sigmas: Sequence[float] = ()) -> float:
-    """Return the distance (a length) below which two atoms with this potential are considered an error."""
+    """Return the smallest distance that two atoms with this potential may have, in length units."""
     if kind == "soft-sphere":
         # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
         return 1e-9
@@ -336,7 +336,7 @@ def nearest_distance(atoms: Atoms, within: float) -> float:
 def with_images(
     atoms: Atoms, reach: float
 ) -> tuple[Float64[np.ndarray, "places 3"], Int64[np.ndarray, " places"]]:
-    """Return positions of all atoms and of their images near the box, and the atom of each position."""
+    """Return the positions of all atoms and of nearby images, and the atom index of each position."""
     from mdnum.md.cell import complete
 
     cell = complete(atoms.cell.array, atoms.pbc)

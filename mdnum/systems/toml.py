@@ -124,7 +124,7 @@ def _dotted_prefix(text: str) -> tuple[Key, int]:
 
 
 def line_of(text: str, key: Key) -> int | None:
-    """Return the line (from 1) that sets a key or starts its table, or None if there is no such line."""
+    """Return the number of the line that sets a key or starts its table; None if there is no such line."""
     best: tuple[int, int] | None = None
     table: Key = ()
     for number, line in enumerate(text.splitlines(), start=1):
@@ -275,7 +275,7 @@ def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
 
 
 def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
-    """Return possible pydantic models of the table at a key, best first; empty if the key has no table."""
+    """Return the pydantic models that fit the table at a key, best first; none if the key has no table."""
     found, table = [root], data
     for part in key:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}
@@ -310,7 +310,7 @@ def _chosen(options: Sequence[type[TomlTable]], table: Any) -> type[TomlTable] |
 
 
 def _tag_of(options: Sequence[type[TomlTable]]) -> str | None:
-    """Return the key that distinguishes the models of a union ("kind" or "rule"), or None without one."""
+    """Return the key ("kind" or "rule") that distinguishes the models of a union, or None."""
     keys = {name for model in options for name in model.model_fields}
     return next((name for name in ("kind", "rule") if name in keys), None)
 

@@ -1,6 +1,6 @@
 """Trial calls of a user's energy function at one configuration, with equivalent neighbor lists.
 
-One compiled function computes energy and derivatives; another only computes the energy for a list with more
+One compiled function computes energy and derivatives. Another computes only the energy, for a list with more
 padding. The functions are compiled with few optimizations, because only a few dozen calls are needed.
 """
 
@@ -93,7 +93,7 @@ class Trial:
 
     @property
     def call(self) -> Call:
-        """The energy function with the calling convention that was found so far."""
+        """The energy function, with its calling convention as far as it is known."""
         return self.model.call
 
     def learn(self, **found: Any) -> None:
@@ -172,7 +172,7 @@ class Trial:
         raise self.error("NOT_CALLABLE", error=failed, tried=", ".join(formats))
 
     def _returned(self) -> str:
-        """Return the form in which the energy function returns energies, as named in `Convention.returns`."""
+        """Return what the energy function returns: one of the values of `Convention.returns`."""
         shape = jax.tree.map(lambda one: one.shape, jax.eval_shape(self.bare, *self.arguments()))
         one = ((), (1,))
         if isinstance(shape, Mapping):

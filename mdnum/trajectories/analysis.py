@@ -2,8 +2,8 @@
 
 Frames may be distributed over processes. A flip is found by comparing two successive frames, so each process
 also reads the frame before its first frame. No flip is lost at a process boundary, and the results are
-bitwise identical to those of a single process. If two processes find different pairs at a shared frame, an
-error is raised.
+bitwise identical to those of a single process. If two processes find different pairs at the frame that both
+read, an error is raised.
 """
 
 from __future__ import annotations
@@ -322,7 +322,7 @@ class NeighborFlips(AnalysisBase):
         self.results.digests[0].append(self._digest)
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
-        """Return the error bound of a distance, and the flips of each rule, for a timestep of MDAnalysis."""
+        """Return the error bound of a distance at an MDAnalysis timestep, and the flips of each rule."""
         frame = self._check(self.library.frame(ts, int(ts.frame)))
         self._digest = digest(frame)
         bound = self._bound_of(frame) if self._bound is None else self._bound

@@ -154,7 +154,7 @@ class ArrayFrames(Trajectory):
 
     @classmethod
     def of(cls, frames: Any, reach: float, velocities: Any = None, **options: Any) -> ArrayFrames:
-        """Build a trajectory from an array of frames or a list of ASE Atoms; `reach`: the longest cutoff."""
+        """Make a trajectory from an array of frames or a list of ASE Atoms; `reach` is the longest cutoff."""
         given = {name: options.pop(name) for name in ("cell", "box") if name in options}
         found, given["velocities"] = cls("array", **options), velocities
         found.reach = reach

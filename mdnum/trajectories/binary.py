@@ -2,8 +2,8 @@
 
 On damaged data, the library that decodes xtc files divides by zero or writes outside its buffers; the process
 then crashes, and all earlier results are lost. Each frame of a file is checked before it is decoded. The
-compressed stream contains the number of bits of each atom's coordinates, so that the header, the number of
-atoms, the bit counts and the length can be verified without decoding. File damage that leaves a valid stream
+compressed stream contains the number of bits of each atom's coordinates. The header, the number of atoms, the
+bit counts and the length can therefore be verified without decoding. File damage that leaves a valid stream
 is not detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
 
 MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. MDAnalysis writes the index
@@ -189,9 +189,9 @@ class XtcFile(XdrFile):
 def _walk(stream, atoms, whole, small):
     """Return the number of bits of the coordinates of `atoms` atoms, or -8 if the stream is invalid.
 
-    Each full set of coordinates of an atom occupies `whole` bits, followed by a flag bit. If the flag is set,
-    the next five bits give the number of atoms that follow as differences of `small` bits, and the change of
-    `small`.
+    The full coordinates of an atom occupy `whole` bits. A flag bit follows. If the flag is set, the next five
+    bits give two numbers: how many of the next atoms are stored as differences of `small` bits, and the
+    change of `small`.
     """
     at, done, run = 0, 0, 0
     most = 8 * stream.shape[0]

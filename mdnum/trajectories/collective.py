@@ -93,8 +93,8 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
     """Describe the plane, line or point into which all atoms have collapsed; None without a collapse.
 
     Rippled sheets may become flat, and bent chains may become straight, in a correct file. A collapse is
-    reported only if the earlier spread across the sheet or chain was larger than the distance between
-    neighboring atoms. For a constant coordinate, a fifth of the largest spread also suffices.
+    reported only if the earlier spread across the sheet or chain exceeded the distance between neighboring
+    atoms. If a coordinate is constant, a spread above a fifth of the largest spread also suffices.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):
@@ -107,7 +107,7 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
 
 
 def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
-    """Return (fraction of the atoms with the most frequent coordinate value, axis of the coordinate, value).
+    """Return (largest fraction of atoms with the same coordinate, axis of this coordinate, its value).
 
     The fraction of the second most frequent value is subtracted, as crystals have many equal coordinates.
     """
@@ -122,7 +122,7 @@ def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
 
 
 def _shift(before: np.ndarray, now: np.ndarray, far: float) -> float:
-    """Return the length of a displacement common to all atoms; 0 if small, or if displacements differ."""
+    """Return the length of a displacement common to all atoms; 0 if it is small or atoms move differently."""
     moved = now - before
     if len(now) < 2 or not far or np.abs(moved).max() <= far / (2 * _SUDDEN):
         return 0.0

@@ -4,7 +4,7 @@ DCD files do not record the convention of the box. The six numbers are lengths a
 (NAMD, VMD, LAMMPS, MDAnalysis since 2.10), lengths and angles in degrees (CHARMM before version 22, OpenMM,
 MDAnalysis before 2.10), or a symmetric matrix of lattice vectors (CHARMM since 22). With a wrong box, atoms
 overlap across the boundary, and atoms that are wrapped between frames seem to leap. If several conventions
-avoid overlaps and leaps, the version number in the header decides: all programs except CHARMM write 24.
+fit the positions, the version number in the header decides. All programs except CHARMM write version 24.
 """
 
 from __future__ import annotations

@@ -71,8 +71,8 @@ def _usable(
 ) -> Iterator[tuple[list[Frame], Any]]:
     """Yield (next frame of each file, result of `step`) until a file ends or a frame is unusable.
 
-    All membership rules process a frame before any results are stored, so that a frame rejected by one rule
-    does not enter the ledger of another rule.
+    All membership rules process a frame before any results are stored. If one rule rejects a frame, no rule
+    stores results of this frame.
 
     Raises:
         InputError: the first frame cannot be read or used, so there are no results to keep.
@@ -162,7 +162,7 @@ class Pass:
 
     @property
     def odd(self) -> dict[str, Any] | None:
-        """Inconsistency between displacements, velocities and times, or None; see `separation.odd_flight`."""
+        """Contradiction between displacements, velocities and times; None if there is none."""
         return odd_flight(self.flights)
 
 
@@ -170,11 +170,11 @@ def follow(
     trajectory: Trajectory, rules: Sequence[Rule], groups: Groups, resolution: Resolution, sink: Sink,
     residues: ByResidue | None = None,
 ) -> Iterator[Pass]:  # fmt: skip
-    """Read frames once; pass rows of the tables "members", "flips", "frames" and "motion" to `sink`.
+    """Read each frame once, and pass rows of the tables "members", "flips", "frames", "motion" to `sink`.
 
-    If `residues` is given, each pair consists of two residues, but the groups still contain atoms. The same
-    `Pass` is yielded after each frame, and iteration may stop at any frame. Memory use does not grow with the
-    number of frames. Reading ends at the first unreadable or unusable frame; earlier results are kept.
+    If `residues` is given, pairs of residues are examined; `groups` still contains atoms. The same `Pass` is
+    yielded after each frame, and iteration may stop at any frame. Memory use does not grow with the number of
+    frames. Reading ends at the first unreadable or unusable frame; earlier results are kept.
 
     Raises:
         InputError: the first frame cannot be read or used, so there are no results to keep.
@@ -251,7 +251,7 @@ def _hand_on(
 
 
 def _threshold(rule: Rule, members: Members) -> tuple[float, bool]:
-    """Return a typical threshold distance, and True if neighbors are defined by the order of distances."""
+    """Return a typical threshold distance, and True if most atoms have the largest number of neighbors."""
     if isinstance(rule, CutoffRule | SpeciesCutoffs):
         return rule.reach, False
     if not len(members):
@@ -320,7 +320,7 @@ class SetDifference:
 
 
 def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[np.ndarray, "pairs"]:
-    """Return distances (lengths) of pairs (i, j, rank of periodic image); inf if there is no such image."""
+    """Return the distances of pairs (i, j, rank of periodic image); inf if there is no such image."""
     i, j, rank = np.array(pairs, np.int64).reshape(-1, 3).T
     at = Placed(np.ascontiguousarray(frame.positions), lattice_of(frame.box), 0.0)
     return image_distances(at, np.minimum(i, j), np.maximum(i, j), rank, directed)
@@ -347,7 +347,7 @@ class ComparedSide:
         return self.tracker.step(frame, bound=self.bound)
 
     def position_bound(self, periods: int) -> float:
-        """Return the error bound (a length) of a position, for distances that span `periods` box periods."""
+        """Return the error bound of a position, for distances across up to `periods` periods of the box."""
         # a distance has two atoms that are off
         return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
 
@@ -387,7 +387,7 @@ def differing_rows(
 def _thresholds(
     i: np.ndarray, j: np.ndarray, inside: np.ndarray, rule: Rule, side: ComparedSide
 ) -> Float[np.ndarray, "pairs"]:
-    """Return the threshold distance (length) of each pair, which for nearest neighbors depends on atom i."""
+    """Return each pair's threshold distance; for nearest-neighbor rules, the threshold depends on i."""
     if isinstance(rule, CutoffRule):
         return np.full(len(i), rule.radius)
     if isinstance(rule, SpeciesCutoffs):
@@ -486,7 +486,7 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 def _apart(
     found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
 ) -> tuple[Separation, float]:
-    """Return the separation of two frames without a common shift, and its bound from file resolution.
+    """Return the separation of two frames (without a common shift), and its error bound.
 
     A shift common to all atoms is removed only if it explains nearly all of the separation. A shift can
     result from different origins of two files, or from removal of center-of-mass motion in one file.
@@ -518,7 +518,7 @@ def _sets_at(
     now: Separation,
     before: Separation,
 ) -> None:
-    """Record how two files' neighbor sets differ at a frame; write the pairs that began to differ there."""
+    """Record the difference of two neighbor sets at a frame, and write the pairs that began to differ."""
     difference, first = one.difference, False
     if one.certain is None and len(difference):
         # all that differ: one that came to differ within the resolution may be beyond it by now

@@ -200,7 +200,7 @@ def far_out(
     bits: int = 64,
     before: Float[np.ndarray, "some 3"] | None = None,
 ) -> tuple[int, int, str] | None:
-    """Return the atom farthest from the others if it is impossibly far away; for arguments, see `FrameCheck`.
+    """Return the atom farthest from the others if it is impossibly far away (arguments as in `FrameCheck`).
 
     The system size is also estimated from the previous frame, since the current frame may be damaged.
 

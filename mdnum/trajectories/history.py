@@ -1,4 +1,4 @@
-"""Flips and contacts of every pair over the frames, and flips that remain if only every nth frame is used.
+"""Flips and contacts of each pair in a trajectory, and counts of the flips found with every nth frame.
 
 From the flips found with every nth frame, the module `lost` estimates the flips missed between frames.
 """
@@ -95,7 +95,7 @@ class History:
 
 
 def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return indices that sort rows stably by all columns, and a mask of the first of several equal rows."""
+    """Return the indices that sort rows by all columns, and a mask of the first of each set of equal rows."""
     if not len(columns[0]):
         return np.zeros(0, np.int64), np.zeros(0, bool)
     sizes = [int(column.max()) + 1 for column in columns]
@@ -116,7 +116,7 @@ class Contacts(Columns):
     """Contacts (periods in which a pair is inside the cutoff), sorted by (i, j, image rank, first frame).
 
     During a contact, the pair is inside the cutoff at the frames `begin`, ..., `end - 1`. A contact begins
-    between the frames `begin - 1` and `begin`. A break between two successive frames is not detected.
+    between the frames `begin - 1` and `begin`. A break that ends before the next frame is not detected.
     """
 
     i: Int[np.ndarray, "stays"]  # the pair; see `ledger.Members`
@@ -213,9 +213,9 @@ def doublings(frames: int) -> list[int]:
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:
     """Count the pair decisions that change if all atoms move in straight lines for a short time.
 
-    The root mean square displacement of the atoms is `move`. Choose a length shorter than the distance over
-    which atomic paths bend, but long enough for many pairs to cross the cutoff. `count` returns the number of
-    flips between two frames.
+    The root mean square displacement of the atoms is `move`. Choose `move` shorter than the distance over
+    which paths bend, but long enough for many pairs to cross the cutoff. `count` returns the number of flips
+    between two frames.
 
     Returns:
         (number of flips, duration of the motion in the time unit of the velocities); None if no atom moves.

@@ -1,4 +1,4 @@
-"""Flips of pairs identified by (i, j, shift), for narrow boxes in which several images can be neighbors.
+"""Flips of each image (i, j, shift) of a pair, for narrow boxes in which several images can be neighbors.
 
 The ledger of flips identifies an image by its rank in distance, which does not change if atoms are wrapped.
 If one image of a pair leaves and another enters between two frames, the ledger contains no flip, but this
@@ -39,10 +39,10 @@ def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
 
 
 def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
-    """Return the lattice shift of the image of j with `rank` nearer images, which is at x[j] + shift @ box.
+    """Return the lattice shift of an image of j, which is at x[j] + shift @ box; `rank` images are nearer.
 
-    ASE, vesin and jax-md define shifts in the same way. Of the two opposite images of an atom itself, the
-    shift with a positive first nonzero component is returned.
+    ASE, vesin and jax-md define shifts in the same way. For images of an atom itself, the returned shift has
+    a positive first nonzero component.
 
     Args:
         pairs: object with arrays i, j, rank and distance, such as `Members`.

@@ -118,7 +118,7 @@ def shortest(
 
 
 def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
-    """Return ascending squared lengths of lattice vectors up to `radius`; opposite vectors count once."""
+    """Return squared lengths of lattice vectors up to `radius`, ascending; opposite vectors count once."""
     if not lattice.periodic.any() or radius < lattice.narrowest * (1 - 1e-9):
         return np.zeros(0)
     vectors, most = lattice.vectors, np.where(lattice.periodic, radius / lattice.widths + 1, 0).astype(int)
@@ -145,11 +145,11 @@ def square_of(x, i, j, s0, s1, s2, vectors):
 
 @njit(inline="never")
 def near_squares(x, i, j, lattice, y, squares):
-    """Compute squared pair distances by rounding of fractional coordinates; `y`: scratch of shape (3, block).
+    """Compute squared pair distances by rounding fractional coordinates; `y` is a work array (3, block).
 
-    The loop has no branches: a zero shift changes no squared distance, and lattice vectors along nonperiodic
-    directions are zero. Coordinates are gathered first, so that all other operations are vector instructions.
-    The lattice vectors are loaded only once.
+    The loop needs no branches, because zero shifts leave squared distances unchanged and lattice vectors are
+    zero along nonperiodic directions. Coordinates are gathered first, so that all other operations are vector
+    instructions. The lattice vectors are loaded only once.
     """
     vectors, inverse = lattice.vectors, lattice.inverse
     y0, y1, y2 = y[0], y[1], y[2]
@@ -175,9 +175,9 @@ def near_squares(x, i, j, lattice, y, squares):
 
 @njit
 def image_square(x, i, j, rank, lattice):
-    """Return the squared distance from i to the image of j with `rank` nearer images; inf if there is none.
+    """Return the squared distance from i to an image of j; `rank` is the number of nearer images of j.
 
-    Indices satisfy i < j, or i == j for images of an atom itself; of two opposite images, one is counted.
+    Either i < j, or i == j (opposite images count once). If there is no such image, the result is inf.
     """
     vectors, periodic, widths = lattice.vectors, lattice.periodic, lattice.widths
     # the image that rounding names; nearest where that is near enough
@@ -277,7 +277,7 @@ class SearchLimits(NamedTuple):
 
     @classmethod
     def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> SearchLimits:
-        """Return the lower and upper squared distance of a band of half width `band` around each radius."""
+        """Return limits of squared distances: each cutoff radius minus `band`, and plus `band`, squared."""
         low = np.where(radii >= 0, np.maximum(radii - band, 0.0) ** 2, np.inf)
         high = np.where(radii >= 0, (radii + band) ** 2, -1.0)
         return cls(kind, low, high, float((radii.max(initial=0.0) + band) ** 2))
@@ -436,7 +436,7 @@ def lattice_vector(code):
 
 @njit
 def _run(d0, d1, d2, b0, b1, b2, bins, last):
-    """Return contiguous bins at offset d from bin b: lattice vector, first bin, last bin, and next d2."""
+    """Return a run of contiguous bins at offset d from bin b: lattice vector, first and last bin, next d2."""
     n0, n1, n2 = (b0 + d0) // bins[0], (b1 + d1) // bins[1], (b2 + d2) // bins[2]
     c0, c1, low = b0 + d0 - n0 * bins[0], b1 + d1 - n1 * bins[1], b2 + d2 - n2 * bins[2]
     high = min(bins[2] - 1, low + last - d2)
@@ -446,7 +446,7 @@ def _run(d0, d1, d2, b0, b1, b2, bins, last):
 
 @njit
 def _most_around(bins, reach, start):
-    """Return upper limits for the atoms, and for the runs of contiguous bins, within reach of one bin."""
+    """Return upper limits of the number of atoms, and of runs of contiguous bins, within reach of one bin."""
     atoms, runs = 0, 0
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):

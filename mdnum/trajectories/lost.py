@@ -1,9 +1,9 @@
 """Estimate of the number of flips missed because a pair crosses its threshold and returns between frames.
 
-Missed flips are defined relative to the flips found if every time step of the run is examined. The four
-estimates (thinning, persistence, velocities and flux), the test systems used to choose the constants, and the
-measured coverage are described in docs/lost-flips.md. The estimates by thinning and persistence are
-extrapolated to shorter frame intervals t by laws for the rate of observed flips, (1 + (t/τ)^p)^(-s/p). The
+Missed flips are flips that would be found if every time step of the run were examined. The four estimates
+(thinning, persistence, velocities and flux), the test systems used to choose the constants, and the measured
+coverage are described in docs/lost-flips.md. The estimates by thinning and persistence are extrapolated to
+shorter frame intervals t. The assumed laws for the rate of observed flips are (1 + (t/τ)^p)^(-s/p). The
 exponent p is 2 for smooth atomic motion and 1 for abrupt velocity changes; s is 1/2 for diffusive motion and
 1 for atoms that stay at their sites. The result is the mean over all laws that fit the data.
 """
@@ -171,7 +171,7 @@ def _of_thinning(found: Strides) -> Estimate:
 
 
 def _carried_on(taken: Float[np.ndarray, "doublings"], error: Float[np.ndarray, "doublings"]) -> Estimate:
-    """Estimate the fraction of flips missed if every frame is used, from laws that fit larger strides."""
+    """Estimate the fraction of missed flips at stride 1 from the flips found at larger strides."""
     misfit = sum(((law - one) / off) ** 2 for law, one, off in zip(_TAKEN, taken, error, strict=False))
     weight = np.exp(np.min(misfit) / 2 - misfit / 2 - _RARE)
     mean = float(np.average(_LOST, weights=weight))

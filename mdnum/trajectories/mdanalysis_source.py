@@ -99,7 +99,7 @@ class LibraryFrames:
             return ts
 
     def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
-        """Return a `Frame` with copies of the data in a timestep; raise the same errors as `timestep`."""
+        """Return a `Frame` with copies of a timestep's data; errors are raised as in `timestep`."""
         with self._reading(number):
             time, x = float(number) if untimed else float(ts.time), np.array(ts.positions, np.float64)
             velocities = np.array(ts.velocities, np.float64) if ts.has_velocities else None
@@ -213,7 +213,7 @@ class MDAnalysisTrajectory(Trajectory):
 
 
 def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
-    """Return a function that reads atom labels of any frame; MDAnalysis reads those of the first frame.
+    """Return a function that reads the atom labels of any frame, not only of the first as MDAnalysis does.
 
     The function returns None unless the file is an XYZ file or a PDB file with several models.
     """
@@ -252,7 +252,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factors(trajectory: Any) -> tuple[float, float]:
-    """Return two ratios of DCD time steps: the file's to MDAnalysis's, and the byte-swapped to the file's."""
+    """Return (time step in a DCD file / MDAnalysis's value, byte-swapped time step / time step)."""
     read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
     if not read:
         return 1.0, math.nan
@@ -320,7 +320,7 @@ def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
 
 
 def _behind_text(file: Any) -> str | None:
-    """Describe lines after the last frame of a text file, except blank lines at the end; None if none."""
+    """Describe lines after a text file's last frame, except trailing blank lines; None if there are none."""
     if file is None or file.closed:
         return None
     lines = 0

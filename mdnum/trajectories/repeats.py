@@ -1,8 +1,8 @@
 """Detection of frames that repeat the data or the times of earlier frames, for example after a restart.
 
 A run continued from a checkpoint writes some frames again, and concatenated files may share frames. A stopped
-simulation or rejected Monte Carlo move repeats the previous frame, at the same or a later time. If a restart
-rounds differently, times repeat but data differ; of frames with equal times, the first is kept.
+simulation or rejected Monte Carlo move repeats the previous frame, at the same or a later time. After a
+restart with different rounding, times repeat but data differ. The first frame with each time is kept.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class RepeatedFrames:
         return digested if before == mine else known
 
     def had(self, number: int, time: float) -> bool:
-        """Return True if an earlier frame has the latest frame's time and some frame has another time."""
+        """Return True if an earlier frame has the latest frame's time, unless all frames share one time."""
         of = self._times.setdefault(f"{time:.12g}", number)
         if of == number or len(self._times) < 2:
             return False
@@ -113,6 +113,6 @@ class RepeatedFrames:
         return back > 0
 
     def plain(self, most: int = 100) -> dict[str, Any]:
-        """Return the record of repeats as plain Python values, with at most `most` ranges of each kind."""
+        """Return the record of repeats as plain Python values; lists of ranges have up to `most` entries."""
         sizes = {"frames": self.frames, "stretches": len(self.stretches), "to_the_end": self._back > 0}
         return sizes | {"dropped": self.drop, "ranges": self.stretches[:most], "again": self.again[:most]}

@@ -104,8 +104,8 @@ def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarr
 class ResidueTracker:
     """Tracker of contacts between residues, with the same interface as `Tracker` for pairs of atoms.
 
-    Pairs of atoms within one residue are ignored. `near` counts atom pairs: at least one per residue pair
-    whose distance equals the cutoff within error. The attribute `min_margin` is always inf.
+    Pairs of atoms within one residue are ignored. `near` counts atom pairs whose distance equals the cutoff
+    within error: at least one for each such residue pair. The attribute `min_margin` is always inf.
 
     Args:
         rule: membership rule for atoms.
@@ -182,7 +182,7 @@ class ResidueTracker:
         return Members(i, j, np.zeros_like(i), self._closest(self._last, i, j)[0])
 
     def _closest(self, frame: Frame, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distance and threshold of the atom pair with the largest margin, for each residue pair."""
+        """For each residue pair, return distance and threshold of the atom pair with the largest margin."""
         placed, found = self._placed(frame), np.full((2, len(i)), np.inf)
         for begin in range(0, len(i), _TOGETHER):
             part = slice(begin, begin + _TOGETHER)
@@ -252,7 +252,7 @@ class ResidueNames(Columns):
 def contacts_over_time(
     stays: Contacts, residues: int, frames: int
 ) -> tuple[Int[np.ndarray, "moments"], Float[np.ndarray, "residues moments"]]:
-    """Return first frames of up to `MOMENTS` intervals, and each residue's mean contacts per interval."""
+    """Return first frames of intervals (at most `MOMENTS`), and each residue's mean number of contacts."""
     edges = np.unique(np.linspace(0, frames, min(frames, MOMENTS) + 1).astype(np.int64))
     found = np.zeros((residues, len(edges) - 1))
     for k, (low, high) in enumerate(pairwise(edges)):

@@ -8,8 +8,8 @@ needed.
 Rounding of coordinates can move a cutoff crossing to another frame, hide a short contact, or create a
 crossing of a pair near the cutoff. The affected flips cannot be identified from one file, but their number is
 estimated by `grid_effect`. Random pairs near the cutoff are moved by displacements found in the file; their
-flips are counted with and without rounding. If the nearest atoms are the neighbors, a flip exchanges two
-atoms at similar distances from a third, so random triples of atoms are moved.
+flips are counted with and without rounding. Among nearest neighbors, a flip exchanges two atoms at similar
+distances from a third atom. For such rules, random triples of atoms are moved.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Resolution:
         bound as a distance. A margin among nearest neighbors (a difference of two distances) has twice the
         bound. If `atoms` are given, the bound is valid for distances between the given atoms.
 
-        Error: valid for pairs across at most one period of the box; each further period adds the box error.
+        Error: the bound is valid within one period of the box; each further period adds the box error.
         """
         if atoms is not None or not np.isfinite(frame.furthest):
             x = frame.positions if atoms is None else frame.positions[atoms]
@@ -185,7 +185,7 @@ def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
 def decimal_grid(
     values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values"]
 ) -> tuple[float, int]:
-    """Find the decimal grid on which all values lie, each within its tolerance `slack`.
+    """Find the decimal grid on which all values lie within the tolerance `slack`.
 
     Returns:
         (the coarsest decimal step of which all values are multiples, 0); or (the step of the largest value,
@@ -233,7 +233,7 @@ def _fixed(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values
 
 
 def _chance(parts: Float[np.ndarray, "values"]) -> float:
-    """Return the log probability that random values all lie within the given fractions of a grid step."""
+    """Return the log probability that random values are as close to a grid as these fractions of a step."""
     return float(np.log(np.maximum(parts, 1e-300)).sum())
 
 
@@ -303,7 +303,7 @@ def grid_effect(
     before, after = _drawn(random, one, other, radius, steps, draws, ranked)
 
     def decided(places: Places) -> np.ndarray:
-        """True if a pair is inside the cutoff or, in a triple, atom 2 is nearer to atom 1 than atom 3 is."""
+        """True if a pair is inside the cutoff, or if atom 2 of a triple is nearer than atom 3 to atom 1."""
         squares = [((place - places[0]) ** 2).sum(axis=1) for place in places[1:]]
         return squares[0] < (squares[1] if ranked else radius**2)
 
@@ -370,9 +370,9 @@ def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]
 def unrounded(variance: float, size: float) -> float:
     """Return the variance that displacements had before positions were rounded to multiples of `size`.
 
-    If a displacement is n + f steps with integer n and 0 <= f < 1, rounding adds size² f (1 - f) to the mean
-    square over all starting points. For normally distributed displacements of variance v, the mean of size² f
-    (1 - f) is, by a Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
+    For a displacement of n + f steps (integer n, 0 <= f < 1), rounding increases the mean square by size² f
+    (1 - f). For normally distributed displacements of variance v, the mean of size² f (1 - f) is, by a
+    Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
     """
     low, high, k = 0.0, variance, np.arange(1, 200)
     for _ in range(60):

@@ -58,7 +58,7 @@ class _Membership:
     def table(
         self, species: Sequence[str] | np.ndarray
     ) -> tuple[Int[np.ndarray, "atoms"], Float[np.ndarray, "species species"]]:
-        """Return the species number of each atom, and the radius of each pair of species or `NEVER`."""
+        """Return species numbers of atoms, and radii of species pairs (`NEVER` if never neighbors)."""
         return np.zeros(len(species), np.int64), np.array([[float(self.reach)]])
 
 
@@ -116,7 +116,7 @@ class SpeciesCutoffs(_Membership):
     def table(
         self, species: Sequence[str] | np.ndarray
     ) -> tuple[Int[np.ndarray, "atoms"], Float[np.ndarray, "species species"]]:
-        """Return the species number of each atom, and the radius of each pair of species or `NEVER`.
+        """Return species numbers of atoms, and radii of species pairs (`NEVER` if never neighbors).
 
         Raises:
             InputError: a species of the rule does not occur among the atoms.

@@ -117,9 +117,9 @@ def search(
 
 @njit(inline="always")
 def exact_square(x, home, i, j, n0, n1, n2, vectors):
-    """Return the squared distance that decides on a pair, given the image shift n of atom j after wrapping.
+    """Return the squared distance by which a pair is decided; n is the image shift of j after wrapping.
 
-    Exchanging the two atoms only changes the signs of all rounded numbers, so the result is bitwise the same.
+    The result is bitwise the same if the two atoms are exchanged: only signs of rounded numbers change.
     """
     s0, s1, s2 = n0 + home[i, 0] - home[j, 0], n1 + home[i, 1] - home[j, 1], n2 + home[i, 2] - home[j, 2]
     return square_of(x, i, j, s0, s1, s2, vectors)
@@ -127,10 +127,9 @@ def exact_square(x, home, i, j, n0, n1, n2, vectors):
 
 @njit
 def _settle(x, atoms, kind, square, radius, bound, found):
-    """Decide, from stored coordinates, the pairs left undecided; return the smallest |margin|.
+    """Decide the remaining pairs from stored coordinates; return the smallest |margin|.
 
-    In a directed search, the squared distances from wrapped coordinates in `found.value` are replaced by the
-    squared distances from stored coordinates.
+    In a directed search, the squared distances in `found.value` are recomputed from stored coordinates.
     """
     smallest, home, vectors, species = np.inf, atoms.home, atoms.lattice.vectors, atoms.species
     for k in range(found.counts[1]):
@@ -151,7 +150,7 @@ def _settle(x, atoms, kind, square, radius, bound, found):
 
 
 def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float) -> float:
-    """Return the number of pairs within `radius` at uniform density; 0 if the box is not fully periodic."""
+    """Estimate the number of pairs within `radius` from the density; 0 if the box is not fully periodic."""
     if not lattice.periodic.all():
         return 0.0
     images = (4.0 / 3.0 * np.pi * radius**3) / lattice.volume
@@ -254,7 +253,7 @@ def nearest(
 def _choose(
     rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
 ):  # fmt: skip
-    """Keep each row's nearest neighbors; return (number, number close, smallest |margin|, rows too short)."""
+    """Keep nearest neighbors; return (number kept, number uncertain, smallest |margin|, rows too short)."""
     written, close, smallest, short = 0, 0, np.inf, 0
     for i in range(rows.first.shape[0]):
         if not centers[i]:
@@ -350,7 +349,7 @@ def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
 
 @njit
 def _compared(old, new, made):
-    """Write the pairs whose decision differs, up to the capacity, and return the number of all such pairs."""
+    """Write pairs whose decision differs, as many as the buffer holds; return the number of all of them."""
     atoms = old.first.shape[0]
     seen = np.zeros((atoms, 2), np.int32)
     total, room = 0, made.i.shape[0]
@@ -380,9 +379,9 @@ def image_distances(
     rank: Int[np.ndarray, "pairs"],
     directed: bool = False,
 ) -> Float[np.ndarray, "pairs"]:
-    """Return distances (length) from i to the image of j with `rank` nearer images; inf if there is none.
+    """Return the distance from i to an image of j; `rank` is the number of nearer images of j.
 
-    If the membership rule is directed, opposite images of an atom are two different neighbors of this atom.
+    If there is no such image, the distance is inf. In a directed rule, opposite images are two neighbors.
     """
     out = np.empty(len(i))
     rank = np.where(i == j, rank // 2, rank) if directed else rank

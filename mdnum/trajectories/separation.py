@@ -43,7 +43,7 @@ class Separation:
 def displacements(
     start: Frame, end: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | float = 0.0
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """Return atomic displacements between two frames minus `shift`, and the lattice vectors removed."""
+    """Return displacements of atoms between two frames minus `shift`, and the lattice vectors removed."""
     x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
     shared = np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool)
     return shortest(y - x - shift, Box(end.box.matrix, shared))
@@ -68,7 +68,7 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
 def separation(
     one: Frame, other: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | None = None
 ) -> Separation:
-    """Return the largest and typical distance of atoms between two frames, minus a common shift."""
+    """Return the largest and the root mean square displacement between two frames, minus a common shift."""
     moved, whole = displacements(one, other, atoms, 0.0 if shift is None else shift)
     square = np.sum(moved**2, axis=1)
     at = int(np.argmax(square))
@@ -101,7 +101,7 @@ def velocities_of(frame: Frame) -> Frame:
 
 
 def velocities_differ(a: Frame, b: Frame, atoms: AtomIndices, bound: float) -> dict[str, Any] | None:
-    """Describe a difference between the velocities of two frames other than a common velocity of all atoms.
+    """Describe how the velocities of two frames differ, apart from a velocity common to all atoms.
 
     Args:
         bound: error bound of the difference of two velocities, in length per time.
@@ -132,10 +132,10 @@ class FreeFlight(NamedTuple):
 
 
 def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
-    """Compare displacements between two frames with velocities; None if there is no velocity or motion.
+    """Compare displacements between two frames with velocities; None without velocities or motion.
 
-    `moved` (measured over predicted displacement) is at most about 1, and less if atoms turn around. `factor`
-    (the same, by least squares) is about 1 if velocities have the right unit and keep their directions.
+    `moved` is measured over predicted displacement: about 1, or less if atoms turn around. `factor`, the
+    least-squares ratio, is about 1 if velocities have the right unit and keep their directions.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None

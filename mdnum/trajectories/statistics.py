@@ -2,13 +2,13 @@
 
 Three quantities describe the durations of contacts:
 
-- The **lifetime** is estimated from contacts whose beginning was observed, with contacts that continue after
-  the last frame as right-censored data (Kaplan and Meier, J. American Statistical Association 53, 457, 1958).
+- The **lifetime** is estimated from contacts whose beginning was observed. Contacts that continue after the
+  last frame are right-censored (Kaplan and Meier, J. American Statistical Association 53, 457, 1958).
 - The **mean by rate** is the total contact time divided by the number of departures. The mean by rate
 includes partly observed contacts, and equals the mean lifetime if pairs leave at a constant rate.
-- The **residence** is the fraction of the pairs in contact at a frame that stay in contact, without a break,
-  for a given lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more
-  often, so the residence differs from the lifetime.
+- The **residence** at a lag is the fraction of the pairs in contact at a frame that stay in contact during
+  the lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more often,
+  so the residence differs from the lifetime.
 
 Durations are numbers of frames. Counts for disjoint subsets of the pairs can be added.
 """
@@ -56,7 +56,7 @@ class Durations(Sums):
 
     @property
     def followed(self) -> Int[np.ndarray, "lengths"]:
-        """Contacts whose beginning was observed, by the number of frames during which they were observed."""
+        """Histogram of the observed durations of contacts whose beginning was observed, in frames."""
         # one that goes on after n frames was seen to survive n - 1 times
         return self.seen + np.append(self.goes_on[1:], 0)
 
@@ -85,7 +85,7 @@ class Survival:
     longest: int  # frames for which any was followed: nothing is known beyond
 
     def at(self, share: float) -> int | None:
-        """Return the duration exceeded by at most a fraction `share` of contacts (0.5: median), or None."""
+        """Return the shortest duration that at most a fraction `share` of contacts exceeds, or None."""
         below = np.flatnonzero(self.share <= share)
         return int(self.frames[below[0]]) if len(below) else None
 
@@ -114,7 +114,7 @@ def survival(found: Durations) -> Survival:
 
 
 def mean_by_rate(found: Durations) -> tuple[float, float]:
-    """Return total frames in contact per departure, and the standard error; inf if no pair ever left.
+    """Return the mean contact time per departure, in frames, and its standard error; inf if no pair left.
 
     The standard error is valid for independent departures; repeated crossings make the true error larger.
     """
@@ -127,8 +127,8 @@ def mean_by_rate(found: Durations) -> tuple[float, float]:
 def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
     """Return, by lag, the fraction of pairs in contact at a frame that stay in contact without a break.
 
-    Lags begin at 0. The fraction at a lag is averaged over all frames that have a later frame at this lag;
-    nan if no pair was inside. `pairs` is the number of pairs inside at each frame.
+    Lags begin at 0. Each fraction is an average over all possible first frames; nan if no pair was inside.
+    `pairs` is the number of pairs inside at each frame.
     """
     count, lags = found.all, np.arange(len(pairs))
     stays = np.cumsum(count[::-1])[::-1]
@@ -142,8 +142,8 @@ def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.nd
 def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
     """Count pairs that are inside at a frame and at a later frame, even if they are outside in between.
 
-    The ratio of the two returned arrays is like `residence`, but includes interrupted contacts. Counts for
-    disjoint subsets of the pairs can be added. Lags are between 0 and frames - 1.
+    The ratio of the two arrays is the residence (see `residence`) with interrupted contacts included. Counts
+    for disjoint subsets of the pairs can be added. Lags are between 0 and frames - 1.
 
     Returns:
         two arrays by lag, summed over frames: numbers of pairs inside at both frames, and at the first frame.
@@ -230,7 +230,7 @@ class ClassTally(Sums):
     def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> ClassTally:
         """Count flips and frames in contact by the classes of both atoms, over the given number of frames.
 
-        For a directed rule, i -> j and j -> i are counted separately; else, the lower class index is first.
+        For directed rules, i -> j and j -> i are separate. Otherwise, the lower class index comes first.
         """
         first, second = classes.of[stays.i], classes.of[stays.j]
         if not directed:
@@ -274,7 +274,7 @@ class Chatter(Sums):
 
     @classmethod
     def of(cls, history: History, window: int) -> Chatter:
-        """Count the flips that the same pair reverses within a window of frames."""
+        """Count the flips that are reversed by a later flip of the same pair within `window` frames."""
         pair = history.pair
         same = pair[1:] == pair[:-1]
         apart, from_inside = np.diff(history.frame)[same], history.entered[:-1][same]
@@ -327,7 +327,7 @@ class Busiest(Columns):
 
 @dataclass(frozen=True)
 class Residues(Sums):
-    """Numbers of flips of pairs between each group of atoms (such as a residue) and others, and within it."""
+    """Number of flips for each group of atoms (such as a residue): within the group, and with other atoms."""
 
     between: Int[np.ndarray, "groups"]
     within: Int[np.ndarray, "groups"]
@@ -347,7 +347,7 @@ class Residues(Sums):
 
 @dataclass(frozen=True)
 class AgainSums(Sums):
-    """Counts returned by the function `again`, summed over a sample of the contacts."""
+    """Counts of pairs in contact at two frames (see `again`), summed over a sample of the contacts."""
 
     both: Int[np.ndarray, "lags"]
     once: Int[np.ndarray, "lags"]
@@ -374,10 +374,10 @@ class Statistics(Sums):
     def of(
         cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
     ) -> tuple[Statistics, Contacts]:
-        """Add the statistics of some pairs to `before`; return the sum, and the contacts of these pairs.
+        """Add statistics of the pairs in `history` to `before`; return the sum and these pairs' contacts.
 
-        A flip reversed within `window` frames is counted as chatter. Intermittent contacts include absences
-        of up to `window` frames.
+        A flip reversed within `window` frames is counted as chatter. A contact with an absence of up to
+        `window` frames counts as one intermittent contact.
         """
         frames, stays = history.frames, contacts(history)
         named, residues = labels.residue_names, labels.residues

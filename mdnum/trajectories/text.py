@@ -184,7 +184,7 @@ def _is_cut(word: str, others: Sequence[str]) -> bool:
 
 
 def _digits(word: str) -> tuple[int, int, int] | None:
-    """Return (decimals, significant digits, digits of the exponent or -1) of a number; None for a word."""
+    """Count the decimals, significant digits and exponent digits (-1: none) of a number; None for a word."""
     match = _NUMBER.fullmatch(word)
     if match is None:
         return None
@@ -391,7 +391,7 @@ def _items(block: list[str]) -> dict[str, list[str]]:
 
 
 def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
-    """Return the column names, and the words of all atoms with shape (atoms, columns)."""
+    """Return the column names, and the values of all atoms as text, with shape (atoms, columns)."""
     head, *rows = items["ATOMS"]
     columns = head.split()
     words = np.array("".join(rows).split(), dtype=object)
@@ -402,7 +402,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
 
 
 def _bounds(items: dict[str, list[str]]) -> Box:
-    """Return the box of a dump frame with a corner as its origin; the corner moves if the volume changes."""
+    """Return the box of a dump frame; its origin is a corner, which moves if the volume changes."""
     head, *rows = items["BOX BOUNDS"]
     names, words = head.split(), [row.split() for row in rows[:3]]
     pbc, values = np.array([name == "pp" for name in names[-3:]], bool), np.array(words, np.float64)
@@ -489,7 +489,7 @@ def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray,
 
 
 def _gro_box(line: str) -> Box:
-    """Return the box from 3 diagonal elements or v1x v2y v3z v1y v1z v2x v2z v3x v3y; no box if all are 0."""
+    """Return the box from a line v1x v2y v3z or v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros mean no box."""
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
         raise ValueError(f"the box line of a frame has {len(values)} numbers; expected 3 or 9")
@@ -500,5 +500,5 @@ def _gro_box(line: str) -> Box:
 
 
 def _box_words(line: str) -> list[str]:
-    """Split a box line into numbers with five decimals; above 10 µm, no space separates the numbers."""
+    """Split a box line into numbers with five decimals, without spaces between them above 10 µm."""
     return _TOUCHING.findall(line) if max(map(len, line.split())) > _LONG else line.split()

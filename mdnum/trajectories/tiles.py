@@ -1,9 +1,9 @@
 """Decisions on all near pairs of each frame, made in float32 for sixteen pairs at a time.
 
-Atoms are sorted into clusters of sixteen by bisecting space. A tile consists of two clusters, the lattice
-vector between the clusters and, for each atom of the first cluster, sixteen decisions as bits. At each frame,
-the pairs of near clusters are decided in float32; only decisions that changed since the previous frame are
-processed further. If float32 cannot decide a pair, or the margin of a pair is needed, the exact squared
+Atoms are sorted into clusters of sixteen by bisecting space. A tile consists of two clusters and the lattice
+vector between them. For each atom of the first cluster, the tile stores sixteen decisions as bits. At each
+frame, the pairs of near clusters are decided in float32; only decisions that changed since the previous frame
+are processed further. If float32 cannot decide a pair, or the margin of a pair is needed, the exact squared
 distance is computed (`search.exact_square`).
 
 Tiles remain valid as long as all atoms of each cluster stay inside an enlarged bounding box of the cluster.
@@ -83,7 +83,7 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Update the tiles to a frame; return True if the tiles contain every pair up to radius + `clear`."""
+        """Update the tiles to a frame; return True if they contain all pairs closer than radius + `clear`."""
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
@@ -163,7 +163,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if each pair has at most one image inside the cutoff even if atoms approach by `moved`."""
+    """Return True if no pair can have two images inside the cutoff, even if atoms approach by `moved`."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
@@ -313,7 +313,7 @@ def _halved(x, order):
 
 @njit
 def _nodes(boxes, runs):
-    """Return a tree of bounding boxes for each range of clusters: of the range, of its halves, and so on.
+    """For each range of clusters, return a tree of bounding boxes: of the range, of its halves, and so on.
 
     The first half of the clusters of node n is node n + 1; the second half is node n + 2 c, where c is the
     number of clusters in the first half.
@@ -343,7 +343,7 @@ def _nodes(boxes, runs):
 
 @njit
 def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
-    """Write tiles between two ranges of clusters, up to the capacity; return the number of tiles found."""
+    """Write the tiles of two ranges of clusters, as many as the buffer holds; return the number of tiles."""
     count, square, same = 0, reach * reach, a == b
     stack = np.empty((256, 6), np.int64)
     for code in codes:
@@ -424,7 +424,7 @@ def _follow(before, now, order, home, vectors, change, inverse, periodic, center
 
 @njit
 def _stays(boxes, around, drift):
-    """Return True if each cluster box is inside its enlarged box, which shrinks by `drift` on each side."""
+    """Return True if each cluster box is inside its enlarged box, reduced by `drift` on each side."""
     out = 0
     for k in range(boxes.shape[0]):
         for c in range(3):
@@ -446,7 +446,7 @@ def _box(columns, boxes):
 
 @njit
 def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count):
-    """Decide pairs of tiles from `begin` on; return (next tile, flips, number within bound, min |margin|)."""
+    """Decide pairs from tile `begin` on; return (next tile, flips, number uncertain, smallest |margin|)."""
     close, smallest, room = 0, np.inf, flips.i.shape[0]
     first, second, vector, rows, inside = tiled.first, tiled.second, tiled.vector, tiled.rows, tiled.inside
     order, low, high, scratch = numbers.order, limits.low, limits.high, np.empty(4 * CLUSTER, np.float32)
@@ -499,7 +499,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
 
 @njit(inline="never")
 def _settled(inside, doubtful, i, slot, code, numbers, limits):
-    """Decide the uncertain pairs of an atom; return (bits inside, number within bound, smallest |margin|)."""
+    """Decide an atom's doubtful pairs; return (bits of pairs inside, number uncertain, least |margin|)."""
     close, smallest, vectors, order = 0, np.inf, numbers.vectors, numbers.order
     n0, n1, n2 = np.intp(code // 9) - 1, np.intp(code // 3 % 3) - 1, np.intp(code % 3) - 1
     while doubtful != np.uintp(0):

@@ -205,7 +205,7 @@ def topology_universe(topology: str | Path) -> Any:
 
 
 def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
-    """Return a trajectory's number of atoms, or None; for some formats, the topology supplies the number."""
+    """Return the number of atoms in a trajectory, or None; some formats need the topology's number."""
     from MDAnalysis.core._get_readers import get_reader_for
 
     for known in ({}, {"n_atoms": topology}):
@@ -280,9 +280,9 @@ class Boxes:
 
 
 def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
-    """Return the box for given lengths, Å, and angles, degrees: a along x, b in xy, as in MDAnalysis.
+    """Return the box for given lengths (Å) and angles (degrees), with a along x and b in the xy plane.
 
-    `None` means no box; an axis of length 0 with right angles is not periodic.
+    `None` means no box. An axis of length 0 is not periodic if all angles are 90°.
 
     Error: lattice vectors have a relative error of 1e-7, since MDAnalysis stores lengths and angles in
         float32.

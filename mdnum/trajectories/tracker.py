@@ -157,7 +157,7 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return the threshold distances of a directed rule at the last frame, per atom; nan if not a center.
+        """Return a directed rule's threshold distances at the last frame; nan for atoms that are not centers.
 
         Returns:
             (distance below which a neighbor stays one, distance below which another atom becomes a neighbor).
@@ -322,7 +322,7 @@ def _participants(
 
 
 def _by_place(who: Participants, frame: Frame) -> Participants:
-    """Renumber the participating atoms by position, so that atoms near in space are near in memory."""
+    """Renumber the atoms by position, so that atoms close in space are close in memory."""
     x, largest = _taken(frame.positions, who.labels)
     if not np.isfinite(largest) or not who.radius > 0:
         return who
@@ -335,7 +335,7 @@ def _by_place(who: Participants, frame: Frame) -> Participants:
 
 
 def _taken(positions: np.ndarray, labels: np.ndarray) -> tuple[Float[np.ndarray, "taken 3"], float]:
-    """Return positions of the given atoms, and the largest |coordinate| (not finite if one is not finite)."""
+    """Return the positions of the given atoms, and the largest |coordinate|, which may be inf or nan."""
     x = np.take(np.asarray(positions, np.float64), labels, axis=0)
     return x, furthest(x)
 

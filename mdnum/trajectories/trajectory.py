@@ -96,7 +96,7 @@ class Trajectory(ABC):
         return self.table.species
 
     def other_box(self, number: int) -> tuple[str, Box] | None:
-        """Return (code of a finding, another possible box of the frame); None if the box is unambiguous."""
+        """Return a finding's code and another possible box of the frame; None if only one box is possible."""
         return None
 
     @property
@@ -117,7 +117,7 @@ class Trajectory(ABC):
         return None if self.in_file is None else len(range(*self.slice.indices(self.in_file)))
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the requested frames in order, with one frame in memory; each call begins at the first frame.
+        """Yield the requested frames one by one, in order; each call begins at the first frame.
 
         Raises:
             UnreadableFrame: a frame cannot be read; all earlier frames have been yielded.
@@ -170,7 +170,7 @@ class Trajectory(ABC):
 
     @abstractmethod
     def raw_frames(self) -> AbstractContextManager[Callable[[int], Any]]:
-        """Open the file; provide a function that returns raw frames by ascending number, None at the end."""
+        """Open the file, and provide a function that returns raw frames by ascending number, then None."""
 
     @abstractmethod
     def decoded(self, number: int, raw: Any) -> Frame:

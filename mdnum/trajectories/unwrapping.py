@@ -1,6 +1,6 @@
 """Unwrapping of atomic paths across box boundaries, and detection of discontinuities between frames.
 
-Wrapping must move an atom by an integer combination of the lattice vectors at that frame; otherwise
+Wrapping must move an atom by an integer combination of the lattice vectors at that frame. Otherwise,
 quantities computed from the path of the atom are wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153,
 021101, 2020). This module removes jumps by the lattice vectors of each frame, which preserves displacements
 (Bullerjahn, von Bülow, Heidari, Hénin and Hummer, J. Chem. Theory Comput. 19, 3406, 2023).
@@ -68,7 +68,7 @@ class Unwrapping:
         }  # fmt: skip
 
     def _pairs(self, here: np.ndarray, there: np.ndarray, cell: np.ndarray) -> dict[str, Any]:
-        """Return relative changes of nearly constant pair distances across the box boundary and elsewhere."""
+        """Return relative changes of nearly constant pair distances, across box boundaries and elsewhere."""
         images = np.rint(there - here)
         split = images.any(axis=1) | (np.floor(here) != np.floor(there)).any(axis=1)
         lengths = np.linalg.norm((there - here - images) @ cell, axis=1)

@@ -401,7 +401,7 @@ def _named(value: Any, given: units.Units) -> Any:
 
 
 def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]]:
-    """Group findings by cause; return pairs of a finding and the list of findings that it may explain."""
+    """Group findings by cause: return each main finding with a list of the findings that it may explain."""
     above = heads([(one.code, one.severity) for one in found])
     return [
         (one, [other for k, other in enumerate(found) if k != place and above[k] == place])

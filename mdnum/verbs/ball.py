@@ -115,7 +115,7 @@ def _loaded(
 
 
 def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun, float | None]:
-    """Simulate a ball; return the run, and steps per second after compilation (None for a short run)."""
+    """Simulate a ball; return the run, and its speed in steps per second (None for a short run)."""
     marks: list[tuple[float, int]] = []
 
     def rate() -> float | None:
@@ -143,7 +143,7 @@ def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun,
 def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return loss, derivatives and variants for the summary, and a table of height differences by variant."""
+    """Return summary entries (loss, derivatives, variants) and a table of variants' height differences."""
     from mdnum.ball.rollout import first_difference
     from mdnum.verbs import ball_record
 
@@ -199,7 +199,7 @@ def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dic
 
 
 def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
-    """Return the loss of the run, if possible as computed by a gradient method that runs the same program."""
+    """Return the loss of the run, taken from a gradient method if one runs the same program."""
     same = ("unrolled", "frozen", "event-aware")
     known = [made["value"] for made in gradient if made["method"] in same and not made["refused"]]
     return known[0] if known else problem.value()

@@ -146,7 +146,7 @@ def _nearest(view: BallView) -> Iterator[Plot]:
 
 
 def _ranges(view: BallView) -> Iterator[Any]:
-    """Yield a table of each quantity's extremes, and of steps at which narrower number formats fail."""
+    """Yield a table of quantities' ranges, and of the first step at which they exceed narrower formats."""
     table = range_table(lambda name: TEXTS(f"range_{name}"), view.table("steps"))
     if table.rows:
         yield table

@@ -1,4 +1,4 @@
-"""Content of the folder of a ball's run: tables of decisions, summary, and deviations from closed forms."""
+"""Content of the folder of a ball's run: tables of decisions, summary, and differences from closed forms."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def decisions(run: BallRun) -> dict[str, np.ndarray]:
     """Return a table with one row per stop decision of the solver, for all steps that needed the solver.
 
     All decisions are included if one solver handles all balls and residual histories were kept. Otherwise,
-    the table contains the last two decisions of each solve.
+    the table contains only the last two decisions of each call of the solver.
     """
     rule = rule_of(run)
     if rule is None:
@@ -182,7 +182,7 @@ def compared(
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Return the step and decision at which a variant diverges from the run, and the variant's gradient.
+    """Return where a variant diverges from the run (step and decision), and the variant's gradient.
 
     Args:
         found: the difference between the two runs.
@@ -289,7 +289,7 @@ def ambiguous_flips(run: BallRun) -> np.ndarray:
 
 
 def ambiguous_stops(run: BallRun) -> np.ndarray:
-    """Count, at each step, stop decisions that may depend on the order in which the residual is summed."""
+    """Count the stop decisions of each step that may change with the order of summation in the residual."""
     rule = rule_of(run)
     if rule is None or isinstance(rule, FixedCount):
         return np.zeros(run.steps, np.int64)
@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin at each step; for separately solved balls, those with the least |margin|."""
+    """Residual and stop margin of each step; with one solver per ball, those of the smallest |margin|."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

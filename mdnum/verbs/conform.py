@@ -241,7 +241,7 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
 
 
 def _script(code: str) -> str:
-    """Return the ending of a script's file name; the script reproduces failures with the given code."""
+    """Return the last part of the name of the script that reproduces failures with the given code."""
     return f"{code.lower().replace('_', '-')}.py"
 
 
@@ -329,7 +329,7 @@ def _total(summary: Mapping[str, Any], name: str) -> int:
 
 
 def judge(view: View) -> Verdict:
-    """Return the verdict on a neighbor list: headline, evidence and findings, from the folder alone."""
+    """Return the verdict on a neighbor list (headline, evidence and findings), from its folder alone."""
     summary = view.summary
     asked, wrong, left = summary["asked"], summary["wrong"], summary["left"]
     silent = {code.lower(): _cases(summary, code) for code in SILENT}

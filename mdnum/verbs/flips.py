@@ -524,10 +524,10 @@ def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
-    """Yield (part, number of parts, history): the flips of one neighbor rule, in parts, sorted by pair.
+    """Yield the flips of one neighbor rule in parts, sorted by pair: (part, number of parts, history).
 
     The table of flips is ordered by frame and may be larger than memory. Each part contains all flips of some
-    of the pairs, and the table of flips is read once for each group of parts that fits into memory.
+    of the pairs. The table is read once for each group of parts that fits into memory.
     """
     from mdnum.trajectories.history import History
 
@@ -689,7 +689,7 @@ def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:
-    """Swap the two atom classes of a table row if only the swapped order matches the two selections."""
+    """Swap the two atom classes of a table row if they match the two selections only after the swap."""
     if groups[0] is None or groups[1] is None:
         return row
     first, second = ({classes.names[at] for at in np.unique(classes.of[group])} for group in groups)

@@ -137,7 +137,7 @@ class ComparisonView(FlipsView):
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
 
     def frame(self, at: int | None) -> str:
-        """Format the index of a frame in the comparison and, if they differ, its numbers in the two files."""
+        """Format the index of a frame, with its numbers in the two files if these differ from the index."""
         if at is None:
             return "no frame"
         a, b = (int(self.table("apart")[f"number_{one}"][at]) for one in "ab")
@@ -149,7 +149,7 @@ class ComparisonView(FlipsView):
 
     @property
     def shift(self) -> dict[str, Any]:
-        """Displacement common to all atoms between trajectories: a vector, and the range of its length."""
+        """Common displacement of all atoms between trajectories: a vector, and the range of its length."""
         table, at = self.table("apart"), self.summary["shift"]
         vectors = np.stack([table[f"shift_{one}"] for one in "xyz"], axis=1)
         sizes = np.sqrt((vectors**2).sum(axis=1))
@@ -248,7 +248,7 @@ def _evidence(view: ComparisonView) -> Iterator[str]:
 
 
 def _certain(one: Mapping[str, Any]) -> str:
-    """Classify when neighbor-set differences exceed rounding: at the first difference, later, or never."""
+    """Return when neighbor sets certainly differ: at their first difference, later, or never."""
     if one["first"]["pairs"] > one["first"]["ambiguous"]:
         return "some"
     return "never" if one["certain"] is None else "later"
@@ -269,7 +269,7 @@ def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _leap(view: ComparisonView, first: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a sentence on whether trajectories diverge faster once their neighbor sets differ than before."""
+    """Yield a sentence on whether trajectories diverge faster after their neighbor sets begin to differ."""
     table, at = view.table("apart"), int(first["frame"])
     furthest = table["furthest"]
     # a difference that has just begun grows fast, whatever began it

@@ -105,7 +105,7 @@ def _ended(view: FlipsView) -> Iterator[Finding]:
 
 
 def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
-    """Return frames at which the number of pairs differs from the previous number + entered - left."""
+    """Return the frames at which the number of pairs is not the previous number + entered - left."""
     table = view.table("frames")
     rows = table["rule"] == place
     net = (table["entered"][rows] - table["left"][rows])[1:]
@@ -165,7 +165,7 @@ def _undecided(one: Rule) -> Iterator[Limit]:
 
 
 def _far_apart(one: Rule) -> bool:
-    """True if frames are too far apart: half of the new contacts have ended by the next frame."""
+    """True if frames are too far apart: the median lifetime of contacts is one frame."""
     return one["flips"] >= FEW and one["lifetime"]["median"] == 1
 
 

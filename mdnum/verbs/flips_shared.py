@@ -76,7 +76,7 @@ def in_python(text: str) -> str:
 
 @contextmanager
 def as_python(in_memory: bool) -> Iterator[None]:
-    """Replace command-line options in error messages by Python arguments, if frames were given as arrays."""
+    """In error messages, replace command-line options by Python arguments if frames were given as arrays."""
     try:
         yield
     except InputError as error:

@@ -326,7 +326,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """Draw a line per choice; mark the first differing bit, the first differing decision, and the split."""
+    """For each choice, draw the steps of the first different bit, first different decision, and split."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (

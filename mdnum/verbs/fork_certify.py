@@ -120,7 +120,7 @@ def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[s
 
 
 def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
-    """Count, for each precision, decisions within rounding bounds, and evaluate each of them exactly."""
+    """For each precision, count the decisions within rounding bounds, and evaluate them exactly."""
     from mdnum.forks.certified import certified_horizon
     from mdnum.numerics import PrecisionPolicy
 
@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """Yield sentences on correct steps gained or lost if one role (such as forces) has another precision."""
+    """Yield sentences on how the precision of one role (such as forces) changes the number of exact steps."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip

@@ -1,4 +1,4 @@
-"""`mdnum fork map` and `mdnum fork forecast`: decisions that change with a parameter or initial state."""
+"""`mdnum fork map` and `mdnum fork forecast`: how decisions change with a parameter or the initial state."""
 
 from __future__ import annotations
 

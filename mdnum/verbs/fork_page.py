@@ -222,7 +222,7 @@ def _atoms(view: View, figure: Canvas) -> None:
 
 
 def _two_by_two(view: View) -> Iterator[Any]:
-    """Yield a table of the step at which runs split, for each run's arithmetic with each run's decisions."""
+    """Yield a table of the step of the split, for the arithmetic of A or B with the decisions of A or B."""
     s, unit = view.summary, view.units.length
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for cell in s["table"]:
@@ -356,7 +356,7 @@ def _growth(view: View) -> Iterator[Any]:
 
 
 def _after(view: View) -> Iterator[Plot]:
-    """Yield figures of how many decisions differ or are overridden, and of energy differences from run A."""
+    """Yield figures of the number of different and overridden decisions, and of energy differences from A."""
     s, table = view.summary, view.table("separation")
     step, dates, length = table["step"], _dates(s, "fork", "split"), view.units.length
     named = [("cross", "decisions that differ"), ("overridden", "decisions overridden")]

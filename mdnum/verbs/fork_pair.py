@@ -56,7 +56,7 @@ class PairQuestion:
 
 
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
-    """Return the last step: the given one or, by default, the system's own last step, but at most `most`.
+    """Return the last step: `steps` if given, otherwise the system's number of steps (at most `most`).
 
     Raises:
         InputError: steps is below 1.
@@ -204,7 +204,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
 
 
 def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
-    """Return the strain between the boxes of A and B: at the end, at the divergence, and the largest."""
+    """Return the strain between the boxes of A and B at the end and at the divergence, and its maximum."""
     if "strain" not in made.series:
         return {}
     strain, free = made.series["strain"], made.series["B"]
@@ -217,7 +217,7 @@ def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
-    """Return the fit distance = exp(intercept + rate * step) for two runs, with its first and last step."""
+    """Return the fit exp(intercept + rate * step) to the distance of two runs, and its range of steps."""
     if not np.isfinite(fit.rate):
         return dict.fromkeys(("rate", "r_squared", "first", "last", "intercept"))
     step = np.arange(fit.first, fit.last + 1)
@@ -226,7 +226,7 @@ def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
 
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Predict when runs that did not split would split, from their distance or the Lyapunov exponent."""
+    """Predict the step at which two runs will split, from their distance or the Lyapunov exponent."""
     from mdnum.numerics.verdicts import expected
 
     exponent = summary.get("lyapunov")
@@ -391,7 +391,7 @@ def _exponent(made: Fork) -> dict[str, Any]:
 
 
 def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
-    """Run B with decisions of A imposed; return the result, or the reason why the run is impossible."""
+    """Run B again with decisions of A imposed; return the result, or the reason why this is impossible."""
     from mdnum.forks.replays import parse_pin, pinned
 
     try:
@@ -408,7 +408,7 @@ def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
 
 
 def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
-    """Return, if found, a minimal set of decisions that must be overridden to keep runs from splitting."""
+    """Return a minimal set of overridden decisions that keeps the runs from splitting, if one is found."""
     from mdnum.forks.replays import disagreements, minimal_cause
 
     try:

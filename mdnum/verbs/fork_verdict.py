@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """Return a phrase: in how many repeats the runs split later if A's decisions are imposed on B."""
+    """Return a phrase on the number of repeats in which the decisions of A, imposed on B, delay the split."""
     said: list[str] = []
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -114,7 +114,7 @@ def decided(decision: Mapping[str, Any]) -> str:
 
 
 def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
-    """Return how runs A and B made the first differing decision, and which of them decided yes."""
+    """Return the first differing decision as made by A and by B, and which run decided yes."""
     yes = "A" if decision["decided"]["A"] > decision["decided"]["B"] else "B"
     return {"yes": yes, "no": "B" if yes == "A" else "A", "a": decision["decided"]["A"],
             "b": decision["decided"]["B"]}  # fmt: skip
@@ -164,7 +164,7 @@ def must_hold(row: Mapping[str, Any]) -> Finding:
 
 
 def judge_screen(view: View) -> Verdict:
-    """Return the verdict on all choices: which first changes a decision, and unexpected changes of bits."""
+    """Return the verdict on all choices: the first that changes a decision, and unexpected bit changes."""
     rows, found = view.summary["ranking"], []
     broken = [row for row in rows if row["must_hold"] and row["first_bit"] is not None]
     forked = [row for row in rows if row["fork"] is not None]

@@ -146,7 +146,7 @@ def _problem(
 def plan(
     problem: Problem, names: Sequence[str], asked: Sequence[str] | None, replicas: int = 0
 ) -> tuple[list[Method], list[dict[str, str]]]:
-    """Return the gradient methods to run, and omitted methods with reasons and the options to add them.
+    """Return the gradient methods to run, and omitted methods, each with a reason and an option to add it.
 
     Args:
         asked: names of methods; None for the fast ones.
@@ -187,7 +187,7 @@ def _too_long(method: Method, problem: Problem, names: int) -> str:
 
 
 def _over(method: Any, replicas: int, horizons: bool = True) -> Method:
-    """Return a method with the given number of initial states, or unchanged if the method uses only one."""
+    """Set the number of initial states of a gradient method; methods that use one state are unchanged."""
     if not replicas or not hasattr(method, "replicas"):
         return method
     changed = replace(method, replicas=replace(method.replicas, count=replicas))

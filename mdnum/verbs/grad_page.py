@@ -120,7 +120,7 @@ def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
 
 
 def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, Any]]:
-    """Group parameters by the judgment on their derivatives; if there is only one group, its key is empty."""
+    """Group parameters whose derivatives have the same judgment; the key of a single group is empty."""
     trust = summary.get("trust")
     if not trust:
         return {}
@@ -269,7 +269,7 @@ def _horizons(view: View) -> Iterator[Any]:
 
 
 def _limits(view: View) -> Iterator[tuple[float, str]]:
-    """Yield the step from which each derivative cannot be trusted, with the reason as a label."""
+    """Yield the step from which each derivative cannot be trusted, and the reason as a label."""
     for names, one in judgments(view.summary).items():
         if one["limited_by"]:
             yield one["horizon"], ", ".join([f"limit: {one['limited_by']}", *names])

@@ -145,7 +145,7 @@ def _of_trust(view: View) -> Iterator[Finding]:
 
 
 def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a remedy for each limit on trust that was not examined, by the name of a finding's variant."""
+    """Yield remedies for limits on trust that were not examined, named as variants of a finding's text."""
     unseen = {one["what"] for one in trust["limits"] if one["horizon"] is None}
     aware = by(view.summary, "event-aware") is not None
     if any(one["what"] == "half the time step" for one in view.summary["left_out"]):

@@ -29,8 +29,8 @@ _OUTERMOST = threading.Lock()
 def reported(progress: Wanted) -> Iterator[Progress | None]:
     """Context manager: yield the function to which progress is reported, or None.
 
-    If `progress` is a function, this function is used; True always shows a bar, False never; None shows a
-    bar, except in the workers of a pool and in a command that another command calls.
+    If `progress` is a function, it receives the reports. True always shows a bar, and False never does. None
+    shows a bar, except in worker processes and in a command called by another command.
     """
     from multiprocessing import parent_process
 

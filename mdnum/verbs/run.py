@@ -224,7 +224,7 @@ def _keep(run: RunView, compared: EnergyReport | None, period: float | None, fun
 
 
 def _beside_float64(run: RunView, result: RunResult) -> None:
-    """Add, for a fixed-point run, the energy fluctuations of this run and a float64 run to the summary."""
+    """For a fixed-point run, add the energy fluctuations of the run and of a float64 run to the summary."""
     from mdnum.rollout.engine import FAILURES, Engine
 
     simulation, summary = result.simulation, run.summary

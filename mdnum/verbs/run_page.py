@@ -73,7 +73,7 @@ class RunView(View):
 
     @property
     def cutoff(self) -> Mapping[str, Any]:
-        """Cutoff: kind, radius, comparison of distances, and jumps at the radius; empty without a cutoff."""
+        """Kind and radius of the cutoff, comparison of distances, and jumps; empty without a cutoff."""
         return self.summary.get("cutoff") or {}
 
     @property
@@ -84,7 +84,7 @@ class RunView(View):
 
     @property
     def own_end(self) -> list[str]:
-        """Variant of a remedy's text: "own" if the potential, not the system file, sets the cutoff."""
+        """Variant of a remedy's text: "own" if the potential sets the cutoff, none if a system file does."""
         return [] if self.cutoff_key else ["own"]
 
     @cached_property
@@ -124,9 +124,9 @@ class RunView(View):
         """Indicators of whether the time step is small enough; unknown indicators are None.
 
         `per_period` is the number of steps per period of the fastest vibration in the first and the last
-        frame. `fluctuation` is the fluctuation of the conserved energy (without the jumps of flips) over that
-        of the kinetic energy. `drift` and `drift_error` are the drift of the conserved energy and its error,
-        in k_B T per atom.
+        frame. `fluctuation` is the ratio of the fluctuations of the conserved energy (without the jumps of
+        flips) and of the kinetic energy. `drift` and `drift_error` are the drift of the conserved energy and
+        its error, in k_B T per atom.
         """
         period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
         atoms = self.summary.get("atoms") or 0
@@ -152,7 +152,7 @@ class RunView(View):
         return Measured(left, self.units.energy, self.summary.get("energy_budget_tolerance"))
 
     def total(self, key: str, column: str | None = None) -> int:
-        """Return a total of the run, from the summary or, if missing there, as a sum over neighbor lists."""
+        """Return a total of the run: the value in the summary or, if missing, the sum over neighbor lists."""
         return int(self.summary.get(key) or self.epochs[column or key].sum())
 
     def step(self, row: int | np.integer) -> int:
@@ -443,7 +443,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
 
 
 def _ranges(run: RunView) -> Iterator[Any]:
-    """Yield a table of each quantity's extremes, and of steps at which narrower number formats fail."""
+    """Yield a table of quantities' ranges, and of the first step at which they exceed narrower formats."""
     examined, series, units = run.table("ranges"), run.series, vars(run.units)
     sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
     sums["step"] = series["step"]

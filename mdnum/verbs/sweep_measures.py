@@ -48,7 +48,7 @@ def fork(run: Sample, argument: str) -> Value:
 
 
 def split(run: Sample, argument: str) -> Value:
-    """Time until the distance between two runs exceeds 0.01 cutoff radii; error: scatter between seeds."""
+    """Time until two runs are 0.01 cutoff radii apart; the error is the scatter between seeds."""
     return _date(run, argument, "split")
 
 

@@ -179,7 +179,7 @@ def _sections(view: View) -> Iterator[Section]:
 def _most(
     rows: Sequence[Any], columns: Mapping[str, str], stored: str, bad: Callable[[Any], Any] | None = None
 ) -> list[Any]:
-    """Return a table of the first rows; if there are more, a note on the file with all rows comes first."""
+    """Return a table of the first rows, preceded by a note on the file with all rows if there are more."""
     more = [TEXTS("more_rows", shown=_ROWS, all=len(rows), stored=stored)] if len(rows) > _ROWS else []
     return [*more, table_of(rows[:_ROWS], columns, bad=bad)]
 
@@ -238,7 +238,7 @@ def _settings(view: View) -> list[Any]:
 
 
 def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
-    """Yield figures of each measure versus the values of one choice, with other choices at base values."""
+    """Yield figures of each measure versus one choice's values; other choices have their base values."""
     s, values = view.summary, axis["values"]
     if not all(isinstance(one, int | float) for one in values):
         return

@@ -43,7 +43,7 @@ def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> boo
 
 
 def _missing(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> list[str]:
-    """Return the requested measures that a stored result lacks or that different source code computed."""
+    """Return the requested measures that are not stored, or were computed by different source code."""
     stored = {} if result is None else result["measures"]
     return [name for name, at in measures.items() if stored.get(name, {}).get("digest") != at]
 
