@@ -275,12 +275,12 @@ def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]
     sentences = (
         f"The target is that each kind of false verdict occurs for fewer than {target} of the starting "
         "states. The target is met with 95 % confidence if the upper bound of the rate of false verdicts is "
-        f'below {target}. The upper bounds are listed in the column "below" of a table further below. '
+        f'below {target}. The upper bounds are given in the column "below (95 %)" of a table below. '
         f"{shown or 'None'} of the {len(wrong)} upper bounds {'are' if shown > 1 else 'is'} below {target}. "
         f"Each upper bound is based on {fewer} to {most} starting states. With more starting states, the "
         "upper bounds would be smaller.",
-        'The verdict is "undecided" for some starting states. The following table gives the number of these '
-        "starting states. In systems that are not listed, the verdict was never undecided.",
+        'The following table gives the number of starting states for which the verdict is "undecided". In '
+        "systems that are not listed, the verdict was never undecided.",
     )
     told = [fill_text(one, 118, break_on_hyphens=False) for one in sentences]
     return "\n\n".join([*told, markdown(("system", "undecided", "starting states"), open_)])
