@@ -37,17 +37,17 @@ _NARROW = 1e-6
 
 
 def _moving(x: Any) -> Any:
-    """Return zero, but with the derivative of x: subtract the value of x, as a constant, from x."""
+    """Return x minus its value held constant: the result is zero, but has the derivative of x."""
     return x - lax.stop_gradient(x)
 
 
 class FixedPointRule(eqx.Module):
-    """Derivative rule for the contact projection: the derivative of the fixed point of its iteration.
+    """Derivative rule for the contact projection: its fixed point is differentiated, not its iterations.
 
     For a ball in contact, the iteration y ← G(y) = y + gain max(0, -y) approaches the fixed point y = 0 from
-    below. At y = 0, dG/dy is discontinuous; its value for y < 0 is used, because the iteration approaches y =
-    0 from below (as for the active set of a complementarity problem). The implicit function theorem, (1 -
-    dG/dy) dy = dG/dgain dgain, gives gain dy = -y dgain for each ball.
+    below. At y = 0, dG/dy is discontinuous. The rule uses the value for y < 0, because the iteration
+    approaches y = 0 from below. By the implicit function theorem, (1 - dG/dy) dy = dG/dgain dgain, so that
+    gain dy = -y dgain for each ball.
     """
 
     # added to 1 - dG/dy; moves the answer by about regularization / gain, relative
@@ -71,7 +71,7 @@ class FixedPointRule(eqx.Module):
 
 
 class _Settled(eqx.Module):
-    """Rule that moves every ball in contact to the fixed point of its iteration, the floor."""
+    """Rule that moves every ball in contact from below the floor up to the floor."""
 
     def attach(self, y, gain, contact):
         """Return the fixed point: 0 for balls in contact below the floor, otherwise y."""
@@ -80,10 +80,10 @@ class _Settled(eqx.Module):
 
 @dataclass(frozen=True)
 class Implicit(BallMethod):
-    """Gradient method: derivative of the fixed point of the projection, by the implicit function theorem.
+    """Gradient method: derivative of the fixed point of the contact projection (implicit function theorem).
 
-    The loss is computed from the executed iterations; the derivative is that of their limit, the floor. For
-    the gain k, the method `unrolled` gives a nonzero derivative, an artifact of the solver's tolerance.
+    The loss uses the executed iterations, but the derivative is that of their limit, the floor. With respect
+    to the gain k, the method `unrolled` gives a nonzero derivative, an artifact of the tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
@@ -153,7 +153,7 @@ class SoftImpact(eqx.Module):
     slow: Any  # in velocity, of the passage, m/s
 
     def acceleration(self, y, v, free, contact, r):
-        """Return the acceleration due to gravity, control and spring, without using the contact decision."""
+        """Return the acceleration due to gravity, control and spring; the contact decision is not used."""
         depth = self.eps * jax.nn.softplus(-y / self.eps)
         share = self.restitution**2
         return free + self.k * depth * (share + (1 - share) * jax.nn.sigmoid(-v / self.slow))
@@ -210,7 +210,7 @@ class SoftFloor(BallMethod):
 
 
 def softened(problem: BallProblem, eps: float) -> BallProblem:
-    """Return the problem with a soft floor: softplus or, for impacts, a spring that gives way by about eps.
+    """Return the problem with a soft floor that yields by about eps (softplus, or a spring for impacts).
 
     Raises:
         InputError: the ball would cross the soft floor of width eps in too few steps.
@@ -258,11 +258,11 @@ def _suitable(problem: BallProblem) -> float:
 class ThroughContacts(BallMethod):
     """Gradient method: derivative of the ball's motion in continuous time, including the times of contacts.
 
-    Contact is decided at the end of a step. A ball that starts higher arrives later; the derivative of the
-    discrete steps lacks this effect. A saltation matrix at every contact adds the effect of contact times. If
-    impacts are located within a step, the program's own derivative already contains the saltation matrix. The
-    method treats a contact by projection like an impact. Without a damper, the force of a spring does not
-    jump, and the result is the same as from the method `unrolled`.
+    Contact is decided at the end of a step. A ball that starts higher reaches the floor later. The derivative
+    of the time steps omits this change of the contact time. A saltation matrix at every contact adds the
+    change of the contact time. If impacts are located within a step, the program's own derivative already
+    contains the saltation matrix. A contact by projection is treated like an impact. Without a damper, the
+    force of a spring does not jump, and the result is the same as from the method `unrolled`.
     """
 
     name = "event-aware"
@@ -310,10 +310,10 @@ class ThroughContacts(BallMethod):
 
 
 class _SaltatingReset:
-    """Contact that resets the velocity at the end of a step, but has the derivative of continuous motion."""
+    """Contact that resets the velocity at the end of a step, with the derivative of continuous motion."""
 
     def move(self, motion: Motion) -> Moved:
-        """Compute one step with a contact; its derivative is that of the flight and the saltation matrix."""
+        """Compute one step with a contact, and differentiate it by means of the saltation matrix."""
         made = super().move(motion)  # type: ignore[misc]
         height, v = motion.integrator.fly(motion.y, motion.v, motion.free, motion.rounding)
         arrived, nothing, bounce = lax.stop_gradient(v), jnp.zeros_like(v), self.restitution.astype(v.dtype)  # type: ignore[attr-defined]

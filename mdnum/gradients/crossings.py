@@ -1,13 +1,13 @@
 """Contributions to a gradient from changes of the times at which pairs cross their cutoff (saltation).
 
 A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the perturbation then
-changes the pair's momentum after the crossing. Derivatives of a program's steps lack the effect of crossing
-times, even for short time steps. In reverse mode, the saltation matrix (mdnum.numerics) of the cutoff sphere
-adds the effect of crossing times. A loss that contains the potential energy or the virial also jumps at a
-crossing: if its frames are equally spaced in time, a later crossing shifts the jump by a fraction of a frame.
+changes the pair's momentum after the crossing. The derivative of the time steps does not include changes of
+crossing times, however short the steps are. A saltation matrix (mdnum.numerics) at each crossing adds the
+effect of the crossing time. The potential energy and the virial also jump at a crossing. If a loss sums
+energies or virials over equally spaced frames, a later crossing shifts the jump by a fraction of a frame.
 
-Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
-dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.
+Source: for a pair with radial force jump f (positive: repulsive) and radial speed s, a change dr of the
+distance changes the crossing time by -dr/s and the momentum along the pair by f dr/s.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class MetRows(NamedTuple):
     slots: Int[np.ndarray, "most"]  # numbers from 0, as many as the row with the most has, or a few more
 
     def row(self, span: Int[Array, "2"], atoms: int) -> Met:
-        """Return the crossings of one step from the index of its first crossing and their number."""
+        """Return the crossings of one step, given the index of the first and the number of crossings."""
         most = len(self.slots)
         own = Met(*(lax.dynamic_slice_in_dim(column, span[0], most, -1) for column in self.met))
         # behind them are those of the next row
@@ -97,13 +97,13 @@ class Crossings:
 
     @property
     def kick(self) -> Float[np.ndarray, "crossings"]:
-        """Change of a pair's radial momentum per change of its distance at the crossing: the force jump
-        (energy/length) divided by the radial speed (length/time).
+        """Force jump (energy/length) of each crossing, divided by the radial speed (length/time): the change
+        of the pair's radial momentum per change of its distance.
         """
         return self.force / self.speed
 
     def spans(self, room: int) -> Int[np.ndarray, "room 2"]:
-        """For each of `room` steps, return the index of its first crossing and its number of crossings."""
+        """Return, for each of `room` steps, the index of the first crossing and the number of crossings."""
         starts = np.searchsorted(self.row, np.arange(room + 1))
         return np.stack([starts[:-1], np.diff(starts)], axis=1)
 
@@ -155,10 +155,10 @@ def onto_crossings(
 ) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"], Float[Array, "3 3"]]:
     """Propagate cotangents backward through the crossings (saltation) of one step.
 
-    A crossing lies between two steps, on average halfway through the drift between these steps. Let n be the
-    unit vector from i to j, f the force jump and s = n · (v_j - v_i) + n · (dh/dt h^-1) r the radial speed,
-    including the motion of the box. If the distance at the crossing changes by dr = n · (dx_j - dx_i), minus
-    the change of the lattice vectors between the images, the force jump acts for a time that changes by dr/s:
+    On average, a crossing lies halfway through the drift between two steps. Let n be the unit vector from i
+    to j, f the force jump and s = n · (v_j - v_i) + n · (dh/dt h^-1) r the radial speed, including the motion
+    of the box. Let dr be the change of the distance at the crossing: n · (dx_j - dx_i), minus the change of
+    the lattice vectors between the images. The force jump then acts for a time that changes by dr/s:
 
         d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
         d(W) = (f r_cut n ⊗ n) dr/s        on the integrator's use of the virial tensor W
@@ -250,7 +250,7 @@ def of_energy(
 def _along(
     met: Met, vectors: Float[Array, "3 atoms"], matrix: Float[Array, "3 3"] | None = None
 ) -> Float[Array, "most"]:
-    """For each pair, return the difference of both atoms' vectors, projected onto the direction of the pair.
+    """Return, for each pair, the difference between both atoms' vectors, projected onto the pair's direction.
     If `matrix` contains lattice vectors, the nearest image of the difference is used.
     """
     dtype = vectors.dtype

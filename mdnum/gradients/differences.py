@@ -3,9 +3,10 @@
 A replica is the same system with different initial velocities and, with a thermostat, different noise.
 Replicas have different neighbor lists and are therefore run one after another on each device.
 
-If a parameter changes, pairs cross the cutoff at other steps. If the force jumps at the cutoff, the loss as a
-function of the parameter then jumps; between jumps, its slope is the derivative of the steps. The event-aware
-gradient is the slope of the loss across many jumps; for comparison, finite differences must span many jumps.
+If a parameter changes, pairs cross the cutoff at other steps. If the force jumps at the cutoff, the loss then
+jumps as a function of the parameter. Between two jumps, the slope of the loss is the derivative of the time
+steps. The event-aware gradient is the slope of the loss across many jumps. Finite differences that are
+compared with it must span many jumps.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ class Differentiated(NamedTuple):
 def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
     """Differentiate f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
-    Steps decrease by factors of 1.4; returning the extrapolation with the smallest estimated error balances
-    the truncation errors of large steps against the noise of small steps.
+    Steps decrease by factors of 1.4, and the extrapolation with the smallest estimated error is returned. It
+    balances the truncation error of large steps against the noise of small steps.
 
     Args:
         f: function of one number. x: point. step: the largest step. levels: number of steps.
@@ -92,7 +93,7 @@ def richardson(f: Callable[[float], float], x: float, step: float, levels: int =
 
 
 def noise_of(values: Float[np.ndarray, "points"]) -> float:
-    """Estimate the standard deviation of noise in function values at small equal spacings.
+    """Estimate the standard deviation of the noise of a function from values at small equal spacings.
 
     Finite differences of order k cancel a smooth function and amplify noise by a known factor.
 
@@ -434,9 +435,8 @@ class SmoothedDifferences(Method):
     """Gradient method: mean over replicas of central differences with steps that span many flips.
 
     The two runs of a difference use the same random numbers. Differences with steps h and h/2 are
-    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with the
-    extrapolations from all narrower steps within twice the standard error. Narrower steps have more noise
-    from single flips.
+    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with those from
+    all narrower steps within twice the standard error. Narrower steps have more noise from single flips.
     """
 
     relative: float = 0.002  # the widest step as a share of the parameter
@@ -483,7 +483,7 @@ class SmoothedDifferences(Method):
 
 
 def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable[[], None]):
-    """For each initial state, return the loss at given parameter values, and crossings (step, i, j)."""
+    """Return the loss of each initial state at given parameter values, and all crossings (step, i, j)."""
     found = []
     for start in starts:
         made, met = start.at(values), set()

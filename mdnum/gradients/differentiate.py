@@ -67,8 +67,8 @@ def differentiable(
 ) -> Callable[[Values], jax.Array]:
     """Return the loss as a function that JAX can differentiate in reverse mode.
 
-    To differentiate with respect to other parameters, such as a pytree, write a function that computes the
-    named values from these parameters, and apply `jax.grad` to the composition.
+    To differentiate with respect to other variables, such as a pytree, write a function that computes the
+    named values from these variables. Then apply `jax.grad` to the composition.
 
     Args:
         problem, names, method: as for `value_and_grad`, which also lists errors and warnings.

@@ -81,7 +81,7 @@ class Loss(eqx.Module):
         return cls(**options)
 
     def looks_at(self, steps: Int[np.ndarray, "rows"], last: int) -> Bool[np.ndarray, "rows"]:
-        """Return, for each step of a run with the given last step, whether the loss uses this step."""
+        """Return, for each given step of a run that ends at step `last`, whether the loss uses this step."""
         return (steps >= self.first) & ((steps - self.first) % self.every == 0)
 
     @abstractmethod
@@ -89,7 +89,7 @@ class Loss(eqx.Module):
         """Return the observations of a frame, to be summed over frames; `origin` is the frame of step 0."""
 
     def value(self, total: Any, frames: Int[Array, ""] | int) -> Inexact[Array, ""]:
-        """Compute the loss from the sum of observations and the number of frames (default: the mean)."""
+        """Compute the loss from the sum of observations and the number of frames; by default, the mean."""
         return total / frames
 
     def reason_unavailable(self, around: LossContext) -> str | None:

@@ -76,8 +76,8 @@ def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce 
 
 
 def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Array, Array]:
-    """Propagate cotangents of the integrator's initial extra state (for example, of a thermostat) backward to
-    the integrator's parameters and to the initial positions and velocities.
+    """Propagate cotangents of the extra state of step 0, such as thermostat variables, backward to the
+    parameters of the integrator and to the initial positions and velocities.
 
     Args:
         start: the state of step 0.
@@ -127,7 +127,7 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any], Any]]:
-    """For each input that a parameter changes, return a function that selects it, and the derivative."""
+    """For each input that depends on a parameter, return a function that selects it, and its derivative."""
     if name in ("initial.positions", "initial.velocities"):
         return [((lambda of: of.x) if name == "initial.positions" else (lambda of: of.v), None)]
     v = simulation.velocities.T

@@ -99,7 +99,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Gradient:
-    """Gradient of a loss by one method, with a description of the method's derivative.
+    """Gradient of a loss, computed by one method, and a description of what this method computes.
 
     Attributes:
         method: name of the method. description: one sentence on the derivative that the method computes.
@@ -122,7 +122,7 @@ class Gradient:
 
 
 class Method:
-    """Base class of gradient methods: frozen dataclasses of options, registered in METHODS.
+    """Base class of gradient methods, which are frozen dataclasses of options, registered in METHODS.
 
     Gradient methods are subclasses of `Method` for molecular dynamics, and of `ball.BallMethod` for a ball.
 
@@ -176,7 +176,7 @@ class Method:
         raise NotImplementedError
 
     def result(self, value: float, gradient: dict[str, Any], notes=None, details=None) -> Gradient:
-        """Create a `Gradient` that contains name, description and kind of this method."""
+        """Create a `Gradient` with the name, description and kind of this method."""
         return Gradient(self.name, self.description, value, gradient, notes or {}, details or {}, self.kind)
 
 

@@ -1,7 +1,7 @@
 """Gradient methods that linearize a recorded run, in reverse mode (cotangents) or forward mode (tangents).
 
 First, an ordinary run is made and recorded. The steps are then linearized at the recorded states and
-decisions; for a reversible run with a fixed-point state, the states are recomputed.
+decisions. For a reversible run with a fixed-point state, the states are not stored but recomputed.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ class Forward(Method):
 class Reversible(Method):
     """Gradient method: derivative of the steps of a fixed-point run; the run is reversed instead of stored.
 
-    The forward pass stores only the last state; rounding to integers is differentiated as the identity.
+    The forward pass stores only the last state. Rounding to integers is differentiated as the identity.
 
     Raises:
         NumericalError: the states of the reversed run differ from those of the forward run.
@@ -298,7 +298,7 @@ class Surrogate(Method):
 
 
 def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
-    """Return how many crossings occur and how many graze, and the crossings with the largest weights."""
+    """Return the numbers of crossings and of grazing crossings, and the crossings with largest weights."""
     speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
     flips = {name: joined(crossings, name, ledger=True) for name in ("step", "i", "j", "entered")}
     key, heavy = -np.abs(weight), np.arange(len(weight))

@@ -74,8 +74,8 @@ def tangents(
 ) -> Iterator[StretchTangents]:
     """For each stretch of steps of a recorded run, yield the tangents with respect to named parameters.
 
-    If saltation is False, the tangents omit flips. The contribution of flips is then the sum over crossings
-    of weight times (dr_cut - dr); an event-aware reverse pass gives the weights.
+    If saltation is False, the tangents omit flips. The contribution of flips is then the sum of weight *
+    (dr_cut - dr) over all crossings. The weights are those of an event-aware reverse pass.
 
     Args:
         tape: the run; recorded with flips if crossings are needed. names: full names of parameters.
@@ -117,7 +117,7 @@ def tangents(
 
 
 def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
-    """Compute the derivatives of the loss from the tangents of the loss's sums at the end of the run."""
+    """Compute the derivatives of the loss from the tangents of the sums over frames."""
 
     def one(tangent):
         return jax.jvp(lambda total: tape.loss.value(total, tape.frames), (tape.total,), (tangent,))[1]

@@ -1,9 +1,9 @@
 """A run recorded for gradients: its steps, in forward or reverse order, and the sums of the loss.
 
 Recorded stretches of steps are kept in memory as long as there is room. Stretches that do not fit into memory
-are run again from their first states: the same compiled program with the same state and neighbor list gives
-the same bits. A run with a fixed-point integer state need not be stored: its steps are reversed, and the
-reversed steps must lead back to the start bit for bit.
+are run again from their first states. The repeated run has the same bits, because program, state and neighbor
+list are the same. A run with a fixed-point integer state need not be stored. Its steps are reversed, and must
+lead back to the start bit for bit.
 """
 
 from __future__ import annotations
@@ -126,8 +126,8 @@ class Pace(NamedTuple):
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the number of frames per unit of time near a step. If a jump of the energy occurs earlier by
-        dt, dt times this number of frames change on average.
+        """Return the number of frames per unit of time near a step. A jump of the energy that occurs earlier
+        by dt changes, on average, dt times this number of frames.
         """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
@@ -222,9 +222,9 @@ class RunTape:
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
-        """Derivatives of the loss with respect to the energy and virial of a frame, if gradients omit jumps
-        of energy and virial at flips (as for losses of a single frame). If frames are equally spaced,
-        gradients include the jumps, and the derivatives with respect to energy and virial are set to 0.
+        """Derivatives of the loss with respect to energy and virial of a frame; (0, 0) if frames are equally
+        spaced. For other losses, such as those of a single frame, gradients omit jumps of energy and virial
+        at flips.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0

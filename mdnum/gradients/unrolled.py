@@ -1,13 +1,13 @@
 """Let JAX differentiate all operations of the steps in reverse mode, like `jax.grad` of the whole run.
 
-A chunk is a scan over a fixed number of steps with one neighbor list, which limits the memory of reverse
+A chunk is a scan over a fixed number of steps with one neighbor list. Chunks limit the memory of reverse
 mode. When the neighbor list expires, the remaining steps of the chunk are skipped, and the host builds the
-next list at the present positions. The states between chunks are stored; if memory is insufficient, every
+next list at the present positions. The states between chunks are stored. If memory is insufficient, every
 second state is dropped, and the steps between the remaining states are run again.
 
-The forward pass of the differentiated program may round differently from an ordinary run, and therefore make
-other decisions; the gradient then belongs to another trajectory. Therefore, the states and decisions of all
-steps are compared with those of an ordinary run.
+The differentiated program may round differently from an ordinary run, and then make other decisions. Its
+gradient would belong to another trajectory. Therefore, the states and decisions of all steps are compared
+with those of an ordinary run.
 """
 
 from __future__ import annotations
@@ -374,7 +374,7 @@ def marks(first: int, rows: range, x, v, bits, table: PairTable) -> Iterator[tup
 
 
 def departure(run: Mapping[int, Any], other: Mapping[int, Any]) -> dict[str, int | None]:
-    """Return the first steps at which the states, and the pairs inside the cutoff, of two programs differ."""
+    """Return the first steps with different states, and with different decisions, of two programs."""
     both = sorted(run.keys() & other.keys())
     different = [[step for step in both if run[step][k] != other[step][k]] for k in (0, 1)]
     state, decision = (steps[0] if steps else None for steps in different)

@@ -5,8 +5,8 @@ box without rotating the box ("full"). A strain or strain rate is stored as a nu
 matrix) or as a symmetric matrix. The pressure is (2 K + virial) / 3 V with the instantaneous kinetic energy
 K; the pressure tensor is Π / V with Π = Σ m v ⊗ v + Σ r ⊗ F. Volumes are sampled with the weight exp(-(U + p
 V) / k_B T) dV, and matrices h of full boxes with the measure dh / det(h)², det(h) = V. If the total momentum
-is zero, the center of mass does not contribute to the pressure, and the mean volume of an ideal gas is N k_B
-T / p; otherwise it is (N + 1) k_B T / p.
+is zero, the center of mass does not contribute to the pressure. The mean volume of an ideal gas is then N k_B
+T / p, otherwise (N + 1) k_B T / p.
 """
 
 from __future__ import annotations
@@ -164,11 +164,11 @@ class MTK(Barostat):
     """Integrator for the isothermal-isobaric ensemble, deterministic and time-reversible.
 
     Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), with the operator splitting of Tuckerman et al.,
-    J. Phys. A 39, 5629 (2006), eq. 38 ff. A step applies the thermostat chains of box and atoms, the kick of
-    the box by its excess pressure, the kick of the atoms, the drift in the changing box, and the same
-    operators in reverse order. The inertia of the box is (N_f + 3) k_B T τ_p² (a third of this value for a
-    full box). An isotropic box has one degree of freedom, a full box six. The drift over a time t is exact if
-    the box expands at a constant rate a: x(t) = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
+    J. Phys. A 39, 5629 (2006), eq. 38 ff. A step applies the thermostat chains, the kick of the box by its
+    excess pressure, the kick of the atoms and the drift, and then the same operators in reverse order. The
+    inertia of the box is (N_f + 3) k_B T τ_p² (a third of this value for a full box). An isotropic box has
+    one degree of freedom, a full box six. If the box expands at a constant rate a, the drift over a time t is
+    exact: x(t) = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -273,10 +273,10 @@ class CellRescaling(Barostat):
     In the middle of the drift, the square root of the volume is propagated by an Euler step with the present
     forces. The noise added to the square root of the volume does not depend on the volume. Velocities are
     scaled inversely to the box (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section II C). In a full
-    box, the traceless strain is also propagated by an Euler step, with noise computed from the geometric mean
-    of the volumes before and after the step (del Tatto, Raiteri, Bernetti, Bussi, Applied Sciences 12, 1139,
-    2022). From the probabilities of each step and its reverse, an effective energy (total energy minus heat
-    and work) is computed, which is conserved within the time-step error.
+    box, an Euler step also propagates the traceless strain (del Tatto, Raiteri, Bernetti, Bussi, Applied
+    Sciences 12, 1139, 2022). The noise of the strain is computed from the geometric mean of the volumes before and after
+    the step. The probabilities of each step and of its reverse give an effective energy, the total energy
+    minus heat and work. The effective energy is conserved within the time-step error.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -309,8 +309,8 @@ class CellRescaling(Barostat):
     def _forces(self, v, at):
         """Return √V, the force on √V, and the traceless part of the excess pressure tensor (see `excess`).
 
-        The force on √V is k_B T times the derivative of the logarithm of the density of √V, which is
-        proportional to √V exp(-(U + K + p V) / k_B T).
+        The force on √V is k_B T d ln P / d√V, where P ~ √V exp(-(U + K + p V) / k_B T) is the probability
+        density of √V.
         """
         root, excess = jnp.sqrt(volume(at.cell)), self.excess(self.motion(v, at.masses), at)
         part = trace(excess) / 3

@@ -1,8 +1,8 @@
 """Simulation boxes: lattice vectors, periodicity, wrapping and minimum image, on the host and in jit.
 
 Code on the host and in jit executes the same operations in the same order. Lattice vectors are subtracted as
-n * L, where n is -1, 0 or 1 for wrapped positions. The products n * L are exact, so that fused and separate
-multiplication and addition give the same bits, and numpy reproduces the results of jit.
+n * L, where n is -1, 0 or 1 for wrapped positions. The products n * L are exact. Fused and separate
+operations therefore give the same bits, and numpy reproduces the results of jit.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Cell(eqx.Module):
         """Return the largest coordinates and lattice vectors, from which rounding bounds are computed.
 
         The largest coordinates along periodic axes follow from the box. Along nonperiodic axes, the returned
-        coordinates allow every atom to move by the present extent of all atoms.
+        coordinates include a margin for motion, equal to the extent of the atoms.
 
         Args:
             positions: initial positions of the atoms, length.
@@ -125,8 +125,8 @@ class Cell(eqx.Module):
     def minimum_image(self, x, y, z):
         """Return the components of the minimum image of a displacement.
 
-        The minimum image is correct for every vector whose nearest image is shorter than half the smallest
-        perpendicular width; calling functions reject longer cutoffs.
+        The minimum image is correct if the nearest image is shorter than half the smallest perpendicular
+        width. Callers therefore reject longer cutoffs.
         """
         if not any(self.pbc):
             return x, y, z
@@ -160,7 +160,7 @@ class Cell(eqx.Module):
         return Cell(matrix, rows.T @ crossed.T / (square[0] @ crossed[0]), self.pbc, self.orthorhombic)
 
     def spent(self, x, reference: Cell, home, r_list):
-        """Return the largest displacement relative to the box plus half of `strain_loss` (inside jit).
+        """Return half of `strain_loss` plus the largest displacement relative to the box (inside jit).
 
         A neighbor list is complete as long as the sum returned by `spent` is at most half the skin.
 
@@ -211,7 +211,7 @@ def _subtract(lattice, x, y, z, n):
 
 @njit(inline="always")
 def nearest_image(lattice, x, y, z):
-    """Return, in compiled code, the minimum image of a displacement, with the bits of `Cell.minimum_image`.
+    """Return the minimum image in compiled code, with the same bits as `Cell.minimum_image`.
 
     Args:
         lattice: the box as returned by `box_of`, in the dtype of the displacement.
@@ -277,9 +277,9 @@ def wrap_positions(
 ) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
     """Wrap positions, even from far outside the box; also return the numbers of lattice vectors subtracted.
 
-    Error: the first pass subtracts n lattice vectors at once and rounds n*L; a second pass wraps positions
-    that are still outside the box due to this rounding. A wrapped coordinate may equal the edge length L
-    after L is added to a tiny negative number.
+    Error: the first pass subtracts n * L, which is rounded. A second pass wraps positions that this rounding
+    left outside the box. A wrapped coordinate may equal the edge length L after L is added to a tiny negative
+    number.
     """
     wrapped = np.array(positions, np.float64, copy=True)
     images = np.zeros(wrapped.shape, np.int64)
@@ -310,8 +310,8 @@ def strain_loss(reference: Cell, now: Cell, r_list):
     """Return an upper bound on how much a deformation of the box can shorten a distance of r_list.
 
     The deformation F maps a vector of length r_list to a vector of at least length sigma_min(F) * r_list. A
-    neighbor list is complete as long as `strain_loss` plus twice the largest displacement relative to the box
-    is at most the skin. `strain_loss` works on the host and inside jit.
+    neighbor list is complete as long as `strain_loss` plus twice the largest displacement (relative to the
+    box) does not exceed the skin. `strain_loss` works on the host and inside jit.
 
     The upper bound follows from sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|, where S is the
     symmetric part of F, t a third of the trace of F, and |.| the Frobenius norm. The upper bound requires no

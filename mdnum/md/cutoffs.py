@@ -34,7 +34,7 @@ class AtCutoff(NamedTuple):
 
 
 class Undecided(Exception):
-    """Error for an interval that contains a threshold, so that a decision cannot be proven."""
+    """Error raised if an interval contains a threshold, so that the decision cannot be proven."""
 
 
 class Cutoff(ABC):
@@ -83,8 +83,8 @@ class Cutoff(ABC):
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
         """Return energy and derivative with respect to r in float64 on the host, as a reference for `cut`.
 
-        The default method differentiates the energy of `cut` with jax; the slope returned by `cut` is not
-        used.
+        The default method differentiates the energy of `cut` with jax. It does not use the slope that `cut`
+        returns.
 
         Args:
             r, u, du: distances, bare energy and its derivative with respect to r.
@@ -104,7 +104,7 @@ class Cutoff(ABC):
     def enclose(
         self, pull: Callable[[Any], Any], energy: Callable[[Any], Any], at: AtCutoff
     ) -> Callable[[Any], Any]:
-        """Return 2 du/d(r²) of the potential u with its cutoff, in ball arithmetic, for an interval of r².
+        """Return a function that computes 2 du/d(r²) of the cut potential from r², in ball arithmetic.
 
         The default method executes the operations of `cut` one by one in ball arithmetic.
 
@@ -138,12 +138,12 @@ _ORDERS = len(_DERIVATIVES) - 1
 def check(cutoff: type[Cutoff] | Cutoff) -> None:
     """Check that a cutoff's slope is the derivative of its energy, and that its smoothness is as declared.
 
-    The test potentials are u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. Derivatives of the energy with
-    respect to r² (nested jvp) are computed at a distance of 2⁻⁴⁶ from r_cut and on both sides of the onset,
-    up to one order above the declared smoothness. The derivative one order above the declared smoothness must
-    jump for at least one test potential. An energy difference above 1e-9 u(r_cut) counts as a jump, and so
-    does a difference of derivative k above 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k. Jumps at other distances
-    and jumps of derivatives beyond the sixth are not detected.
+    The test potentials are u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. The energy and its derivatives
+    with respect to r² (nested jvp) are evaluated within 2⁻⁴⁶ of the onset and of r_cut. The highest
+    derivative, one order above the declared smoothness, must jump for at least one test potential. An energy
+    difference above 1e-9 u(r_cut) counts as a jump. A difference of derivative k counts as a jump if it
+    exceeds 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k. Jumps at other distances and jumps of derivatives beyond
+    the sixth are not detected.
 
     Raises:
         ValueError: the test fails; the message contains the quantity and the distance.
@@ -161,7 +161,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
 
 
 def _ends(made: Cutoff, power: int) -> bool:
-    """Check a cutoff of u = r^(-2 power); return True if a derivative jumps that is allowed to jump."""
+    """Check a cutoff of u = r^(-2 power); return True if the derivative above the smoothness jumps."""
     import jax
     import jax.numpy as jnp
 

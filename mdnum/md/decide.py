@@ -1,7 +1,7 @@
 """Decisions on which pairs are inside the cutoff, by the comparison that the system file specifies.
 
 The compared quantity and its threshold are defined only in this module. The force loop, the check of neighbor
-lists and the host code that writes the ledger use this module, so that their results are bitwise the same.
+lists and the code that writes the ledger use this module. Their decisions are therefore bitwise the same.
 """
 
 from __future__ import annotations
@@ -83,10 +83,10 @@ class PairDecider:
     def bounds(self) -> tuple[float, ...]:
         """Bounds on |computed margin - exact margin| by pair type, in units of the compared r or r².
 
-        The exact margin follows from the stored positions, and from the box and the threshold in double
-        precision (error analysis: numerics.rounding). The bound is evaluated at a distance of 1.001 r_cut,
-        and holds for every pair up to this distance. For more distant pairs, the decision is correct, or the
-        margin is within the bound. If atoms are beyond `reach`, `bounds_at` gives valid bounds.
+        The exact margin is that of the stored positions, with box and threshold in double precision. For the
+        error analysis, see numerics.rounding. The bound is evaluated at a distance of 1.001 r_cut, and holds
+        for every pair up to this distance. For more distant pairs, the decision is correct, or the margin is
+        within the bound. If atoms are beyond `reach`, `bounds_at` gives valid bounds.
         """
         return tuple(float(bound) for bound in self._bounds(None))
 
@@ -97,9 +97,9 @@ class PairDecider:
         return narrows and len(self.reach.lattice) < 3
 
     def bounds_at(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows types"]:
-        """Return margin bounds of several states, larger if atoms are beyond `reach` on a nonperiodic axis.
+        """Return margin bounds of several states, with larger bounds for atoms beyond `reach`.
 
-        The rounding error of a position increases with its magnitude; positions are not wrapped along
+        The rounding error of a position increases with its magnitude. Positions are not wrapped along
         nonperiodic axes.
 
         Args:

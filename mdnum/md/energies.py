@@ -130,7 +130,7 @@ class Call:
 
 @jax.custom_jvp
 def _real_slope(x: Array, inverse: Array) -> Array:
-    """Return fractional coordinates with the derivatives of real coordinates, as jax-md does."""
+    """Return fractional coordinates, but differentiate as if they were real coordinates, like jax-md."""
     return x @ inverse
 
 

@@ -1,13 +1,13 @@
 """Simulations with fixed-point numbers: positions, momenta and pair forces are multiples of fixed units.
 
 All units are powers of two, so that integer multiples of a unit are stored exactly as doubles, in the same
-arrays as floating-point positions. Sums of integers do not depend on the order of summation, squared
-distances in pair decisions have no rounding error, and a step that adds an integer is reversed by subtracting
+arrays as floating-point positions. Sums of integers do not depend on the order of summation. Squared
+distances in pair decisions have no rounding error. A step that adds an integer is reversed by subtracting
 this integer.
 
-A pair force is computed in float64 from the exact integer distance, by operations that every compiler rounds
-in the same way, and is then rounded to the unit of force. The forces on both atoms are exactly opposite, so
-that momentum is conserved to the last bit. Forces do not depend on atom labels or on the neighbor list.
+A pair force is computed in float64 from the exact integer distance, by operations that round equally with
+every compiler. The force is then rounded to its unit. The forces on both atoms are exactly opposite, so that
+momentum is conserved to the last bit. Forces do not depend on atom labels or on the neighbor list.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class FixedPointDecider(PairDecider):
 
     The squared distance is an integer in units of the squared spacing. Every comparison is converted to the
     form `r2 < limit` with an integer limit. For margins, the threshold is half a unit below the integer
-    limit, so that margins are never zero and have no rounding error.
+    limit. Margins are therefore never zero and have no rounding error.
     """
 
     spacing: float = 1.0  # of positions, length
@@ -378,7 +378,7 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
 
 
 def _period(kept: int) -> int:
-    """Return the number of steps before an integer that grows by a factor 2^24/kept per step may overflow."""
+    """Return after how many steps an integer may overflow if it grows by a factor of 2^24/kept per step."""
     if not 0 < kept < 2**_SHIFT:
         return 0
     growth = 2**_SHIFT / kept
@@ -387,7 +387,7 @@ def _period(kept: int) -> int:
 
 
 def forgotten_bits(integrator: Integrator) -> float:
-    """Return the bits per step that friction removes from a momentum component; 0 without a thermostat."""
+    """Return how many bits of a momentum component friction removes per step; 0 without a thermostat."""
     if isinstance(integrator, Langevin):
         return float(integrator.friction) * float(integrator.timestep) / math.log(2)
     return 0.0

@@ -81,10 +81,10 @@ def _layered(x, start, bins):
 
 @njit
 def _runs(b0, b1, box, run, shift):
-    """Find the runs of bins near a column of bins in a layer, and the lattice vector that shifts each run.
+    """Find ranges of bins near a column of bins in a layer, and the lattice vector that shifts each range.
 
     Returns:
-        number of runs, and the run that contains the column. run: index along the first axis, first and last
+        number of ranges, and the range that contains the column. run: index along the first axis, first and last
             index along the second.
     """
     bins, reach, periodic, matrix = box

@@ -144,7 +144,7 @@ class Integrator(eqx.Module):
 
     @property
     def random(self) -> Any:
-        """Random key, as an array; None if there is no noise; inside eqx.tree_at, any object is allowed."""
+        """Random key, as an array; None if there is no noise."""
         field = self.keys().get("seed")
         return None if field is None else getattr(self, field.name)
 

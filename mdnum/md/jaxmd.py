@@ -46,7 +46,7 @@ def displacement(
 
     The image is chosen by rounding fractional coordinates, and integer multiples of lattice vectors are
     subtracted. If no image is needed, the displacement is the exact difference of the coordinates. Positions
-    may lie outside the box, and derivatives with respect to the cell (stress) are those of the chosen image.
+    may lie outside the box. Derivatives with respect to the cell (stress) are those of the chosen image.
 
     Args:
         cell: lattice vectors as rows, length; orthorhombic or triclinic.

@@ -65,8 +65,8 @@ class Members(Columns):
 class FlipTable(Columns):
     """Table with one row per flip, sorted by (step or frame, i, j, rank).
 
-    In a run of mdnum, a flip is a change of the decision used for the forces of a pair between two steps. For
-    given positions, such as those of a trajectory, flips are computed from the positions in each frame.
+    In a run of mdnum, a pair flips if the decision used for its force changes between two steps. For given
+    positions, such as those of a trajectory, flips are computed from the positions in each frame.
     """
 
     i: Int[np.ndarray, "flips"]  # the pair, as in `Members`

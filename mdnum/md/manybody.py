@@ -33,8 +33,8 @@ class ManyBody(eqx.Module):
     """Base class of potentials whose energy is not a sum over pairs.
 
     Pair decisions are made before the energy is evaluated: the neighbor list contains only pairs inside the
-    cutoff, and an entry equal to the number of atoms is padding. Every potential also tests r < r_cut, so
-    that a neighbor list with a skin gives the same energy.
+    cutoff. An entry equal to the number of atoms is padding. Every potential also tests r < r_cut, so that a
+    neighbor list with a skin gives the same energy.
 
     Attributes:
         pbc: which axes are periodic.
@@ -81,7 +81,7 @@ class ManyBody(eqx.Module):
         cell: Float[Array, "3 3"],
         deformation: Float[Array, "3 3"],
     ) -> Float[Array, ""]:
-        """Return the energy if positions and lattice vectors (rows) are multiplied by a matrix near 1."""
+        """Return the energy after multiplying positions and lattice vectors (rows) by a matrix near unity."""
         return self.energy(positions @ deformation, neighbor, cell @ deformation)
 
     def forces(

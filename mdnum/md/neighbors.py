@@ -97,7 +97,7 @@ class PairTable:
         return (i + channel * len(self.order))[keep], j[keep]
 
     def listed(self, channels: int = 1) -> tuple[Int[np.ndarray, "pairs"], ...]:
-        """Return both sorted indices, and i and j as in `decided`, of every pair in every channel."""
+        """Return, for every pair in every channel, both sorted indices, and i and j as `decided` does."""
         slots, first = np.nonzero(self.index < len(self.order))
         second = self.index[slots, first]
         i, j = self.order[first], self.order[second]
@@ -127,7 +127,7 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Return neighbor table, atom order, largest neighbor count (if above `slots`, pairs are missing)."""
+        """Return the neighbor table, atom order and largest count; above `slots`, pairs are missing."""
         ...
 
 

@@ -2,9 +2,9 @@
 
 Every pair is evaluated twice, once for each atom. Each atom sums over its neighbors in a fixed order, without
 scattered writes. In double precision on a CPU, forces are computed by one compiled loop (`md.kernel`). On
-other devices, or in other precisions, XLA evaluates a group of neighbor slots for all atoms at once and packs
-the decisions into bits, so that temporary arrays fit in the cache. Evaluating all slots of all atoms at once
-would take twice as long for 4,000 atoms and ten times as long for 32,000 atoms.
+other devices or in other precisions, XLA evaluates one group of neighbor slots for all atoms at a time.
+Decisions are packed into bits, so that temporary arrays fit in the cache. Evaluating all slots at once would
+take twice as long for 4,000 atoms and ten times as long for 32,000 atoms.
 """
 
 from __future__ import annotations
@@ -376,10 +376,10 @@ def _in_one_loop_jvp(primals, tangents, *, decisions: bool, tensor: bool):
 def imposed(
     inside: Bool[Array, "4 atoms"], given: UInt8[Array, "atoms"], where: UInt8[Array, "atoms"] | None
 ) -> Bool[Array, "4 atoms"]:
-    """Return the decisions in a group of slots: imposed if given for a slot, otherwise computed (`inside`).
+    """Return the decisions on a group of slots: imposed decisions if given, otherwise computed (`inside`).
 
-    With a simple mask, the compiler computes distances twice: a step of 864 atoms takes 2.2 times as long as
-    without imposed decisions. The factor is 1.3 with a mask per slot (`unpacked`), and 1.2 with this code.
+    With a simple mask, distances are computed twice, and a step of 864 atoms takes 2.2 times as long as
+    usual. The step takes 1.3 times as long with a mask per slot (`unpacked`), and 1.2 times with this code.
 
     Args:
         where: slots in which decisions are imposed; None for all.
@@ -390,7 +390,7 @@ def imposed(
 
 
 class Guarded(eqx.Module):
-    """A potential with cutoff, evaluated by `how`: with every operation rounded, or reproducibly."""
+    """A potential with cutoff; `how` makes every operation rounded, or makes results reproducible."""
 
     model: CutPotential
     zero: Int[Array, ""]
@@ -562,7 +562,7 @@ class PairDynamics(eqx.Module):
     tables: Tables  # the list
 
     def margins(self, state: MdState) -> Float[Array, "groups 4 atoms"]:
-        """Return the margin (threshold minus r or r²) of every slot, positive inside; -inf for padding."""
+        """Return margins (threshold minus r or r², positive inside) of all slots; -inf for padding slots."""
         judge = self.force.judge(state.x)
         index, types = self.tables.groups()
 

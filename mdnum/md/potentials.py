@@ -85,7 +85,7 @@ class PairPotential(eqx.Module):
         return self
 
     def split(self) -> tuple[Any, Any]:
-        """Return two copies of the potential: with only per-pair-type and with only shared parameters."""
+        """Return two copies: one with only per-pair-type parameters, and one with only shared parameters."""
         return self, jax.tree.map(lambda _: None, self)
 
     @property
@@ -421,7 +421,7 @@ class CutPotential(eqx.Module):
         return self.cutoff.cut(r2, u, w, here, *weights)
 
     def jumps(self) -> Float[np.ndarray, "2 terms types"]:
-        """Return energy and radial-force jumps when a weight-1 pair enters the cutoff, by term and type."""
+        """Return jumps of energy and radial force if a weight-1 pair enters the cutoff, by term and type."""
         # in numpy: to jax each operation on these few numbers is a program to compile
         made = self.cutoff.jumps(jax.tree.map(np.asarray, self).at_cutoff())
         return np.array(made).swapaxes(0, 1)

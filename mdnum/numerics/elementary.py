@@ -8,8 +8,8 @@ a function is run operation by operation, as in the compiled force loop.
 Arguments and results are float64. Subnormal arguments are treated as 0. Results below 2.2261e-308 are 0, and
 results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps; an ulp is the spacing of
 the floats at the result. The error bound of the exponential was derived by counting roundings. Every other
-bound is at least 1.3 times the largest error measured, for 100,000 arguments of error functions and for ten
-million arguments of other functions (docs/compiled-loop.md).
+bound is at least 1.3 times the largest measured error. Errors were measured for 100,000 arguments of error
+functions and for ten million arguments of other functions (docs/compiled-loop.md).
 """
 
 from __future__ import annotations

@@ -67,9 +67,9 @@ def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -
 def root(x: jax.Array) -> jax.Array:
     """Return the square root, correctly rounded on every device.
 
-    On an H200 GPU, XLA's float32 square root has an error of one ulp for one number in six. A float64
-    square root that is rounded to float32 is correct, because 53 bits are at least 2 * 24 + 2 bits (Figueroa
-    1995, "When is double rounding innocuous?").
+    On an H200 GPU, XLA's float32 square root has an error of one ulp for one number in six. A float64 square
+    root, rounded to float32, is correctly rounded, because 53 >= 2 * 24 + 2 (Figueroa 1995, "When is double
+    rounding innocuous?").
     """
     if x.dtype != jnp.float32 or jax.default_backend() == "cpu":
         return jnp.sqrt(x)

@@ -1,7 +1,7 @@
 """Sums that do not depend on the order of the terms, and the registry of all summation orders.
 
-A finite float is an integer multiple of its format's smallest subnormal number. The exact sum adds the
-integers of all terms in a long accumulator (Kulisch & Miranker 1986), stored as 32-bit limbs in int64, and
+A finite float is an integer multiple of its format's smallest subnormal number. The exact sum expresses all
+terms as integers, adds the integers in a long accumulator of 32-bit limbs (Kulisch & Miranker 1986), and
 rounds once. The fixed-point sum rounds every term to a coarser unit, so that one int64 can hold the sum.
 """
 

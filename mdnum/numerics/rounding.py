@@ -2,7 +2,7 @@
 
 A displacement is x_j - x_i minus at most one lattice vector for each periodic axis, rounded after every
 subtraction. The squared components of the displacement are added in the order x, y, z. The error of each
-rounding is proportional to the magnitude of the rounded result; the class `Reach` bounds the magnitudes.
+rounding is proportional to the magnitude of the rounded result. The class `Reach` bounds the magnitudes.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Reach:
         return cls(tuple(_three(row) for row in lattice), _three(coordinate))
 
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
-        """Return the sum of |lattice-vector components| in all rounded results, and the number of roundings.
+        """Return the sum of |lattice components| over all rounded results, by axis, and the rounding count.
 
         After the first subtraction, a component of the displacement is d + n_1 a_1 + n_2 a_2 + n_3 a_3, where
         d is its final value and each n is -1, 0 or 1. Each further subtraction of a lattice vector removes
@@ -91,7 +91,7 @@ class Reach:
         return sizes, most
 
     def narrowed(self, dtype: DTypeLike) -> Float[np.ndarray, "3"]:
-        """Return the sum of rounding errors (lengths) of all lattice vectors in a dtype, for each axis."""
+        """Return, for each axis, the summed error (a length) of rounding all lattice vectors to a dtype."""
         lattice = np.array(self.lattice, np.float64).reshape(-1, 3)
         return np.abs(lattice.astype(dtype).astype(np.float64) - lattice).sum(axis=0)
 
@@ -110,7 +110,7 @@ def displacement_bound(
     digits than `dtype`, the positions of both atoms are first rounded. If float64 has more digits than
     `dtype`, the lattice vectors of the box are also rounded. The exact displacement is defined by the
     positions of the state and the box of the system file. The nearest image found in `dtype` must be the true
-    nearest image, so r_cut must be below half the box width by more than the rounding error.
+    nearest image. Therefore, r_cut must be below half the box width by more than the rounding error.
 
     Args:
         r: length(s) of the displacement.

@@ -1,11 +1,11 @@
 """Summation orders and their error bounds.
 
-A summation order is used in two ways. The force loop of molecular dynamics passes blocks of terms, and a
-partial sum is carried from block to block, so that the terms of a whole neighbor list are never stored at
-once. A summation order that needs all terms stores the terms and adds them at the end. Code outside of the
-force loop passes a whole array and gets the sum over the first axis, which is rounded after every addition
-and has the same bits as a numpy loop in the dtype of the terms. `jnp.sum` differs from every summation order
-in this module: `jnp.sum` adds 16-bit terms in float32, which hides the effect of a 16-bit accumulator.
+A summation order is used in two ways. The force loop of molecular dynamics passes blocks of terms and carries
+a partial sum from block to block. The terms of a whole neighbor list are therefore never stored at once. A
+summation order that needs all terms stores the terms and adds them at the end. Code outside of the force loop
+passes a whole array and gets the sum over the first axis. The sum is rounded after every addition and has the
+same bits as a numpy loop in the dtype of the terms. `jnp.sum` differs from every summation order in this
+module: `jnp.sum` adds 16-bit terms in float32, which hides the effect of a 16-bit accumulator.
 
 The derivative of every sum is that of the exact sum, because rounding and order have no derivative.
 """
@@ -89,8 +89,8 @@ class Reduction:
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
         """Return a bound on the difference between the computed and the exact sum, in float64.
 
-        The bound holds if no sum overflows or is subnormal (XLA on a CPU flushes subnormal numbers of every
-        dtype except float16 to zero).
+        The bound holds if no sum overflows or is subnormal. XLA on a CPU flushes subnormal numbers to zero in
+        every dtype except float16.
         """
         factor = gamma(self.depth(len(terms)), terms.dtype)
         return np.asarray((factor if factor >= 0 else np.inf) * np.abs(terms.astype(np.float64)).sum(axis=0))
@@ -101,7 +101,7 @@ class Reduction:
 
 
 def in_order(terms, add, start=None):
-    """Return ((0 + t0) + t1) + ... (or with `start` instead of 0) by a scan, which XLA does not reorder; the
+    """Return ((0 + t0) + t1) + ... (or with `start` instead of 0) by a scan, which XLA does not reorder. The
     scan is unrolled, because a step of a loop costs more than an addition.
     """
     total, _ = lax.scan(
@@ -167,8 +167,8 @@ def _levels(terms, add, width: int):
 class Blocked(Reduction):
     """A summation tree: each node adds `width` adjacent terms from left to right, like GPU thread blocks.
 
-    The error is at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 gives the balanced tree; a width
-    not below the number of terms gives a sequential loop.
+    The error is at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 gives the balanced tree. A width
+    of at least the number of terms gives a sequential loop.
     """
 
     width: int = 32  # children of a node, at least 2

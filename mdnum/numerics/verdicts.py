@@ -4,11 +4,11 @@ A flip is a cutoff decision that differs between two runs. The verdict compares 
 counterfactual run, which has the arithmetic of the second run but the cutoff decisions of the first run. If
 the counterfactual run stays close to the first run, the flips caused the split. If the counterfactual run
 also splits from the first run, repeats of the pair of runs decide whether the flips accelerated the split or
-are bystanders. Repeats are evaluated by a sequential sign test. If the probability that a pair of runs splits
-later without the flips is at most 1/2, the probability that k or more of n pairs do so is at most that of k
-or more heads in n coin tosses, for any delays. The initial displacements of all repeats have the same size.
-If the majority is different for displacements of another size, the verdict is left open. Error rates are
-listed in docs/verdict-calibration.md.
+are bystanders. Repeats are evaluated by a sequential sign test. Assume that a pair of runs splits later
+without the flips with a probability of at most 1/2. Then k or more of n pairs do so with at most the
+probability of k or more heads in n coin tosses, for any delays. The initial displacements of all repeats have
+the same size. If the majority is different for displacements of another size, the verdict is left open. Error
+rates are listed in docs/verdict-calibration.md.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
     """Return, for each stage of the sequential sign test, the number of run pairs and how many must agree.
 
     The allowed error probability is used up in proportion to the number of pairs (Lan and DeMets, Biometrika
-    70, 659, 1983). For fair coin tosses, the probability that the test has stopped with a given result by
-    some stage is at most the error probability times the fraction of pairs used.
+    70, 659, 1983). For fair coin tosses, the probability of a given result by some stage is at most the error
+    probability times the fraction of pairs used until then.
 
     Args:
         pairs: largest number of pairs of runs.
@@ -129,7 +129,7 @@ class Count:
 
     @property
     def wanted_for_majority(self) -> int:
-        """Number of further run pairs that decide the majority if all agree; 0 if decided or impossible."""
+        """Run pairs still needed to decide the majority if all agree; 0 if decided or impossible."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -212,8 +212,8 @@ class Growth:
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
     """Return the growth rate of a quantity, its standard error, and whether growth is faster than linear.
 
-    The rate per row and its standard error are estimated from the logarithm of the quantity in blocks of the
-    later rows. The result is NaN, NaN, False if there are too few rows, or if numbers are not finite.
+    The rate is the slope of the logarithm over the later rows, with a standard error from blocks of rows. The
+    result is NaN, NaN, False if there are too few rows, or if numbers are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
@@ -245,8 +245,8 @@ def _last_seen(separation: Float[np.ndarray, "steps"]) -> int:
 def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
     """Fit the exponential growth rate of the distance between two runs, before the distance saturates.
 
-    The fit uses the steps before the split at which the distance is between 1e-12 and 0.1 times the
-    tolerance. Steps up to the last smaller distance are omitted. A low r_squared of the fit indicates noise.
+    The fit uses steps before the split, with distances between 1e-12 and 0.1 times the tolerance. Steps up to
+    the last distance below this range are omitted. A low r_squared of the fit indicates noise.
 
     Args:
         separation: of each step, length; NaN after a run ended.
@@ -277,7 +277,7 @@ def expected(
 ) -> float | None:
     """Predict the number of further steps until two runs split, or return None if this is impossible.
 
-    A prediction requires continued exponential growth: in the later half of the fitted steps, the distance
+    A prediction requires continued exponential growth. In the later half of the fitted steps, the distance
     between the runs must grow by several e-foldings, at a rate within a factor of 2 of the overall rate.
 
     Args:
@@ -516,7 +516,7 @@ class Share:
 
 
 def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:
-    """Return when each combination of A's or B's arithmetic and decisions splits from run A and from run B.
+    """For each combination of the arithmetic and decisions of A and B, return when it splits from A and B.
 
     Args:
         series: separations at each step, length, by the names "B" and those in SERIES; NaN after a run ended.
@@ -541,7 +541,7 @@ def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -
 
 
 def shares(cells: tuple[SplitCell, ...], rate: float) -> tuple[Share, ...]:
-    """Return how much decisions and arithmetic contribute to a split, with run A and run B as references.
+    """Return by how many steps decisions and arithmetic advance a split, with runs A and B as references.
 
     Args:
         cells: result of `table`.

@@ -1,8 +1,8 @@
 """Diagnose a simulation's gradient: up to which step it can be trusted, and what contributes to it.
 
-Gradient methods compute different quantities: the derivative of the steps, the derivative of the flow with
-changes of flip times, the slope of the loss between shifted runs, the slope of an average, or the derivative
-of another program. The function `agreement` gives the reason for each difference between two gradients.
+Gradient methods compute different quantities: derivatives of the time steps, derivatives that include changes
+of flip times, slopes of the loss between shifted runs, slopes of an average, or derivatives of another
+program. The function `agreement` gives the reason for each difference between two gradients.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""For a finite run, search for the first operation of the reverse pass with a result that is not finite.
+"""Search for the first operation of a reverse pass whose result is not finite, although the run is finite.
 
 For example, a force can be finite while its derivative is not, a loss can contain a square root at zero, or a
-sum can overflow in the reverse pass. The reverse pass is repeated up to the first step that gives a number
-that is not finite, and this step is run operation by operation. An operation is the cause if its inputs are
-finite, its result is not finite, and replacing its result by a finite number makes the program's result
-finite; the last condition excludes numbers that are masked out later.
+sum can overflow in the reverse pass. The reverse pass is repeated up to the first step that gives a
+non-finite number. The operations of this step are then run one by one. An operation is the cause if its
+inputs are finite, its result is not finite, and a finite number in place of the result makes the program's
+result finite. The last condition excludes numbers that are masked out later.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFi
 
 
 def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
-    """Return the arguments of a reverse pass over a range of rows (steps of a stretch)."""
+    """Return the arguments of a reverse pass, restricted to a range of rows (steps of a stretch)."""
     out = list(arguments)
     for k in (4, 5, 7):
         out[k] = jax.tree.map(lambda leaf: leaf[first:end], out[k])
@@ -152,7 +152,7 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 def _pair(
     back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
-    """Return both atoms and the distance of the pair with a given result; -1, -1, NaN if there is no pair."""
+    """Return the atoms and distance of the pair to which a result belongs; -1, -1, NaN if there is none."""
     nowhere = (-1, -1, float("nan"))
     if made is None or not made.index:
         return nowhere

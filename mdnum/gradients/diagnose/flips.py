@@ -1,13 +1,13 @@
 """Contribution of each flip to a gradient, and parameter values at which flips and the gradient change.
 
-The contribution of a flip to a gradient is a product of two factors. The first factor of a contribution, from
-a reverse pass, is the derivative of the loss with respect to the cutoff of one crossing alone, including the
-effect of later flips. The second factor, from tangents without flips, is the derivative of the cutoff minus
-that of the pair distance. The contributions of single flips therefore sum exactly to that of all flips.
+The contribution of a flip to a gradient is a product of two factors. The first factor, from a reverse pass,
+is the derivative of the loss with respect to the cutoff of one crossing. It includes the effect of later
+flips. The second factor, from tangents without flips, is the derivative of the cutoff minus that of the pair
+distance. The contributions of single flips sum exactly to that of all flips.
 
-A decision boundary is a value of a parameter at which the decision on a pair changes, between two adjacent
-floats. Between two boundaries all runs make the same decisions, and loss and gradient are smooth functions of
-the parameter. Gradients on both sides of a boundary show whether an optimizer step across it is useful.
+A decision boundary is a parameter value, between two adjacent floats, at which a pair decision changes.
+Between two boundaries all runs make the same decisions, and loss and gradient are smooth functions of the
+parameter. Gradients on both sides of a boundary show whether an optimizer step across it is useful.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _FIRST, _FACTOR = 1e-12, 8.0
 class FlipTerms:
     """Contributions of all flips to the derivative with respect to each parameter entry, largest first.
 
-    A number in the table is a scalar parameter or one entry of an array parameter ("potential.sigma[1]").
+    In column names, a number is a scalar parameter or one array entry, such as "potential.sigma[1]".
     """
 
     # a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the decision,
@@ -211,7 +211,7 @@ def edges(
 
 
 def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[int, float]:
-    """Predict by tangents the smallest parameter shift of either sign at which a pair crosses its cutoff."""
+    """Use tangents to predict the smallest parameter shifts, up and down, at which a pair crosses r_cut."""
     if name == "box.scale":
         # the images move too, which these differences of positions leave out
         return {-1: np.inf, 1: np.inf}
@@ -285,7 +285,7 @@ def _edge(
 
 
 def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:
-    """Return the loss of a simulation, and its derivative with respect to one parameter, from two methods."""
+    """Return the loss, and its derivative with respect to one parameter by two gradient methods."""
     there = Problem(simulation, problem.loss, problem.steps)
     tape = tape_of(there, True)
     found = {

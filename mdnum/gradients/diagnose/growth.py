@@ -1,13 +1,13 @@
 """Growth of a gradient and of perturbations with the number of steps, and overflow in narrow formats.
 
 The cotangent of the state h steps before the end is the gradient of a run of h steps (horizon h) from this
-state. One reverse pass over T steps therefore gives gradients for all horizons up to T; each gradient belongs
-to a different start on the same trajectory. Cotangents of a chaotic run span many powers of two: a loss scale
+state. One reverse pass over T steps therefore gives gradients for all horizons up to T. Each gradient belongs
+to a different start on the same trajectory. Cotangents of a chaotic run span many powers of two. A loss scale
 helps if all cotangents are small, but not if their range exceeds that of the narrow format.
 
 The largest singular value of a run's Jacobian bounds the gradient of any loss of the last state. Singular
-values are computed by subspace iteration with a random block (Halko, Martinsson and Tropp 2011), which is
-orthonormalized after every stretch of steps to prevent overflow and parallel vectors.
+values are computed by subspace iteration with a random block of vectors (Halko, Martinsson and Tropp 2011).
+The block is orthonormalized after every stretch of steps, to prevent overflow and parallel vectors.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class GrowthWatch:
 
     def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> GradientGrowth:
         """Return the norms of the gradient by horizon, and their growth rate. The last row is the gradient of
-        the whole run, because cotangents of single steps omit a dependence of the loss on the first frame.
+        the whole run; the other rows omit how the loss depends on the first frame.
         """
         units = self.simulation.units
         timestep = float(self.simulation.integrator.timestep)
@@ -141,7 +141,7 @@ class GrowthWatch:
 
 
 def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
-    """Return the word from WORDS that describes the growth of a gradient and outliers of the rms speed."""
+    """Return the word from WORDS that tells whether the gradient and the rms speed stay bounded."""
     usual = float(np.median(speed))
     if usual > 0 and not (np.isfinite(speed).all() and speed.max() <= _WILD * usual):
         return WORDS[2]
@@ -252,7 +252,7 @@ class ScalingWatch:
 class Spectrum:
     """Growth of small perturbations of the initial state: singular values of the Jacobian of the whole run.
 
-    The norm of a perturbation combines positions, and velocities times the internal time `clock`.
+    The norm of a perturbation includes the velocities, multiplied by the internal time `clock`.
     """
 
     steps: int  # of the run

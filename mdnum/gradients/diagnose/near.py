@@ -1,14 +1,14 @@
 """Pairs whose distance has an extremum near the cutoff: contributions of flips that almost happened.
 
 A pair that turns back just outside its cutoff causes no flip. If the pair came slightly closer, it would
-enter and leave at a radial speed near zero, and the contribution of each crossing to the gradient would be
-proportional to the inverse of this speed. Conversely, if a pair comes inside the cutoff by only a small
+cross the cutoff twice at a radial speed near zero. The contribution of a crossing to the gradient is
+proportional to the inverse of the radial speed. Conversely, if a pair comes inside the cutoff by only a small
 distance, a small perturbation can remove both crossings and their contribution. Therefore, all turning points
-near the cutoff are examined: on both sides of the cutoff, and also between two steps.
+near the cutoff are examined, on both sides and also between two steps.
 
 Near the turning point the distance is r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth
-d crosses the cutoff twice at speed sqrt(2 a d), and the two crossings contribute 2 w / sqrt(2 a d), where w
-is the contribution of one crossing at unit speed.
+d crosses the cutoff twice at speed sqrt(2 a d). If w is the contribution of one crossing at unit speed, the
+two crossings contribute 2 w / sqrt(2 a d).
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class Turns:
 
 @dataclass
 class Near:
-    """Collector of extrema of pair distances, with derivatives, and with shifts of extrema in other runs."""
+    """Collector of extrema of pair distances, of their derivatives, and of their shifts in other runs."""
 
     simulation: Simulation
     pace: Pace  # how often the loss looks

@@ -246,11 +246,11 @@ class Trust(Judgment):
 
 
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
-    """Return a simulation with different rounding, for comparison, and formats in use narrower than float64.
+    """Return a simulation that rounds differently, and the formats in use that are narrower than float64.
 
     If the given run uses formats narrower than float64, the run for comparison is in float64. No hardware
-    format is wider than float64: a float64 run is compared with a run whose start is shifted by one rounding
-    error. The shifted start shows how rounding affects the gradient, up to a factor of order one.
+    format is wider than float64. A float64 run is therefore compared with a run whose start is shifted by one
+    rounding error. The shifted start shows how rounding affects the gradient, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -440,7 +440,7 @@ def _missed(
     problem: Problem, own: Horizons, turns: Turns | None, unseen, made: ReversePass, moved, tolerance: float,
     saltation: bool, names: Sequence[str],
 ) -> Limit:  # fmt: skip
-    """Find the last step up to which excluded flips and near misses of the cutoff have negligible effects."""
+    """Find the last step up to which omitted flips and near misses have negligible effects on a gradient."""
     if not np.any(np.asarray(problem.simulation.jumps())):
         return Limit(NEAR, problem.steps, False, "no jump")
     if not saltation:
@@ -475,7 +475,7 @@ def _missed(
 
 
 def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
-    """Divide contributions by derivatives; return the ratios and their cumulative sums in quadrature."""
+    """Return contributions divided by derivatives, and the cumulative root sum of squares of these ratios."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
         share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))
@@ -486,7 +486,7 @@ def _left_out(
     made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
     tolerance: float,
 ) -> Limit | None:  # fmt: skip
-    """Return a limit if gradients omit a large contribution of grazing flips or of jumps of the loss."""
+    """Return a limit if grazing flips or jumps of the loss, which gradients omit, contribute too much."""
     tape, met = made.tape, made.crossings[::-1]
     energy, virial, speed, weight, slow = (
         joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")
@@ -546,7 +546,7 @@ def last_agreeing(
 ) -> tuple[int, bool]:
     """Return the longest horizon at which all values are below a limit, and whether a longer horizon exists.
 
-    Disagreement of two gradients at shorter horizons is ignored: the relative error due to the time step may
+    Disagreement of two gradients at shorter horizons is ignored. The relative error due to the time step may
     decrease again, and a single flip among few may contribute a large part of the gradient. If two gradients
     agree at one horizon, but not at adjacent horizons, the agreement is regarded as chance.
     """
@@ -558,7 +558,7 @@ def last_agreeing(
 
 
 def ambiguity(problem: Problem) -> Limit:
-    """Find the first decision of the run with a margin that is smaller than its rounding bound."""
+    """Find the first decision of the run whose margin is smaller than its rounding bound."""
     recorder = PairRecorder(problem.simulation)
     for segment in Engine(problem.simulation, problem.steps).segments():
         close = recorder.doubtful(segment)
