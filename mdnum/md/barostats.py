@@ -274,9 +274,9 @@ class CellRescaling(Barostat):
     forces. The noise added to the square root of the volume does not depend on the volume. Velocities are
     scaled inversely to the box (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section II C). In a full
     box, an Euler step also propagates the traceless strain (del Tatto, Raiteri, Bernetti, Bussi, Applied
-    Sciences 12, 1139, 2022). The noise of the strain is computed from the geometric mean of the volumes before and after
-    the step. The probabilities of each step and of its reverse give an effective energy, the total energy
-    minus heat and work. The effective energy is conserved within the time-step error.
+    Sciences 12, 1139, 2022). The noise of the strain is computed from the geometric mean of the volumes
+    before and after the step. The probabilities of each step and of its reverse give an effective energy, the
+    total energy minus heat and work. The effective energy is conserved within the time-step error.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
