@@ -84,8 +84,8 @@ def _runs(b0, b1, box, run, shift):
     """Find ranges of bins near a column of bins in a layer, and the lattice vector that shifts each range.
 
     Returns:
-        number of ranges, and the range that contains the column. run: index along the first axis, first and last
-            index along the second.
+        number of ranges, and the range that contains the column. run: index along the first axis, first and
+            last index along the second.
     """
     bins, reach, periodic, matrix = box
     found = middle = 0
