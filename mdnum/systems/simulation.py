@@ -173,7 +173,7 @@ class Simulation:
 
     @cached_property
     def force(self) -> PairForce | ManyBodyForce:
-        """Function that computes forces and cutoff decisions from a neighbor list; callable inside jit."""
+        """Function that computes forces and cutoff decisions from a neighbor list, also inside jit."""
         # kept for later calls, so it must hold no tracer even where its first use is inside a jit
         with jax.ensure_compile_time_eval():
             parts = (self.model, self.cell, self.decider, self.policy, self.reduction)
@@ -211,7 +211,7 @@ class Simulation:
         return self.file.program if self.file is not None else describe.program(self)
 
     def write(self, folder: str | Path) -> None:
-        """Write a folder with the system file and the structure, or with a description of the objects."""
+        """Write the system file and the structure, or a description of the objects, to a folder."""
         describe.write(self, Path(folder))
 
     def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
@@ -246,21 +246,21 @@ class Simulation:
         return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
 
     def first_atoms(self, i: Any) -> dict[str, Any]:
-        """Return the first atom of each cutoff decision, and the potential term if decisions are per term."""
+        """Return the first atom of each decision, and the potential term if terms have separate decisions."""
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """Return a table column with the potential term of each decision; no column if terms share them."""
+        """Return a table column with the term of each decision; no column if all terms share decisions."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])
         return {"terms": names[kind // self.pair_types]}
 
     def pair_of(self, i: int, j: int) -> dict[str, Any]:
-        """Return a table row with both atoms of a pair, and the potential term if decisions are per term."""
+        """Return a table row with both atoms of a pair, and the term if terms have separate decisions."""
         return {key: np.asarray(one).item() for key, one in self.first_atoms(i).items()} | {"j": int(j)}
 
     def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
@@ -426,7 +426,7 @@ class Simulation:
 
 
 def _edges(index: Int[np.ndarray, "slots atoms"], form: str) -> Int[np.ndarray, "first second"]:
-    """Return the pairs in a neighbor list, grouped by atom, in the format of `Tables.edges`."""
+    """Return the pairs in a neighbor list, grouped by atom (for the format, see `Tables.edges`)."""
     atoms = index.shape[1]
     if form == "dense":
         return np.ascontiguousarray(index.T, np.int32)

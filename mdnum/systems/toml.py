@@ -494,7 +494,7 @@ _RIVALS: dict[Key, tuple[str, ...]] = {
 
 
 def read_overrides(overrides: Mapping[str, Any] | None) -> dict[Key, Any]:
-    """Parse overrides from dotted keys to values; text is parsed as a TOML value.
+    """Parse overrides, given as values by dotted key; text is parsed as a TOML value.
 
     Raises:
         InputError: a key is not a valid dotted key.

@@ -103,7 +103,7 @@ class Trial:
     # --- the programs ---------------------------------------------------------------------------------
 
     def _lists(self) -> None:
-        """Find the neighbor list's format and whether it has self-pairs; also initialize parameters."""
+        """Find the list format of the energy function, with or without self-pairs; initialize parameters."""
         model, lists, own = self.model, self.model.lists, None
         if lists is not None:
             for x in (self.x / self.call.length, self.x @ np.linalg.inv(self.cell)):
@@ -130,7 +130,7 @@ class Trial:
             self.model = replace(model, parameters=model.start(key, x, own))
 
     def bare(self, parameters, x, idx, real, cell, box, strain, code):
-        """Call the energy function with arguments in its convention; return the energy in its unit."""
+        """Call the energy function in its own convention; return the energy in the function's unit."""
         call, model = self.call, self.model
         neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
         if call.how.images:

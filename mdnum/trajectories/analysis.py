@@ -105,14 +105,14 @@ class NeighborFlips(AnalysisBase):
     After `run` with one rule, `results` has all attributes of `RuleResult` (`flips`, `pairs`, `near`,
     `min_margin`, `initial`, `last`, `contacts`, `occupancy`). With several rules, each element of
     `results.rules` is a `RuleResult`. Tables have a method `to_pandas()`. With by="residue", the pairs are
-    pairs of residues, `i` and `j` are row numbers of `results.residues`, and `results.left_out` counts the
-    excluded atoms. `results.resolution` is the resolution of positions in the file, and `results.bound`
-    contains the resulting error bound of a distance in each frame. `results.repeats` lists the frames that
-    repeat earlier frames (see `repeats.RepeatedFrames`). `results.other_box` gives another possible box of
-    the first frame and a reason (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers
-    and times of the frames analyzed; `FlipTable.frame` is an index into both.
+    pairs of residues. `i` and `j` are row numbers of `results.residues`, and `results.left_out` counts the
+    excluded atoms. `results.resolution` is the resolution of positions in the file. `results.bound` contains
+    the resulting error bound of a distance in each frame. `results.repeats` lists the frames that repeat
+    earlier frames (see `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first
+    frame and a reason (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and times
+    of the frames analyzed; `FlipTable.frame` is an index into both.
 
-    If a frame cannot be read or contains impossible values, an error with the frame number is raised; the
+    If a frame cannot be read or contains impossible values, an error with the frame number is raised. The
     results of all earlier frames are kept.
 
     Args:
@@ -272,7 +272,7 @@ class NeighborFlips(AnalysisBase):
 
     @property
     def library(self) -> LibraryFrames:
-        """Reader that obtains frames through MDAnalysis; it is opened when this process first uses it."""
+        """Reader of frames through MDAnalysis, opened at its first use in this process."""
         if self._library is None:
             self._library = LibraryFrames(self._trajectory)
             self._check.labels = self._library.labels(0)

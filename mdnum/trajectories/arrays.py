@@ -1,7 +1,7 @@
 """Trajectories in memory: a program passes frames, one after another, as numpy, jax or torch arrays.
 
-ASE, vesin and torch-sim store lattice vectors as rows of a matrix (`cell`); jax-md stores them as columns of
-an upper triangular matrix (`box`), and often stores positions as fractions of the box.
+ASE, vesin and torch-sim store lattice vectors as rows of a matrix (`cell`). jax-md stores the vectors as
+columns of an upper triangular matrix (`box`), and often stores positions as fractions of the box.
 """
 
 from __future__ import annotations

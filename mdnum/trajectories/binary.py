@@ -1,13 +1,13 @@
 """Readers of GROMACS's xtc and trr files that check each frame before it is decoded.
 
-On damaged data, the library that decodes xtc files divides by zero or writes outside its buffers; the process
+On damaged data, the library that decodes xtc files divides by zero or writes outside its buffers. The process
 then crashes, and all earlier results are lost. Each frame of a file is checked before it is decoded. The
 compressed stream contains the number of bits of each atom's coordinates. The header, the number of atoms, the
 bit counts and the length can therefore be verified without decoding. File damage that leaves a valid stream
 is not detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
 
 MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. MDAnalysis writes the index
-through symbolic links, and uses an index file even if it belongs to another trajectory; this module uses no
+through symbolic links, and uses an index file even if it belongs to another trajectory. This module uses no
 index file. Source of the trr format: GROMACS, trrio.
 """
 
@@ -187,7 +187,7 @@ class XtcFile(XdrFile):
 
 @njit
 def _walk(stream, atoms, whole, small):
-    """Return the number of bits of the coordinates of `atoms` atoms, or -8 if the stream is invalid.
+    """Return the number of bits that the coordinates of all atoms occupy, or -8 if the stream is invalid.
 
     The full coordinates of an atom occupy `whole` bits. A flag bit follows. If the flag is set, the next five
     bits give two numbers: how many of the next atoms are stored as differences of `small` bits, and the

@@ -1,4 +1,4 @@
-"""Detection of impossible collective motions of all atoms, caused by file damage that leaves finite numbers.
+"""Detection of file damage that appears as an impossible motion of all atoms, with finite coordinates.
 
 A counter overflow gives every atom the same value of one coordinate, and a misread offset shifts all atoms.
 Planar systems, linear systems, drift and wrapping are not reported as damage.
@@ -94,7 +94,7 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
 
     Rippled sheets may become flat, and bent chains may become straight, in a correct file. A collapse is
     reported only if the earlier spread across the sheet or chain exceeded the distance between neighboring
-    atoms. If a coordinate is constant, a spread above a fifth of the largest spread also suffices.
+    atoms. If a coordinate is constant, a spread above a fifth of the largest is enough for a report.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):

@@ -1,6 +1,6 @@
 """One frame of a trajectory in float64, and checks for values that no simulation can produce.
 
-Formats with plain floats (dcd, trr, netcdf) accept any bytes as coordinates; file damage often produces a
+Formats with plain floats (dcd, trr, netcdf) accept any bytes as coordinates. File damage often produces a
 huge coordinate. A huge coordinate in an accepted frame increases the rounding bound of every pair.
 """
 

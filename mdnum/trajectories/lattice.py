@@ -133,7 +133,7 @@ def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "ima
 # inlined: a call that takes arrays costs more than what is done here
 @njit(inline="always")
 def square_of(x, i, j, s0, s1, s2, vectors):
-    """Return the squared distance, used in every decision, from atom i to an image of atom j, i < j."""
+    """Return the squared distance that every decision uses, from atom i to an image of atom j (i < j)."""
     if s0 == 0 and s1 == 0 and s2 == 0:
         d0, d1, d2 = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
     else:
@@ -277,7 +277,7 @@ class SearchLimits(NamedTuple):
 
     @classmethod
     def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> SearchLimits:
-        """Return limits of squared distances: each cutoff radius minus `band`, and plus `band`, squared."""
+        """Return the squares of each cutoff radius minus `band`, and of each cutoff radius plus `band`."""
         low = np.where(radii >= 0, np.maximum(radii - band, 0.0) ** 2, np.inf)
         high = np.where(radii >= 0, (radii + band) ** 2, -1.0)
         return cls(kind, low, high, float((radii.max(initial=0.0) + band) ** 2))
@@ -409,7 +409,7 @@ def wrap(x, lattice, bins, step):
 
 @njit
 def _sorted_by_bin(bin_of, chosen, total):
-    """Return (first index of each bin, indices of the chosen atoms by bin) from a stable counting sort."""
+    """Sort the chosen atoms by bin; return the first index of each bin, and the sorted atom indices."""
     start = np.zeros(total + 1, np.int64)
     count = 0
     for i in range(bin_of.shape[0]):

@@ -1,11 +1,11 @@
 """Estimate of the number of flips missed because a pair crosses its threshold and returns between frames.
 
 Missed flips are flips that would be found if every time step of the run were examined. The four estimates
-(thinning, persistence, velocities and flux), the test systems used to choose the constants, and the measured
-coverage are described in docs/lost-flips.md. The estimates by thinning and persistence are extrapolated to
-shorter frame intervals t. The assumed laws for the rate of observed flips are (1 + (t/τ)^p)^(-s/p). The
-exponent p is 2 for smooth atomic motion and 1 for abrupt velocity changes; s is 1/2 for diffusive motion and
-1 for atoms that stay at their sites. The result is the mean over all laws that fit the data.
+(thinning, persistence, velocities and flux) are described in docs/lost-flips.md, with their test systems and
+measured coverage. The estimates by thinning and persistence are extrapolated to shorter frame intervals t.
+The assumed laws for the rate of observed flips are (1 + (t/τ)^p)^(-s/p). The exponent p is 2 for smooth
+atomic motion and 1 for abrupt velocity changes. The exponent s is 1/2 for diffusive motion and 1 for atoms
+that stay at their sites. The result is the mean over all laws that fit the data.
 """
 
 from __future__ import annotations

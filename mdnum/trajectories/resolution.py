@@ -7,8 +7,8 @@ needed.
 
 Rounding of coordinates can move a cutoff crossing to another frame, hide a short contact, or create a
 crossing of a pair near the cutoff. The affected flips cannot be identified from one file, but their number is
-estimated by `grid_effect`. Random pairs near the cutoff are moved by displacements found in the file; their
-flips are counted with and without rounding. Among nearest neighbors, a flip exchanges two atoms at similar
+estimated by `grid_effect`. Random pairs near the cutoff are moved by displacements found in the file. Flips
+are then counted with and without rounding. Among nearest neighbors, a flip exchanges two atoms at similar
 distances from a third atom. For such rules, random triples of atoms are moved.
 """
 
@@ -350,7 +350,7 @@ def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
 def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]:
     """Return the displacement of every atom from one frame to the next, corrected for rounding.
 
-    Displacements are measured over several frames, until they clearly exceed a step of the grid; the variance
+    Displacements are measured over several frames, until they clearly exceed a step of the grid. The variance
     due to rounding is subtracted.
     """
     moves, lag, total = np.zeros_like(sample[0].positions), 0, 0.0

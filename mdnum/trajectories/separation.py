@@ -134,8 +134,8 @@ class FreeFlight(NamedTuple):
 def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
     """Compare displacements between two frames with velocities; None without velocities or motion.
 
-    `moved` is measured over predicted displacement: about 1, or less if atoms turn around. `factor`, the
-    least-squares ratio, is about 1 if velocities have the right unit and keep their directions.
+    `moved` is the ratio of measured to predicted displacements: about 1, or less if atoms turn around.
+    `factor`, the least-squares ratio, is about 1 if velocities have the right unit and keep their directions.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None
@@ -198,8 +198,8 @@ def growth(
 ) -> GrowthLaw | None:
     """Fit an exponential and a power law to the growing distance between two trajectories.
 
-    A constant error of a force or a velocity makes the distance between two runs grow as a low power of time;
-    chaos makes the distance grow exponentially. Fits exclude distances that are zero or above `limit`.
+    A constant error of a force or a velocity makes the distance between two runs grow as a low power of time.
+    Chaos makes the distance grow exponentially. Fits exclude distances that are zero or above `limit`.
 
     Args:
         began: earliest and latest possible time at which the separation began, as the origin of a power law.

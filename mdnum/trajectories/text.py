@@ -500,5 +500,5 @@ def _gro_box(line: str) -> Box:
 
 
 def _box_words(line: str) -> list[str]:
-    """Split a box line into numbers with five decimals, without spaces between them above 10 µm."""
+    """Split a box line into numbers with five decimals; numbers above 10 µm are not separated by spaces."""
     return _TOUCHING.findall(line) if max(map(len, line.split())) > _LONG else line.split()

@@ -2,7 +2,7 @@
 
 Atoms are sorted into clusters of sixteen by bisecting space. A tile consists of two clusters and the lattice
 vector between them. For each atom of the first cluster, the tile stores sixteen decisions as bits. At each
-frame, the pairs of near clusters are decided in float32; only decisions that changed since the previous frame
+frame, the pairs of near clusters are decided in float32. Only decisions that changed since the previous frame
 are processed further. If float32 cannot decide a pair, or the margin of a pair is needed, the exact squared
 distance is computed (`search.exact_square`).
 

@@ -241,7 +241,7 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
 
 
 def _script(code: str) -> str:
-    """Return the last part of the name of the script that reproduces failures with the given code."""
+    """Return the ending of the file name for a script that reproduces failures with the given code."""
     return f"{code.lower().replace('_', '-')}.py"
 
 

@@ -277,7 +277,7 @@ def examining(
     opened: Trajectory, asked: tuple[Rule, ...], between: tuple[str, str] | None, window: int,
     live: bool = False, hydrogens: bool | None = None, **keep: Unpack[Keep],
 ) -> Iterator[FrameExamination]:  # fmt: skip
-    """Context manager: make an output folder, and examine frames inside the block; arguments: see `flips`.
+    """Context manager: make an output folder and examine frames; for the arguments, see `flips`.
 
     Args:
         live: whether frames come from a running program. Frame numbers are then time steps, with no decisions

@@ -129,7 +129,7 @@ def _of_rules(view: FlipsView) -> Iterator[Finding]:
 
 
 def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
-    """Yield findings on limits of the flip analysis of one neighbor rule: code, text variants and values."""
+    """Yield findings (code, text variants, values) on the limits of an analysis with one neighbor rule."""
     if len(wrong := _disagreeing(view, place)):
         yield "EVENT_ALGEBRA", (), {"first": int(wrong[0]) + 1, "frames": len(wrong)}
     flips, frames = one["flips"], view.summary["frames"]

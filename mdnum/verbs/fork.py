@@ -1,7 +1,7 @@
 """`mdnum fork`: the step at which two runs that differ in one numerical choice diverge, and why.
 
-For molecular dynamics and for a ball, `fork` varies one numerical choice and `fork_screen` each choice in
-turn; `fork_folders` compares or replays two finished runs; `fork_benign` compares ensembles of runs.
+For molecular dynamics and for a ball, `fork` varies one numerical choice. `fork_screen` varies each choice in
+turn. `fork_folders` compares or replays two finished runs. `fork_benign` compares ensembles of runs.
 """
 
 from __future__ import annotations

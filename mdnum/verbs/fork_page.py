@@ -222,7 +222,7 @@ def _atoms(view: View, figure: Canvas) -> None:
 
 
 def _two_by_two(view: View) -> Iterator[Any]:
-    """Yield a table of the step of the split, for the arithmetic of A or B with the decisions of A or B."""
+    """Yield a table of split steps: arithmetic of run A or B, combined with decisions of run A or B."""
     s, unit = view.summary, view.units.length
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for cell in s["table"]:

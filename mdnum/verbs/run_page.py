@@ -84,7 +84,7 @@ class RunView(View):
 
     @property
     def own_end(self) -> list[str]:
-        """Variant of a remedy's text: "own" if the potential sets the cutoff, none if a system file does."""
+        """Variant of a remedy's text: "own" if the potential sets the cutoff, otherwise none."""
         return [] if self.cutoff_key else ["own"]
 
     @cached_property

@@ -122,7 +122,7 @@ def _advised(view: View, advice: Mapping[str, Any]) -> str:
 
 
 def _further_seeds(view: View, factor: float) -> int:
-    """Return how many random seeds to add to multiply the number of seeds by the given factor."""
+    """Return the number of random seeds to add so that the total grows by the given factor."""
     return int(np.ceil(len(view.summary["seeds"]) * (factor - 1)))
 
 
@@ -208,7 +208,7 @@ def _differences(view: View) -> list[Any]:
 
 
 def _with_error(row: Mapping[str, Any]) -> str:
-    """Format a value and its error, with the value rounded to the digits that the error leaves valid."""
+    """Format a value and its error; the value is rounded to the digits that its error allows."""
     value, error = row["value"], row["error"]
     if not error:
         return number(value, 5)
