@@ -545,7 +545,7 @@ def _sets_at(
 
 
 def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return growth rates of the separation before and after the first frame with different neighbor sets."""
+    """Return growth rates of the distance between files, before and after neighbor sets first differ."""
     cutoff, furthest = isinstance(one.rule, CutoffRule), float(table["furthest"].max(initial=0.0))
     limit = 0.1 * (one.rule.reach if cutoff else furthest)
     cut = frames if one.first is None else one.first["frame"]

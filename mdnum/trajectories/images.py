@@ -64,13 +64,13 @@ def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
 
 
 class ImageFlips:
-    """Flips between successive frames, for pairs identified by image."""
+    """Flips of periodic images between successive frames, for a symmetric membership rule."""
 
     def __init__(self) -> None:
         self._before: tuple[Frame, np.ndarray] | None = None
 
     def step(self, frame: Frame, pairs: Members) -> dict[str, Any] | None:
-        """Return the flips since the previous frame as table columns, or None; the rule must be symmetric."""
+        """Return table columns of the flips since the previous frame, or None at the first frame."""
         matrix, inverse = cell_of(frame)
         now = np.column_stack([pairs.i, pairs.j, image_shifts(frame, pairs)])
         known, self._before = self._before, (frame, now)
