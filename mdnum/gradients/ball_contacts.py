@@ -141,8 +141,8 @@ def _with_contact(problem: BallProblem, contact: Any) -> BallProblem:
 class SoftImpact(eqx.Module):
     """Smooth model of an impact: a soft spring that is stiffer while the ball falls than while it rises.
 
-    The stiffness is k while the ball falls and restitution² k while it rises, with smooth transitions, so
-    that the ball leaves the floor at `restitution` times its impact speed.
+    The stiffness is k while the ball falls and restitution² k while it rises, with smooth transitions. The
+    ball therefore leaves the floor at `restitution` times its impact speed.
 
     Source: latching spring of Walton and Braun (1986), here with smooth transitions.
     """
@@ -258,11 +258,11 @@ def _suitable(problem: BallProblem) -> float:
 class ThroughContacts(BallMethod):
     """Gradient method: derivative of the ball's motion in continuous time, including the times of contacts.
 
-    Contact is decided at the end of a step. A ball that starts higher reaches the floor later. The derivative
-    of the time steps omits this change of the contact time. A saltation matrix at every contact adds the
-    change of the contact time. If impacts are located within a step, the program's own derivative already
-    contains the saltation matrix. A contact by projection is treated like an impact. Without a damper, the
-    force of a spring does not jump, and the result is the same as from the method `unrolled`.
+    Contact is decided at the end of each step. A ball that starts higher reaches the floor later. The
+    derivative of the time steps omits this change of the contact time. A saltation matrix at every contact
+    adds the change of the contact time. If impacts are located within a step, the program's own derivative
+    already contains the saltation matrix. A contact by projection is treated like an impact. Without a
+    damper, the force of a spring does not jump, and the result is the same as from the method `unrolled`.
     """
 
     name = "event-aware"

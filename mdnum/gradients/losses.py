@@ -232,7 +232,7 @@ class MeanDensity(MeanVolume):
 class EinsteinDiffusion(Loss):
     """Diffusion constant (length² per unit of time) from the slope of the mean squared displacement.
 
-    A straight line is fitted to the mean squared displacement since step 0; D is a sixth of the line's slope.
+    A straight line is fitted to the mean squared displacement since step 0. D is a sixth of the line's slope.
     Motion is ballistic at the beginning of a run: set `first` to a step after the ballistic regime.
 
     Source: Allen and Tildesley, Computer Simulation of Liquids (2017), section 2.7.
@@ -304,8 +304,8 @@ class GreenKuboDiffusion(Loss):
 class RadialDistribution(Loss):
     """Loss computed from the radial distribution function g(r), averaged over frames.
 
-    Each pair distance contributes to the four nearest bins with cubic B-spline weights, so that g(r) has two
-    continuous derivatives with respect to positions. For N atoms, the computing time of each frame is of
+    Each pair distance contributes to the four nearest bins with cubic B-spline weights. Therefore, g(r) has
+    two continuous derivatives with respect to positions. For N atoms, the computing time of each frame is of
     order N² and the memory of order N.
 
     Source: Hansen and McDonald, Theory of Simple Liquids (2013), section 2.5.
@@ -392,7 +392,7 @@ class RadialDistribution(Loss):
 
 
 def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Array, "bins"]:
-    """Histogram of distances with bin centers (k + 1/2) width and cubic B-spline weights."""
+    """Histogram of distances, with bin centers at (k + 1/2) * width and cubic B-spline weights."""
     u = r / width - 0.5
     left = lax.stop_gradient(jnp.floor(u))
     t = u - left

@@ -120,7 +120,7 @@ def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progres
 
 @dataclass(frozen=True)
 class Symmetric(Method):
-    """Gradient method: derivative of the steps at fixed decisions, by one reverse pass with little memory."""
+    """Gradient method: derivative of the time steps at fixed decisions, from one low-memory reverse pass."""
 
     # bytes of the recorded run that are kept in memory; what does not fit is run again, stretch by stretch,
     # with the same bits
@@ -147,7 +147,7 @@ class Symmetric(Method):
 
 @dataclass(frozen=True)
 class EventAware(Method):
-    """Gradient method: derivative of the steps, plus contributions from changes of the times of all flips."""
+    """Gradient method: derivative of the time steps, plus contributions from changes of all flip times."""
 
     # radial speed below which a crossing grazes and is left out, as a share of the rms radial speed of a
     # pair. Left in, single crossings would dominate: their terms go with one over that speed
@@ -182,7 +182,7 @@ class EventAware(Method):
 
 @dataclass(frozen=True)
 class Forward(Method):
-    """Gradient method: derivative of the steps at fixed decisions, in forward mode (tangents)."""
+    """Gradient method: derivative of the time steps at fixed decisions, in forward mode (tangents)."""
 
     # whether every flip adds what moving its time does, as the method event-aware has it
     saltation: bool = False
@@ -231,7 +231,7 @@ class Forward(Method):
 
 @dataclass(frozen=True)
 class Reversible(Method):
-    """Gradient method: derivative of the steps of a fixed-point run; the run is reversed instead of stored.
+    """Gradient method: derivative of the time steps of a fixed-point run, which is reversed, not stored.
 
     The forward pass stores only the last state. Rounding to integers is differentiated as the identity.
 

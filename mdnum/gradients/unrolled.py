@@ -1,7 +1,7 @@
 """Let JAX differentiate all operations of the steps in reverse mode, like `jax.grad` of the whole run.
 
 A chunk is a scan over a fixed number of steps with one neighbor list. Chunks limit the memory of reverse
-mode. When the neighbor list expires, the remaining steps of the chunk are skipped, and the host builds the
+mode. When the neighbor list expires, the remaining steps of the chunk are skipped. The host then builds the
 next list at the present positions. The states between chunks are stored. If memory is insufficient, every
 second state is dropped, and the steps between the remaining states are run again.
 
@@ -68,7 +68,7 @@ class StepEnds(NamedTuple):
 
 
 class RunConstants(NamedTuple):
-    """Constants of a run that are not differentiated; the parameters of the force are those of `Inputs`."""
+    """Constants of a run that are not differentiated; force parameters are taken from `Inputs`."""
 
     force: Any
     integrator: Any
@@ -298,7 +298,7 @@ class ChunkedProgram:
 
 @dataclass(frozen=True)
 class Unrolled(Method):
-    """Gradient method: derivative of the steps, computed by JAX in reverse mode."""
+    """Gradient method: derivative of the time steps, computed by JAX in reverse mode."""
 
     # bytes of states that are kept, evenly spread; those between two of them are made again
     budget: int = KEPT

@@ -1,12 +1,12 @@
 """Constant pressure and temperature: the Martyna-Tobias-Klein barostat and stochastic cell rescaling.
 
-Each barostat changes either only the volume of the box (`box = "isotropic"`), or all six parameters of the
-box without rotating the box ("full"). A strain or strain rate is stored as a number (a multiple of the unit
-matrix) or as a symmetric matrix. The pressure is (2 K + virial) / 3 V with the instantaneous kinetic energy
-K; the pressure tensor is Π / V with Π = Σ m v ⊗ v + Σ r ⊗ F. Volumes are sampled with the weight exp(-(U + p
-V) / k_B T) dV, and matrices h of full boxes with the measure dh / det(h)², det(h) = V. If the total momentum
-is zero, the center of mass does not contribute to the pressure. The mean volume of an ideal gas is then N k_B
-T / p, otherwise (N + 1) k_B T / p.
+An isotropic barostat (`box = "isotropic"`) changes only the volume of the box. A full barostat ("full")
+changes all six parameters of the box, but does not rotate it. A strain or strain rate is stored as a number
+(a multiple of the unit matrix) or as a symmetric matrix. The pressure is (2 K + virial) / 3 V with the
+instantaneous kinetic energy K. The pressure tensor is Π / V with Π = Σ m v ⊗ v + Σ r ⊗ F. Volumes are sampled
+with the weight exp(-(U + p V) / k_B T) dV. Matrices h of full boxes have the measure dh / det(h)², where
+det(h) = V. If the total momentum is zero, the center of mass does not contribute to the pressure. The mean
+volume of an ideal gas is then N k_B T / p, otherwise (N + 1) k_B T / p.
 """
 
 from __future__ import annotations

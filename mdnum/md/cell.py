@@ -301,7 +301,7 @@ def displacement(
 
 
 def transformed(x, by):
-    """Return the components of positions, as rows, times a deformation matrix (for use inside jit)."""
+    """Multiply positions (rows) by a deformation matrix; return their components (for use inside jit)."""
     # one product: XLA fuses sums that are written out with what makes their operands, again for each row
     return jnp.matmul(by.astype(x.dtype).T, x, precision="highest")
 
@@ -315,8 +315,8 @@ def strain_loss(reference: Cell, now: Cell, r_list):
 
     The upper bound follows from sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|, where S is the
     symmetric part of F, t a third of the trace of F, and |.| the Frobenius norm. The upper bound requires no
-    matrix decomposition. If the box keeps its shape, the upper bound is exact; otherwise its error is at most
-    0.41 |S - t| plus the square of the rotation angle.
+    matrix decomposition. If the box keeps its shape, the upper bound is exact. Otherwise, its error is at
+    most 0.41 |S - t| plus the square of the rotation angle.
 
     Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
     """

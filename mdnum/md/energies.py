@@ -2,7 +2,7 @@
 
 Functions written for jax-md differ in the order of the arguments, the form of the box, real or fractional
 positions, neighbor lists with or without images, and the return value. The signature determines the order of
-the arguments; all other properties are determined by trial calls (`mdnum.systems.admission`).
+the arguments. All other properties are determined by trial calls (`mdnum.systems.admission`).
 """
 
 from __future__ import annotations
@@ -201,10 +201,10 @@ def energy_function(
 
     Supported forms are `energy_fn(R, neighbor, **kw)`, `energy_fn(params, R, neighbor, **kw)`, `energy_fn(R,
     *, box=, neighbor=, perturbation=)`, and mdnum's own form `f(parameters, positions, neighbor, cell)`. A
-    function may be given alone or with its neighbor functions, as returned by jax-md's `*_neighbor_list`, and
+    function may be given alone, or with its neighbor functions as returned by jax-md's `*_neighbor_list`. It
     may use neighbor lists with several images. The energy function returns a number, a number per atom, or a
-    dictionary with key "total" or "energy". Properties that the signature does not determine (box vectors in
-    rows or columns, real or fractional positions) are determined by trial calls when a simulation is made.
+    dictionary with key "total" or "energy". Box vectors in rows or columns, and real or fractional positions,
+    are distinguished by trial calls when a simulation is made.
 
     Example:
         >>> made = jax_md.energy.lennard_jones_neighbor_list(displacement, box)

@@ -257,7 +257,7 @@ class FixedPointStep(Integrator):
 
     @abstractmethod
     def drift(self, x, v, extra, masses, step, order):
-        """Advance positions, velocities and extra state in the part of `begin` that follows the kick."""
+        """Advance positions, velocities and extra state after the kick in `begin`."""
 
     @abstractmethod
     def undrift(self, x, v, extra, masses, step, order):

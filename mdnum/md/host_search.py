@@ -115,8 +115,8 @@ def _runs(b0, b1, box, run, shift):
 def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
     """Copy the atoms near a column of bins, layer by layer, shifted by lattice vectors to nearby images.
 
-    The neighborhood of a bin consists of contiguous layers around its own layer, so that every atom is copied
-    only once for a whole column of bins.
+    The neighborhood of a bin consists of contiguous layers around its own layer. Every atom is therefore
+    copied only once for a whole column of bins.
 
     Returns:
         whether the capacity sufficed. begin: start of each layer, and the end; home: start of its middle bin.
@@ -205,7 +205,7 @@ def _transposed(rows, table, first, begin, end):
 
 @njit
 def _fill(x, layered, box, inverse, start, r2_list, table, columns):
-    """Write the neighbors of the atoms, sorted by bin, in a range of columns of bins.
+    """Write the neighbors of all atoms in a range of columns of bins; atoms are sorted by bin.
 
     Returns:
         the largest number of neighbors, which may exceed the capacity.

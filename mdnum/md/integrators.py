@@ -3,7 +3,7 @@
 A step evaluates the forces at x_s and completes the previous step (`finish`), which gives full-step
 velocities v_s. The first half of the next step (`begin`) gives the positions x_{s+1}. The state between steps
 is (x_{s+1}, half-step velocity, extra). An outdated neighbor list is therefore replaced before forces are
-evaluated, and a simulation can stop and resume between steps without evaluating forces twice.
+evaluated. A simulation can stop and resume between steps without evaluating forces twice.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ class Integrator(eqx.Module):
         """Return the deformation of the box before the next force evaluation; the default is no deformation.
 
         The method `deform` is called after `begin`. Lattice vectors and positions, as rows, are multiplied by
-        the deformation; `begin` must move the atoms only relative to the box.
+        the deformation. The method `begin` must move the atoms only relative to the box.
 
         Args:
             v, extra: sorted velocities and extra state, as returned by `begin`.
@@ -390,8 +390,8 @@ class VelocityVerlet(KickDrift):
 class Langevin(KickDrift):
     """Langevin dynamics, BAOAB (Leimkuhler & Matthews 2013): drift, exact Ornstein-Uhlenbeck step, drift.
 
-    The noise is a function of the random key and the step number, so that two runs can have the same noise
-    and a resumed run continues the same noise sequence.
+    The noise depends only on the random key and the step number. Two runs can therefore have the same noise,
+    and a resumed run continues its noise sequence.
 
     Example:
         >>> cut = mdnum.Cut("switched", 8.5)

@@ -231,9 +231,9 @@ class PairSearch:
     """Neighbor search of jax-md for one cell, for repeated calls with new positions.
 
     Positions are passed to jax-md as fractional coordinates in [0, 1), with the perpendicular widths as the
-    box. For positions outside the box, jax-md loses pairs without an error; jax-md also rejects some valid
-    triclinic boxes. After every search, the overflow flag is read outside jit; after an overflow, the list is
-    enlarged.
+    box. For positions outside the box, jax-md loses pairs without an error. The search also rejects some
+    valid triclinic boxes. After every search, the overflow flag is read outside jit. After an overflow, the
+    list is enlarged.
 
     Args:
         cell: lattice vectors as rows, length.

@@ -1,10 +1,10 @@
 """Sums over the neighbors of every atom, computed by one compiled loop that XLA calls on a CPU.
 
-jax traces a function of one pair, whose operations are written as LLVM text for vectors of eight atoms. The
-data of each atom are contiguous, so that loading a neighbor takes one or two instructions. The terms of eight
-neighbor slots are summed in registers. XLA's own loop gathers neighbor data and computes terms in separate
-passes. No operation is contracted or reordered, so that equal input gives equal bits on every processor. XLA
-calls the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
+jax traces a function of one pair. The operations of this function are written as LLVM text for vectors of
+eight atoms. The data of each atom are contiguous, so that loading a neighbor takes one or two instructions.
+The terms of eight neighbor slots are summed in registers. XLA's own loop gathers neighbor data and computes
+terms in separate passes. No operation is contracted or reordered, so that equal input gives equal bits on
+every processor. XLA calls the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
 """
 
 from __future__ import annotations

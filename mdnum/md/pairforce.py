@@ -411,8 +411,8 @@ VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 def products(a: Float[Array, "_ atoms"], b: Float[Array, "_ atoms"]) -> Float[Array, "6"]:
     """Return the six sums over atoms of a_i b_j, in Voigt order, for the first three rows i of a and j of b.
 
-    XLA computes eight partial sums at a time with vector instructions. For 4,000 atoms, this takes a third of
-    the time of a sequential sum.
+    XLA computes eight partial sums at a time with vector instructions. For 4,000 atoms, these partial sums
+    take a third of the time of a sequential sum.
     """
     pieces = [jnp.pad(one[:3], ((0, 0), (0, -one.shape[1] % 8))).reshape(3, 8, -1) for one in (a, b)]
     sums = [reduce(add, (pieces[0][i, k] * pieces[1][j, k] for k in range(8))) for i, j in VOIGT]

@@ -1,8 +1,8 @@
 """Thermostats that scale all velocities by one factor (Nosé-Hoover chains, stochastic rescaling).
 
-A total momentum of zero stays zero, which reduces the number of degrees of freedom and affects the
-temperature (`Integrator.freedom`). The variables of a thermostat are always float64. Velocities are scaled in
-float64, too: if a factor near one were rounded to float32, all atoms would have the same relative error.
+If the total momentum is zero, it stays zero, and the system has three degrees of freedom fewer
+(`Integrator.freedom`). The variables of a thermostat are always float64. Velocities are scaled in float64,
+too. If a factor near one were rounded to float32, all atoms would have the same relative error.
 """
 
 from __future__ import annotations
@@ -138,9 +138,9 @@ def rescaled(
 class CSVR(Integrator):
     """Stochastic velocity rescaling in the canonical ensemble: velocity Verlet, then a random scale factor.
 
-    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). The noise is a function of the random key
-    and the step number, so that two runs can have the same noise and a resumed run continues the noise. The
-    effective energy (eq. 15 of the paper), which is the total energy minus the heat, is conserved.
+    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). The noise depends only on the random key
+    and the step number. Two runs can have the same noise, and a resumed run continues the noise sequence. The
+    effective energy (total energy minus heat, eq. 15 of the paper) is conserved.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="csvr",

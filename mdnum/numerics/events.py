@@ -40,7 +40,7 @@ class Threshold:
         return self.value - quantity
 
     def decide(self, quantity):
-        """Return the result of the comparison of a quantity with the threshold, which is False for NaN."""
+        """Return whether the comparison of a quantity with the threshold is true; False for NaN."""
         return quantity <= self.value if INCLUSIVE[self.comparison] else quantity < self.value
 
 
@@ -125,7 +125,7 @@ class Ledger:
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "flips"]:
-        """Whether rounding errors could change the step of each flip (|margin| is within the error bound)."""
+        """Whether |margin| of each flip is within the error bound, so that rounding could change its step."""
         return np.abs(self.margin) <= self.bound
 
     def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:

@@ -29,7 +29,7 @@ def integer_of(dtype):
 
 
 def zero_bits(dtype) -> jax.Array:
-    """Return an integer zero with the width of dtype, which is passed into jit for use by `fence`."""
+    """Return an integer zero with the width of dtype, to be passed into jit for use by `fence`."""
     return jax.device_put(np.zeros((), integer_of(dtype)))
 
 
@@ -161,8 +161,8 @@ def rounded(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]
 
     XLA on a CPU computes float16 and bfloat16 expressions in float32, and may omit the rounding between two
     operations. In the returned function, a fence after each operation forces the rounding. For + - * / and
-    sqrt, the results have the same bits as numpy with ml_dtypes; exp and cos are computed in float32 and may
-    differ between libraries. Results that are not 16-bit floats do not change.
+    sqrt, the results have the same bits as numpy with ml_dtypes. The functions exp and cos are computed in
+    float32 and may differ between libraries. Results that are not 16-bit floats do not change.
 
     Args:
         function: function of arrays; it may close over others.
@@ -183,8 +183,8 @@ def _is_short(dtype: Any) -> bool:
 def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list[Any]]:
     """Return a version of a float64 function in interval arithmetic; each interval contains the exact value.
 
-    Constants of the formula are treated as exact float64 numbers. If an interval contains values on both
-    sides of the condition of a `where`, the result is the union of the intervals of both branches.
+    Constants of the formula are treated as exact float64 numbers. If both branches of a `where` are possible
+    within an interval, the result is the union of the intervals of both branches.
 
     Args:
         function: function of scalars; jax traces it once.
@@ -322,7 +322,7 @@ _SAFE = (
 
 @dataclass
 class _Held:
-    """A number in a jaxpr that is being interpreted, with flags for whether the number needs a fence."""
+    """A number in a jaxpr that is being interpreted, with flags that tell whether a fence is needed."""
 
     value: Any
     safe: bool = True

@@ -1,7 +1,7 @@
 """Emulation of floating-point formats: rounding and loss scaling.
 
 The emulation reproduces the rounding of a format, not its speed. Some devices use TF32 for float32 matrix
-products by default: the inputs keep 10 of 23 fraction bits, and the sums are in float32.
+products by default. The inputs then keep 10 of 23 fraction bits, and the sums are in float32.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def round_to(
 
 
 def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Array, "..."]:
-    """Round x stochastically to one of the two nearest numbers of a format, with x as expectation.
+    """Round x stochastically to one of the two nearest numbers of a format; the expectation is x.
 
     The result has the dtype of x; numbers of the format are unchanged. For |x| up to the largest number of
     the format, the expectation of the result is x, and the standard deviation is at most half the spacing. A

@@ -100,7 +100,7 @@ def _rounded(limbs: Int[Array, "limbs columns"], form: FloatFormat) -> UInt64[Ar
 class Exact(Reduction):
     """The exact sum, rounded once to nearest; the result has the same bits for every order of the terms.
 
-    The error is at most half an ulp of the result for up to 2^31 terms; intermediate sums do not overflow.
+    The error is at most half an ulp of the result for up to 2^31 terms. Intermediate sums do not overflow.
     Infinite and NaN terms give the result of IEEE addition.
     """
 

@@ -55,7 +55,7 @@ _compiled = partial(jax.jit, static_argnums=0)(_summed)
 class Reduction:
     """Base class of summation orders; terms arrive in blocks, or in one array that is summed over axis 0.
 
-    A subclass defines the sum of a whole array; by default, blocks are stacked and summed at the end.
+    A subclass defines the sum of a whole array. By default, blocks are stacked and summed at the end.
     """
 
     def within(self, total: jax.Array, terms: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array | None]:

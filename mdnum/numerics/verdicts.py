@@ -1,14 +1,14 @@
 """Divergence of two runs that differ in one setting: start, growth rate, and whether flips are the cause.
 
 A flip is a cutoff decision that differs between two runs. The verdict compares the second run with a
-counterfactual run, which has the arithmetic of the second run but the cutoff decisions of the first run. If
-the counterfactual run stays close to the first run, the flips caused the split. If the counterfactual run
-also splits from the first run, repeats of the pair of runs decide whether the flips accelerated the split or
-are bystanders. Repeats are evaluated by a sequential sign test. Assume that a pair of runs splits later
-without the flips with a probability of at most 1/2. Then k or more of n pairs do so with at most the
-probability of k or more heads in n coin tosses, for any delays. The initial displacements of all repeats have
-the same size. If the majority is different for displacements of another size, the verdict is left open. Error
-rates are listed in docs/verdict-calibration.md.
+counterfactual run. The counterfactual run has the arithmetic of the second run but the cutoff decisions of
+the first run. If the counterfactual run stays close to the first run, the flips caused the split. If the
+counterfactual run also splits, repeats of both runs decide whether the flips accelerated the split or are
+bystanders. Repeats are evaluated by a sequential sign test. Assume that a pair of runs splits later without
+the flips with a probability of at most 1/2. Then k or more of n pairs do so with at most the probability of k
+or more heads in n coin tosses, for any delays. The initial displacements of all repeats have the same size.
+If the majority is different for displacements of another size, the verdict is left open. Error rates are
+listed in docs/verdict-calibration.md.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Count:
 
     @property
     def needed(self) -> tuple[int, int] | None:
-        """Current or next stage of the sign test (if any): number of run pairs, and how many must agree."""
+        """Current or next stage of the sign test, if any: number of run pairs, and how many must agree."""
         return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
 
     @property

@@ -1,4 +1,4 @@
-"""Contribution of each flip to a gradient, and parameter values at which flips and the gradient change.
+"""Contribution of each flip to a gradient, and the parameter values at which pair decisions change.
 
 The contribution of a flip to a gradient is a product of two factors. The first factor, from a reverse pass,
 is the derivative of the loss with respect to the cutoff of one crossing. It includes the effect of later

@@ -98,7 +98,7 @@ class Shorter(Loss):
 
 
 def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Problem:
-    """Return a problem with the loss at several horizons, and with `per` times as many, shorter time steps.
+    """Return a problem with losses at several horizons, in which `per` short steps replace each time step.
 
     Args:
         at: horizons, rising; the last horizon is the length of the run.
@@ -403,7 +403,7 @@ def no_half_step(simulation: Simulation) -> bool:
 def verdict_of(
     limits: Sequence[Limit], steps: int, chaotic: bool, skipped: bool
 ) -> tuple[str, int, str, tuple[str, ...]]:
-    """Return the verdict, the last horizon within all limits, the first limit, and limits not examined."""
+    """Return the verdict, its horizon, the limit that was reached first, and the limits not examined."""
     examined = [one for one in limits if one.horizon is not None]
     horizon = min((one.horizon or 0 for one in examined), default=0)
     met = [one.what for one in examined if one.reached and one.horizon == horizon]
