@@ -76,7 +76,7 @@ def test_the_readme_of_an_index_has_absolute_links_alone():
     relative = [target for target in targets if urlsplit(target).scheme != "https"]
     assert len(targets) > 20 and not relative
     base = PROJECT["urls"]["Homepage"]
-    assert "![Separation" in text and f"]({base}/raw/main/docs/figures/fork.svg)" in text
+    assert "![Distance" in text and f"]({base}/raw/main/docs/figures/fork.svg)" in text
     assert f"]({base}/blob/main/docs/start.md)" in text
 
 

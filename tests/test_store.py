@@ -438,7 +438,7 @@ def test_existing_folders_are_not_overwritten(tmp_path):
         RunFolder.create(tmp_path / "mine" / "thesis.tex", MD)
     with pytest.raises(FolderError, match="holds no run"):
         RunFolder.open(tmp_path / "mine")
-    with pytest.raises(FolderError, match="the folder does not exist"):
+    with pytest.raises(FolderError, match="does not exist"):
         RunFolder.open(tmp_path / "nowhere")
 
 

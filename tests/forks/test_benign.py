@@ -137,7 +137,7 @@ def test_what_cannot_be_judged_is_refused(hot):
     for message, call in (
         ("108 and 864 atoms", lambda: benign(pair(hot, build("argon/liquid-864"), "another system"))),
         ("different random noise", lambda: benign(pair(noisy, replace(noisy, integrator=other), "noise"))),
-        ("members = 5: the ensemble has too few", lambda: calibrate(hot, members=5)),
+        ("members = 5: ", lambda: calibrate(hot, members=5)),
         ("steps = 0", lambda: calibrate(hot, steps=0)),
         ("tries = 0", lambda: calibrate(hot, tries=0)),
         ("deliberate change", lambda: calibrate(hot, steps=100, changes=harmless)),

@@ -199,7 +199,7 @@ def test_bad_input_is_refused():
     zero = np.zeros_like(crystal().positions)
     for words, call in (
         ("is zero", lambda: forecast(crystal(), 10, dx=zero)),
-        ("same shape as the positions", lambda: forecast(crystal(), 10, dx=zero[:5])),
+        ("same shape", lambda: forecast(crystal(), 10, dx=zero[:5])),
         ("many-body", lambda: forecast(build("copper/eam-500"), 10)),
         ("too few", lambda: lyapunov(crystal(), 40)),
     ):

@@ -171,7 +171,7 @@ def test_what_cannot_be_continued_is_refused(path, whole, tmp_path):
         run(None, resume=whole[1].path, steps=20)
     with pytest.raises(FolderError, match="already holds a run"):
         run(load(path), out=whole[1].path, steps=5)
-    with pytest.raises(FolderError, match="the folder does not exist"):
+    with pytest.raises(FolderError, match="does not exist"):
         run(None, resume=tmp_path / "nothing")
     for more in ({"save_every": 3}, {"overrides": {"neighbors.skin": 0.3}}):
         with pytest.raises(InputError, match="keeps its own"):

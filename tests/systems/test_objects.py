@@ -256,7 +256,7 @@ def object_of(kind, timestep=0.2, **numbers):
     """An integrator object with plain numbers, in internal units."""
     numbers = {"timestep": timestep} | numbers
     numbers = {key: jnp.float64(one) if isinstance(one, float) else one for key, one in numbers.items()}
-    # an array in the place of a number: the annotations, if they are checked, allow none when an object is made
+    # annotations that are checked allow no array in the place of a number when an object is made
     arrays = {key: numbers[key] for key in numbers if np.ndim(numbers[key])}
     numbers |= dict.fromkeys(arrays, jnp.float64(1.0))
     made = kind(**numbers, **({"key": jax.random.key(0)} if kind in (Langevin, CSVR) else {}))

@@ -421,7 +421,7 @@ def test_a_replay_meets_the_stored_runs(runs, capsys):
     lines = printed(capsys)
     assert any(line.startswith("precision.force float64 float32") for line in lines)
     assert call("fork", "compare", str(runs / "a"), str(runs / "nowhere")) == 2
-    assert "the folder does not exist" in capsys.readouterr().err
+    assert "does not exist" in capsys.readouterr().err
 
 
 def test_two_finished_runs_of_a_ball(tmp_path, monkeypatch):

@@ -178,7 +178,7 @@ def test_without_its_folder_it_still_says_what_was_found(returned, tmp_path):
     html = moved._repr_html_()
     assert moved.verdict.headline[:30] in html and moved.keys[0].label in html and "<svg" not in html
     for read in (lambda: moved.page, lambda: moved.table("steps"), lambda: moved.plot("heights")):
-        with pytest.raises(FolderError, match="the folder does not exist"):
+        with pytest.raises(FolderError, match="does not exist"):
             read()
 
 
