@@ -293,7 +293,7 @@ class Surrogate(Method):
     def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
         found = self.method(self.twin(problem), names, progress)
         details = {"cutoff": self.cutoff, "onset": self.onset, **found.details}
-        notes = dict.fromkeys(names, "of the switched twin, not of the system that was asked about")
+        notes = dict.fromkeys(names, "derivative of the system with a switched cutoff, not of the given system")
         return self.result(found.value, found.gradient, notes | found.notes, details)
 
 

@@ -133,7 +133,7 @@ def test_a_surrogate_is_the_gradient_of_the_switched_system(hard):
     assert found.value != pytest.approx(problem.value(), rel=1e-6)
     own = by_sigma(Symmetric(), twin)
     assert float(found.gradient["potential.sigma"]) == pytest.approx(own, rel=1e-10)
-    assert "switched twin" in found.notes["potential.sigma"]
+    assert "switched cutoff" in found.notes["potential.sigma"]
     with pytest.raises(InputError, match="no force jump"):
         Surrogate()(twin, ("sigma",))
 

@@ -139,7 +139,7 @@ class Examiner:
     def unusable(self) -> str | None:
         """Return the first error if every simple test case raised an exception or gave malformed pairs."""
         reasons = [
-            f"asked about {case.name}, {'it raised ' * (why.code == 'RAISED')}{why.text}"
+            f"for the test case “{case.name}”, {'it raised ' * (why.code == 'RAISED')}{why.text}"
             for case, outcome in self.opening
             if (why := outcome.failure) is not None and why.code in ("RAISED", "MALFORMED")
         ]
