@@ -259,8 +259,8 @@ class ThroughContacts(BallMethod):
     """Gradient method: derivative of the ball's motion in continuous time, including the times of contacts.
 
     Contact is decided at the end of each step. A ball that starts higher reaches the floor later. The
-    derivative of the time steps omits this change of the contact time. A saltation matrix at every contact
-    adds the change of the contact time. If impacts are located within a step, the program's own derivative
+    derivative of the time steps omits the change of the contact time. A saltation matrix at every contact
+    adds this change to the derivative. If impacts are located within a step, the program's own derivative
     already contains the saltation matrix. A contact by projection is treated like an impact. Without a
     damper, the force of a spring does not jump, and the result is the same as from the method `unrolled`.
     """
@@ -310,7 +310,7 @@ class ThroughContacts(BallMethod):
 
 
 class _SaltatingReset:
-    """Contact that resets the velocity at the end of a step, with the derivative of continuous motion."""
+    """Contact that resets velocities at the end of a step, but is differentiated like continuous motion."""
 
     def move(self, motion: Motion) -> Moved:
         """Compute one step with a contact, and differentiate it by means of the saltation matrix."""

@@ -6,8 +6,8 @@ crossing times, however short the steps are. A saltation matrix (mdnum.numerics)
 effect of the crossing time. The potential energy and the virial also jump at a crossing. If a loss sums
 energies or virials over equally spaced frames, a later crossing shifts the jump by a fraction of a frame.
 
-Source: for a pair with radial force jump f (positive: repulsive) and radial speed s, a change dr of the
-distance changes the crossing time by -dr/s and the momentum along the pair by f dr/s.
+For a pair with radial force jump f (positive: repulsive) and radial speed s, a change dr of the distance
+changes the crossing time by -dr/s and the momentum along the pair by f dr/s.
 """
 
 from __future__ import annotations
@@ -209,8 +209,8 @@ def of_energy(
 ) -> Float[Array, "most"]:
     """Compute cotangents of crossing distances for an energy function, with jumps E(with pair) - E(without).
 
-    The jump affects all atoms whose energy depends on the pair, and is evaluated with the pair at its cutoff
-    distance. For other pairs that cross in the same step, the decisions at the end of the step are used.
+    The jump affects all atoms whose energy depends on the pair. It is evaluated with the pair at its cutoff
+    distance. Other pairs that cross in the same step have their decisions at the end of the step.
 
     Args:
         met: crossings whose `push` is one over the radial speed, negative where the pair leaves.

@@ -65,7 +65,7 @@ class Differentiated(NamedTuple):
 def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
     """Differentiate f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
-    Steps decrease by factors of 1.4, and the extrapolation with the smallest estimated error is returned. It
+    Steps decrease by factors of 1.4. The extrapolation with the smallest estimated error, which is returned,
     balances the truncation error of large steps against the noise of small steps.
 
     Args:
@@ -348,7 +348,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Ensemble(Method):
-    """Gradient method: mean over replicas of another method's gradient, for several numbers of steps.
+    """Gradient method: average of another method's gradient over replicas, for several numbers of steps.
 
     The details of the gradient contain standard errors, and the number of steps at which noise dominates.
     """

@@ -1,9 +1,9 @@
 """Losses of a trajectory, which are evaluated frame by frame so that the trajectory need not be stored.
 
 A loss computes observations from each frame (and the first frame), sums the observations over frames, and
-computes a number from these sums. Averages, correlations with the start and histograms are losses of this
-form. The derivatives of a loss also require only one frame at a time. Each loss that the command line offers
-is a class in this module with a name, a label and a unit.
+computes a number from these sums. Examples of losses are averages, correlations with the start, and
+histograms. The derivatives of a loss also require only one frame at a time. Each loss that the command line
+offers is a class in this module with a name, a label and a unit.
 """
 
 from __future__ import annotations

@@ -126,8 +126,8 @@ class Pace(NamedTuple):
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the number of frames per unit of time near a step. A jump of the energy that occurs earlier
-        by dt changes, on average, dt times this number of frames.
+        """Return the number of frames per unit of time near a step. If the energy jumps earlier by dt, the
+        number of frames after the jump increases by dt times the result.
         """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
@@ -223,8 +223,7 @@ class RunTape:
     @property
     def jumps_unseen(self) -> tuple[float, float]:
         """Derivatives of the loss with respect to energy and virial of a frame; (0, 0) if frames are equally
-        spaced. For other losses, such as those of a single frame, gradients omit jumps of energy and virial
-        at flips.
+        spaced. For losses of a single frame, gradients omit jumps of energy and virial at flips.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0

@@ -5,9 +5,9 @@ mode. When the neighbor list expires, the remaining steps of the chunk are skipp
 next list at the present positions. The states between chunks are stored. If memory is insufficient, every
 second state is dropped, and the steps between the remaining states are run again.
 
-The differentiated program may round differently from an ordinary run, and then make other decisions. Its
-gradient would belong to another trajectory. Therefore, the states and decisions of all steps are compared
-with those of an ordinary run.
+The differentiated program may round differently from an ordinary run, and then make other decisions. In this
+case, the gradient belongs to another trajectory. Therefore, the states and decisions of all steps are
+compared with those of an ordinary run.
 """
 
 from __future__ import annotations

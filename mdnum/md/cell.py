@@ -126,7 +126,7 @@ class Cell(eqx.Module):
         """Return the components of the minimum image of a displacement.
 
         The minimum image is correct if the nearest image is shorter than half the smallest perpendicular
-        width. Callers therefore reject longer cutoffs.
+        width. Calling functions reject cutoffs longer than this half width.
         """
         if not any(self.pbc):
             return x, y, z
@@ -315,8 +315,8 @@ def strain_loss(reference: Cell, now: Cell, r_list):
 
     The upper bound follows from sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|, where S is the
     symmetric part of F, t a third of the trace of F, and |.| the Frobenius norm. The upper bound requires no
-    matrix decomposition. If the box keeps its shape, the upper bound is exact. Otherwise, its error is at
-    most 0.41 |S - t| plus the square of the rotation angle.
+    matrix decomposition. If the box keeps its shape, the upper bound is exact. If the shape changes, the
+    error of the bound is at most 0.41 |S - t| plus the square of the rotation angle.
 
     Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
     """

@@ -3,9 +3,9 @@
 Every cutoff maps the value u and slope w = du/d(r²) of the bare potential to the value and slope of the cut
 potential, for pairs inside the cutoff. The module `decide` determines which pairs are inside the cutoff.
 
-A cutoff is a class with a formula `cut`, a name and a smoothness. All other parts of the package find the
-class by its name in `CUTOFFS`. A class may also define the independent implementation `reference` and the
-interval version `enclose`. By default, both are derived from `cut`.
+A cutoff is a class with a formula `cut`, a name and a smoothness. All other parts of the package find a
+cutoff by its name in `CUTOFFS`. A class may also define the independent implementation `reference` and the
+interval version `enclose`. By default, `reference` and `enclose` are derived from `cut`.
 
 All formulas work with numpy and jax arrays; this module does not import jax.
 """
@@ -83,8 +83,8 @@ class Cutoff(ABC):
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
         """Return energy and derivative with respect to r in float64 on the host, as a reference for `cut`.
 
-        The default method differentiates the energy of `cut` with jax. It does not use the slope that `cut`
-        returns.
+        The default method differentiates the energy of `cut` with jax. The slope returned by `cut` is not
+        used.
 
         Args:
             r, u, du: distances, bare energy and its derivative with respect to r.

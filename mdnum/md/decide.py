@@ -1,7 +1,7 @@
 """Decisions on which pairs are inside the cutoff, by the comparison that the system file specifies.
 
 The compared quantity and its threshold are defined only in this module. The force loop, the check of neighbor
-lists and the code that writes the ledger use this module. Their decisions are therefore bitwise the same.
+lists and the code that writes the ledger use this module. All decisions are therefore bitwise the same.
 """
 
 from __future__ import annotations

@@ -201,10 +201,10 @@ def energy_function(
 
     Supported forms are `energy_fn(R, neighbor, **kw)`, `energy_fn(params, R, neighbor, **kw)`, `energy_fn(R,
     *, box=, neighbor=, perturbation=)`, and mdnum's own form `f(parameters, positions, neighbor, cell)`. A
-    function may be given alone, or with its neighbor functions as returned by jax-md's `*_neighbor_list`. It
-    may use neighbor lists with several images. The energy function returns a number, a number per atom, or a
-    dictionary with key "total" or "energy". Box vectors in rows or columns, and real or fractional positions,
-    are distinguished by trial calls when a simulation is made.
+    function may be given alone, or with its neighbor functions as returned by jax-md's `*_neighbor_list`. The
+    function may use neighbor lists with several images. The energy function returns a number, a number per
+    atom, or a dictionary with key "total" or "energy". Box vectors in rows or columns, and real or fractional
+    positions, are distinguished by trial calls when a simulation is made.
 
     Example:
         >>> made = jax_md.energy.lennard_jones_neighbor_list(displacement, box)

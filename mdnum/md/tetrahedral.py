@@ -79,7 +79,7 @@ class Tersoff(ManyBody):
 
     Energy and force go to zero at r_cut = R + D, where the derivative of the force jumps. If only the atom
     that crosses the cutoff affects a bond, the bond order varies as (r_cut - r)^(2n). For n < 1, the force is
-    then continuous but has an infinite derivative. This case occurs in dilute silicon, not in the crystal.
+    then continuous with an infinite derivative (in dilute silicon, not in the crystal).
 
     The implementation was checked against ase.calculators.tersoff and a plain numpy evaluation
     (tests/support/oracles_manybody.py). Source: Tersoff, Phys. Rev. B 38, 9902 (1988), eqs. 1 to 3 and table

@@ -1,7 +1,7 @@
 """Evaluation of jax functions by numpy and scipy, one operation at a time and without compilation.
 
-The results are a reference for jax: the same formula with independent functions and loops. Operations are not
-compiled, because their compilation would take longer than the rest of a short run.
+The results are a reference for jax: numpy evaluates the same formula with independent code. Operations are
+not compiled, because their compilation would take longer than the rest of a short run.
 """
 
 from __future__ import annotations

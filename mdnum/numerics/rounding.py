@@ -28,7 +28,7 @@ def _signed(dtype: np.dtype) -> np.dtype:
 def ordinal(x: ArrayLike) -> Int[np.ndarray, "..."]:
     """Return the index of x among all floats of the same dtype, as a signed integer; ±0 has index 0.
 
-    Adjacent finite floats have adjacent indices, so differences count ulps. The index of NaN has no meaning.
+    Adjacent floats have adjacent indices, so index differences count ulps. The index of NaN has no meaning.
     """
     x = np.asarray(x)
     integer = _signed(x.dtype)

@@ -4,8 +4,8 @@ A summation order is used in two ways. The force loop of molecular dynamics pass
 a partial sum from block to block. The terms of a whole neighbor list are therefore never stored at once. A
 summation order that needs all terms stores the terms and adds them at the end. Code outside of the force loop
 passes a whole array and gets the sum over the first axis. The sum is rounded after every addition and has the
-same bits as a numpy loop in the dtype of the terms. `jnp.sum` differs from every summation order in this
-module: `jnp.sum` adds 16-bit terms in float32, which hides the effect of a 16-bit accumulator.
+same bits as a numpy loop in the dtype of the terms. Unlike the summation orders of this module, `jnp.sum`
+adds 16-bit terms in float32, which hides the effect of a 16-bit accumulator.
 
 The derivative of every sum is that of the exact sum, because rounding and order have no derivative.
 """

@@ -5,10 +5,10 @@ counterfactual run. The counterfactual run has the arithmetic of the second run 
 the first run. If the counterfactual run stays close to the first run, the flips caused the split. If the
 counterfactual run also splits, repeats of both runs decide whether the flips accelerated the split or are
 bystanders. Repeats are evaluated by a sequential sign test. Assume that a pair of runs splits later without
-the flips with a probability of at most 1/2. Then k or more of n pairs do so with at most the probability of k
-or more heads in n coin tosses, for any delays. The initial displacements of all repeats have the same size.
-If the majority is different for displacements of another size, the verdict is left open. Error rates are
-listed in docs/verdict-calibration.md.
+the flips with a probability of at most 1/2. Then the probability that k or more of n pairs split later is at
+most that of k or more heads in n coin tosses. The initial displacements of all repeats have the same size. If
+the majority is different for displacements of another size, the verdict is left open. Error rates are listed
+in docs/verdict-calibration.md.
 """
 
 from __future__ import annotations
@@ -205,7 +205,7 @@ class Growth:
 
     @property
     def plain(self) -> bool:
-        """Whether the distance between two runs grows so clearly that the fit is not a fit of noise."""
+        """True if the distance between two runs clearly grows, so that the fit is not a fit of noise."""
         return bool(np.isfinite(self.rate) and self.rate > 0 and self.r_squared > FITS)
 
 
@@ -246,7 +246,7 @@ def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
     """Fit the exponential growth rate of the distance between two runs, before the distance saturates.
 
     The fit uses steps before the split, with distances between 1e-12 and 0.1 times the tolerance. Steps up to
-    the last distance below this range are omitted. A low r_squared of the fit indicates noise.
+    the last distance below 1e-12 times the tolerance are omitted. A low r_squared of the fit indicates noise.
 
     Args:
         separation: of each step, length; NaN after a run ended.

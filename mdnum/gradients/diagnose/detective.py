@@ -4,7 +4,7 @@ For example, a force can be finite while its derivative is not, a loss can conta
 sum can overflow in the reverse pass. The reverse pass is repeated up to the first step that gives a
 non-finite number. The operations of this step are then run one by one. An operation is the cause if its
 inputs are finite, its result is not finite, and a finite number in place of the result makes the program's
-result finite. The last condition excludes numbers that are masked out later.
+result finite. Numbers that are masked out later are therefore not a cause.
 """
 
 from __future__ import annotations

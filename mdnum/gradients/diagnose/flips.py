@@ -1,9 +1,9 @@
 """Contribution of each flip to a gradient, and the parameter values at which pair decisions change.
 
 The contribution of a flip to a gradient is a product of two factors. The first factor, from a reverse pass,
-is the derivative of the loss with respect to the cutoff of one crossing. It includes the effect of later
-flips. The second factor, from tangents without flips, is the derivative of the cutoff minus that of the pair
-distance. The contributions of single flips sum exactly to that of all flips.
+is the derivative of the loss with respect to the cutoff of one crossing. The first factor includes the effect
+of later flips. The second factor, from tangents without flips, is the derivative of the cutoff minus that of
+the pair distance. The contributions of single flips sum exactly to that of all flips.
 
 A decision boundary is a parameter value, between two adjacent floats, at which a pair decision changes.
 Between two boundaries all runs make the same decisions, and loss and gradient are smooth functions of the
@@ -42,7 +42,7 @@ _FIRST, _FACTOR = 1e-12, 8.0
 class FlipTerms:
     """Contributions of all flips to the derivative with respect to each parameter entry, largest first.
 
-    In column names, a number is a scalar parameter or one array entry, such as "potential.sigma[1]".
+    Columns are named by scalar parameters and single array entries, such as "potential.sigma[1]".
     """
 
     # a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the decision,

@@ -202,7 +202,7 @@ class ScalingWatch:
             self.put(stretch.first + row, np.concatenate(list(both)))
 
     def put(self, step: int, values: Float[np.ndarray, "numbers"]) -> None:
-        """Count overflow and underflow among the cotangents of one step."""
+        """Count the cotangents of one step that overflow or underflow."""
         form, size, table = self.format, np.abs(values), self.table
         self.numbers = len(values)
         there = size[np.isfinite(size) & (size > 0)]
@@ -219,7 +219,7 @@ class ScalingWatch:
             table["largest"][step] = np.inf
 
     def result(self) -> Scaling:
-        """Count overflow and underflow for the unscaled loss, and for the best scale of the loss."""
+        """Count cotangents that overflow or underflow, for the unscaled loss and for its best scale."""
         form = self.format
         largest = float(self.table["largest"].max())
         there = self.exponents.sum(axis=1, dtype=np.int64)
