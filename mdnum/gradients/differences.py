@@ -6,7 +6,7 @@ Replicas have different neighbor lists and are therefore run one after another o
 If a parameter changes, pairs cross the cutoff at other steps. If the force jumps at the cutoff, the loss then
 jumps as a function of the parameter. Between two jumps, the slope of the loss is the derivative of the time
 steps. The event-aware gradient is the slope of the loss across many jumps. Finite differences that are
-compared with it must span many jumps.
+compared with this gradient must span many jumps.
 """
 
 from __future__ import annotations

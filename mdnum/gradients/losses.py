@@ -232,8 +232,8 @@ class MeanDensity(MeanVolume):
 class EinsteinDiffusion(Loss):
     """Diffusion constant (length² per unit of time) from the slope of the mean squared displacement.
 
-    A straight line is fitted to the mean squared displacement since step 0. D is a sixth of the line's slope.
-    Motion is ballistic at the beginning of a run: set `first` to a step after the ballistic regime.
+    A straight line is fitted to the mean squared displacement since step 0. D is a sixth of the slope of this
+    line. Motion is ballistic at the beginning of a run: set `first` to a step after the ballistic regime.
 
     Source: Allen and Tildesley, Computer Simulation of Liquids (2017), section 2.7.
     """

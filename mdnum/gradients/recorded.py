@@ -1,7 +1,7 @@
 """Gradient methods that linearize a recorded run, in reverse mode (cotangents) or forward mode (tangents).
 
 First, an ordinary run is made and recorded. The steps are then linearized at the recorded states and
-decisions. For a reversible run with a fixed-point state, the states are not stored but recomputed.
+decisions. For a reversible run in fixed-point numbers, the states are not stored but recomputed.
 """
 
 from __future__ import annotations
@@ -298,7 +298,7 @@ class Surrogate(Method):
 
 
 def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
-    """Return the numbers of crossings and of grazing crossings, and the crossings with largest weights."""
+    """Return the numbers of all and of grazing crossings, and the crossings with the largest weights."""
     speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
     flips = {name: joined(crossings, name, ledger=True) for name in ("step", "i", "j", "entered")}
     key, heavy = -np.abs(weight), np.arange(len(weight))

@@ -2,8 +2,8 @@
 
 Recorded stretches of steps are kept in memory as long as there is room. Stretches that do not fit into memory
 are run again from their first states. The repeated run has the same bits, because program, state and neighbor
-list are the same. A run with a fixed-point integer state need not be stored. Its steps are reversed, and must
-lead back to the start bit for bit.
+list are the same. A run in fixed-point numbers need not be stored. The steps of such a run are reversed, and
+must lead back to the start bit for bit.
 """
 
 from __future__ import annotations
@@ -268,7 +268,7 @@ class RunTape:
 
 
 class ReversibleTape(RunTape):
-    """A completed run with a fixed-point integer state, which is reversed instead of stored.
+    """A completed run in fixed-point numbers, which is reversed instead of stored.
 
     The method `backward` reverses the steps with new neighbor lists, and raises NumericalError if states
     differ from those of the forward run.

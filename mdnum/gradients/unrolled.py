@@ -116,7 +116,7 @@ def chunk(
     tables: Tables,
     rule: tuple[int, int, bool],
 ) -> tuple[StepEnds, ChunkRecord]:
-    """Run a chunk of steps with one neighbor list; differentiable in the first two arguments.
+    """Run a chunk of steps with one neighbor list, differentiable with respect to the first two arguments.
 
     Args:
         limit: largest number of steps. seen: which of the chunk's steps the loss uses.

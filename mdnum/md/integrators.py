@@ -77,7 +77,7 @@ def quantity(
 ) -> Any:
     """Declare a field of an integrator that has a unit in system files, such as a time or a temperature.
 
-    A temperature (energy in mdnum) has the key `temperature` in system files, and a random key `seed`.
+    In system files, the energy kT has the key `temperature`, and the random key has the key `seed`.
     """
     return eqx.field(metadata={"unit": unit}, **options)
 

@@ -86,7 +86,7 @@ class PairTable:
     def decided(
         self, bits: UInt8[np.ndarray, "words atoms"]
     ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Return atoms i < j of the pairs with a true decision, each pair once, in the order of the table.
+        """Return the atoms i < j of all pairs whose decision is true, each pair once, in table order.
 
         For channel number c (counted from 0), c times the number of atoms is added to i.
         """

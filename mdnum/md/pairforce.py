@@ -356,8 +356,8 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
 def _virial(made: kernel.PairSums, x: Float[Array, "3 atoms"]) -> list[Float[Array, ""]]:
     """Return the sum of force times displacement over all pairs, counted for both atoms, in Voigt order.
 
-    A displacement is x_j - x_i minus lattice vectors. In the virial, force times position is summed over
-    atoms. Force times lattice vectors is added in the pair loop for the few pairs across a periodic boundary.
+    A displacement is x_j - x_i minus lattice vectors. The virial sums force times position over atoms. For
+    the few pairs across a periodic boundary, the pair loop adds force times lattice vectors.
     """
     return list(-2 * products(made.sums, x) - made.totals)
 

@@ -1,9 +1,9 @@
 """Elementary functions made of IEEE 754 operations; results have the same bits unless operations are fused.
 
 Elementary functions differ between libraries, and between the instruction sets for which a compiler generates
-code. The functions here have no branch, no table and no fused multiply-add. Each function consists of sums,
-products, quotients, roots, comparisons, selections and bit operations. The result is the same number wherever
-a function is run operation by operation, as in the compiled force loop.
+code. The functions of this module have no branch, no table and no fused multiply-add. Each function consists
+of sums, products, quotients, roots, comparisons, selections and bit operations. The result is the same number
+wherever a function is run operation by operation, as in the compiled force loop.
 
 Arguments and results are float64. Subnormal arguments are treated as 0. Results below 2.2261e-308 are 0, and
 results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps; an ulp is the spacing of

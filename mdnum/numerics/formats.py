@@ -1,7 +1,7 @@
 """Emulation of floating-point formats: rounding and loss scaling.
 
 The emulation reproduces the rounding of a format, not its speed. Some devices use TF32 for float32 matrix
-products by default. The inputs then keep 10 of 23 fraction bits, and the sums are in float32.
+products by default. The inputs of a TF32 product keep 10 of 23 fraction bits, and the sums are in float32.
 """
 
 from __future__ import annotations

@@ -78,8 +78,8 @@ class PrecisionPolicy:
     def geometry(self) -> np.dtype:
         """The dtype of the pair displacements from which forces are computed.
 
-        For 32- and 64-bit forces, displacements have the force dtype. For 16-bit forces, they have the dtype
-        of cutoff decisions, because the difference of two 16-bit coordinates has almost no correct digits.
+        For 32- and 64-bit forces, displacements have the force dtype. For 16-bit forces, displacements have
+        the dtype of cutoff decisions, because 16-bit differences have almost no correct digits.
         """
         return self.dtype("force") if self.force in WIDE else self.dtype("decision")
 

@@ -94,14 +94,14 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """True if a distance equals the cutoff within its error, or crosses the cutoff only between steps."""
+        """True if a distance equals the cutoff within its error, or if a pair crosses only between steps."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
         """Magnitude of the contribution that the two crossings at each turning point may have. If distance
         and cutoff agree within the uncertainty, the pair is assumed to pass the cutoff by 1 % of the
-        uncertainty. Otherwise, the result is how much the contribution changes in a run with shorter steps.
+        uncertainty. Otherwise, the result is the change of the contribution in a run with shorter steps.
         """
         bend, reach = self.table["bend"], self.reach
 
