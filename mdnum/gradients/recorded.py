@@ -293,7 +293,7 @@ class Surrogate(Method):
     def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
         found = self.method(self.twin(problem), names, progress)
         details = {"cutoff": self.cutoff, "onset": self.onset, **found.details}
-        notes = dict.fromkeys(names, "derivative of the system with a switched cutoff, not of the given system")
+        notes = dict.fromkeys(names, "derivative for the switched cutoff, not for the given system")
         return self.result(found.value, found.gradient, notes | found.notes, details)
 
 
