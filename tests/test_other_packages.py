@@ -175,7 +175,7 @@ def test_a_gradient_method(site):
     [
         (CUTOFF.replace(old, new), message)
         for old, new, message in (
-            ("w - share", "w + share", "r = 1, r_cut = 2 … slope … derivative … energy"),
+            ("w - share", "w + share", "r_cut = 2 … slope at r = 1 … derivative … energy"),
             ("u - share * r2", "u - share * r2 + 1", "energy jumps … -1 … r_cut … smoothness … 0"),
             ("smoothness = 0", "smoothness = 1", "slope jumps … 0.125 … r_cut … smoothness … 1"),
             ("smoothness = 0", "smoothness = -1", "smoothness -1 … energy is continuous"),

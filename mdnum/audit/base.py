@@ -128,8 +128,8 @@ def finding(
     """
     if left := [test for test in cause(code).tests if test not in tests]:
         raise ValueError(
-            f"the finding {code} was reported, but the tests {left}, which exclude the alternative causes "
-            f"{', '.join(cause(code).rivals)}, were not run"
+            f"the finding {code} was reported, but the tests {left} were not run; they rule out the other "
+            f"possible causes, {', '.join(cause(code).rivals)}"
         )
     return Observed(code, severity, [one for one in variants if one], values)
 

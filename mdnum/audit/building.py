@@ -123,8 +123,8 @@ class _Builder:
             return self.best  # on which no atom feels another: the forces say so
         if made is None:
             raise InputError(
-                f"the calculator computed no energy for any crystal of one element, nor for water ({why}; "
-                f"the structure was saved in {saved})",
+                f"no energy could be computed for a crystal of any element or for water ({why}; the "
+                f"structure of water was saved in {saved})",
                 where=self.name,
                 remedy="Use --structure FILE to give a structure that the calculator supports",
             )

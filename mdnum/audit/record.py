@@ -158,7 +158,7 @@ def kept(folder: RunFolder) -> AuditState:
         FolderError: answers.json does not contain an audit.
     """
     if not (folder.path / NAME).exists():
-        raise FolderError("the folder has no saved audit", remedy="Start a new audit", where=str(folder.path))
+        raise FolderError("the folder contains no audit", remedy="Start a new audit", where=str(folder.path))
     state = restored(folder, AuditState)
     with restoring(folder.path / NAME):
         assert state.atoms

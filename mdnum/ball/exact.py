@@ -61,7 +61,7 @@ class _Motion:
             value = getattr(self, name)
             _positive(name, abs(value) if name == "v0" else value, zero=zero)
         if self.y0 == 0 and self.v0 == 0:
-            raise InputError("the ball starts at rest on the floor", remedy="Give it a height or a velocity")
+            raise InputError("the ball starts at rest on the floor", remedy="Set a height or a velocity")
 
     def _known(self, quantities: Callable[[Parameters], tuple[Any, ...]]) -> tuple[Known, ...]:
         """Evaluate functions of complex parameters; return their values and complex-step derivatives."""
@@ -237,7 +237,7 @@ class ExactPenalty(_Motion):
         _positive("damping", self.damping, zero=True)
         if self.damping**2 == 4 * self.k:
             raise InputError(
-                "no formula describes the motion at critical damping", remedy="Change the damping slightly"
+                "the formula for the motion fails at critical damping", remedy="Change the damping slightly"
             )
 
     def state(self, t: Times) -> tuple[Known, Known]:
@@ -333,7 +333,7 @@ def _numbers(n: Counts, least: int = 1) -> Float[np.ndarray, "*counts"]:
 def _later(t: Times) -> Float[np.ndarray, "*times"]:
     t = np.asarray(t, np.float64)
     if not np.all(t >= 0):
-        raise InputError("a requested time is negative", remedy="Request times of at least 0")
+        raise InputError("a requested time is negative", remedy="Request only times of 0 or later")
     return t
 
 

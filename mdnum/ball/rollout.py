@@ -303,7 +303,7 @@ def first_difference(a: BallRun, b: BallRun) -> BallDifference:
     """
     if (a.steps, a.balls) != (b.steps, b.balls):
         raise InputError(
-            f"run A has {a.steps} steps and {a.balls} balls, run B {b.steps} steps and {b.balls} balls",
+            f"run A has {a.steps} steps and {a.balls} balls; run B has {b.steps} steps and {b.balls} balls",
             remedy="Compare runs with the same numbers of steps and balls",
         )
     separation, seed = np.zeros(0), None

@@ -250,14 +250,14 @@ def _check(world: World) -> None:
         if not isinstance(contact, Impact):
             raise InputError(
                 "the event-located integrator needs an impact contact",
-                remedy="Use an impact contact, or another integrator for penalty and projection contacts",
+                remedy="Use an impact contact; for penalty and projection contacts, use another integrator",
             )
         _count("max_impacts", integrator.max_impacts)
     if isinstance(contact, Projection):
         gain = float(contact.alpha) * float(contact.k)
         if gain >= 2:
             raise InputError(
-                f"alpha * k = {gain:g}; the iteration of the contact solver converges only below 2",
+                f"alpha * k = {gain:g}; the iteration of the contact solver converges only if alpha * k < 2",
                 remedy="Choose alpha * k below 2; at alpha * k = 1, one iteration is enough",
             )
         _check_stop(contact.stop, world.policy, gain)
@@ -274,8 +274,8 @@ def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
         _check_stop(rule.rule, policy, gain)
         if not float(rule.enter) >= float(rule.rule.tol):
             raise InputError(
-                f"the stopping rule has enter = {rule.enter}, below tol = {rule.rule.tol}",
-                remedy="Set enter to at least tol: iterations end when the residual falls below tol",
+                f"the stopping rule has enter = {rule.enter}, which is below tol = {rule.rule.tol}",
+                remedy="Set enter to tol or more, because the solver stops when the residual falls below tol",
             )
         return
     tol = float(rule.tol)

@@ -236,7 +236,7 @@ def calibrate(
     """
     if members < FEWEST:
         raise InputError(
-            f"members = {members}: the ensemble has too few runs to estimate a statistical limit",
+            f"members = {members}: statistical limits cannot be estimated from so few runs",
             remedy=f"Set members to at least {FEWEST}",
         )
     expect_at_least(0, held_out=held_out)
@@ -244,8 +244,8 @@ def calibrate(
     changes = planted(simulation) if changes is None else changes
     if not any(change.must_fail for change in changes):
         raise InputError(
-            "no deliberate change has must_fail = True, so the test's sensitivity is not checked",
-            remedy="Add a deliberate change with must_fail = True, which the test must detect",
+            "the sensitivity of the test is not checked, because no deliberate change has must_fail = True",
+            remedy="Set must_fail = True for a deliberate change that the test must detect",
         )
     tried = [steps] if steps is not None else _windows(simulation, start)
     nodes = nodes_of(simulation, start or first_state(simulation))
@@ -304,8 +304,8 @@ def choose(windows: Sequence[Window], name: str) -> Window:
         if not one.ok
     )
     raise InputError(
-        f"after {steps} steps the effects of the deliberate changes cannot be distinguished from those of "
-        f"rounding errors (the best step was {best.step}: {missed})",
+        f"after {steps} steps, the effects of the deliberate changes cannot be distinguished from those of "
+        f"rounding errors. The test came closest at step {best.step}: {missed}",
         where=name,
         remedy=(
             "Compare at an earlier step, before the runs of the ensemble diverge, or start from a fluid "

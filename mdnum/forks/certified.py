@@ -176,7 +176,7 @@ def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
     """
     if not simulation.rule.safe:
         raise InputError(
-            "a neighbor list that is not checked at every step may miss pairs and leave them unexamined",
+            "the neighbor list is not checked at every step, so it may lack pairs that are inside the cutoff",
             remedy="Set neighbors.rebuild.every = 1 and neighbors.rebuild.check = true",
             where="neighbors.rebuild",
         )

@@ -111,13 +111,13 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
             raise InputError(
                 "the folder contains a result of `mdnum fork`; expected a run",
                 where=str(folder.path),
-                remedy="Give two folders of `mdnum run`, `mdnum ball` or `mdnum flips`. To show a result "
-                "of `mdnum fork`, use `mdnum report DIR`",
+                remedy="Give two output folders of `mdnum run`, `mdnum ball` or `mdnum flips`. To show a "
+                "result of `mdnum fork`, use `mdnum report DIR`",
             )
     where = f"{first.path} and {second.path}"
     if first.kind != second.kind:
         kinds = f"the folders hold runs of different kinds, {first.kind} and {second.kind}"
-        raise InputError(kinds, where=where, remedy="Compare two runs with atoms, or two runs with balls")
+        raise InputError(kinds, where=where, remedy="Compare two runs of atoms, or two runs of balls")
     with first.explained(), second.explained():
         return _compared(first, second, where)
 

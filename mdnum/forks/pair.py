@@ -138,7 +138,7 @@ def fork(
     expect_at_least(1, steps=asked)
     tolerance = SPLIT * a.scale if split is None else split
     if not 0 < tolerance < np.inf:
-        raise InputError(f"split = {tolerance:g}; expected a distance between runs A and B above 0")
+        raise InputError(f"split = {tolerance:g}; expected a positive distance between runs A and B")
     guard = _GUARD * tolerance
     gathered: list[PairRows] = []
     flips: list[Any] = []
@@ -183,7 +183,7 @@ def counterfactuals(
     most = repeats_asked(repeats, runs, reason or "such runs are disabled")
     if back and not runs:
         raise InputError(
-            "the option back needs a repeat of run B with the decisions of run A, but there is none: "
+            "the option `back` cannot be used, because run B is not repeated with the decisions of run A: "
             f"{reason or 'such runs are disabled'}",
             remedy="Omit the option `back`",
         )

@@ -126,7 +126,7 @@ def pinned(
     last_step = fork.steps if steps is None else steps
     if pairs is None:
         if fork.decision is None:
-            raise InputError("runs A and B do not fork", remedy="Name the pairs whose decisions are imposed")
+            raise InputError("runs A and B do not fork", remedy="Name the pairs whose decisions to impose")
         i, j = fork.decision.subject
         pairs = [(i, j)]
         spell = disagreements(fork, i, j)[0]
@@ -162,7 +162,7 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
     named = re.fullmatch(r"(\d+)\s*[-–]\s*(\d+)(?::(\d+)\.\.(\d+))?", text.strip())
     if named is None:
         raise InputError(
-            f"{text!r} names no pair decision", where="pin", remedy="Give fork, atoms 3-75 or 3-75:600..700"
+            f"{text!r} is not a pair decision", where="pin", remedy="Write fork, 3-75 or 3-75:600..700"
         )
     pair = int(named[1]), int(named[2])
     _check_pair(pair, atoms)
@@ -251,7 +251,7 @@ def minimal_cause(
     """
     split = fork.dates.split
     if fork.dates.fork is None or split is None or fork.decision is None:
-        raise InputError("runs A and B stayed close together", remedy="Use more steps or a smaller split")
+        raise InputError("runs A and B stayed close together", remedy="Use more steps, or reduce `split`")
     check_pins(fork)
     atoms = fork.twin.a.size
     # pairs that differ before the split, in the order in which they first do

@@ -378,8 +378,8 @@ class StretchReversal:
         force: Any = simulation.force
         if guard is not None and not simulation.imposable:
             raise InputError(
-                "the gradient can include flips of pair decisions only for a pair potential whose energy is "
-                "summed over the pairs of the neighbor list",
+                "the gradient can include the effect of flips only for a pair potential, with an energy that "
+                "is a sum over the pairs of the neighbor list",
                 remedy="For a many-body potential, use the gradient method symmetric",
                 where=simulation.name,
             )

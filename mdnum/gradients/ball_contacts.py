@@ -295,7 +295,7 @@ class ThroughContacts(BallMethod):
             events, flagged = _events(problem, run)
         if flagged:
             raise NumericalError(
-                f"the ball only grazes the floor in {int(flagged)} contacts, whose times have no derivative",
+                f"in {int(flagged)} contacts, the ball only grazes the floor; their times have no derivative",
                 remedy="Change the start or time step to make the ball hit the floor, or smooth the contact.",
             )
         use = used(problem, names, slopes, run, own=located or smooth)

@@ -306,7 +306,7 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
     """
     ledger = stretch.ledger
     if ledger is None:
-        raise InputError("the flips of the run were not recorded", remedy="Record the run with flips")
+        raise InputError("the flips of the run were not recorded", remedy="Repeat the run, recording flips")
     row = (ledger.step - stretch.first).astype(np.int64)
     low, high = ledger.i, ledger.j
     i, j = stretch.table.place[low % simulation.atoms], stretch.table.place[high]

@@ -321,7 +321,7 @@ def settled(simulation: Simulation, steps: int) -> Simulation:
     """
     *_, last = Engine(simulation, steps).segments()
     if last.closes in FAILURES:
-        raise NumericalError(f"the equilibration of a replica ended with a {last.closes} at step {last.last}")
+        raise NumericalError(f"a replica failed while equilibrating ({last.closes} at step {last.last})")
     x, v, images = (last.unsorted(name, last.rows - 1) for name in ("x", "v", "images"))
     cell = last.cell_of(last.rows - 1)
     x = unwrapped(np.asarray(cell.matrix), x, images)

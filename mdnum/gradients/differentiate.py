@@ -136,7 +136,7 @@ def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) ->
                 why = f": at step {blamed.step} {blamed.operation}({inputs}) in {blamed.source}"
         what = "the loss" if not np.isfinite(found.value) else f"a derivative, by {', '.join(bad)}"
         raise NumericalError(
-            f"{what} is not finite{why}", where=found.method, remedy="Correct the operation at fault"
+            f"{what} is not finite{why}", where=found.method, remedy="Correct the operation giving inf or NaN"
         )
     return found
 
@@ -149,7 +149,7 @@ def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str,
         if name not in full:
             raise InputError(
                 f"a value was given for {word}, but the gradient does not include this parameter",
-                remedy=f"Add {word} to the parameters of the gradient, now {', '.join(full)}",
+                remedy=f"Add {word} to the parameters of the gradient ({', '.join(full)})",
             )
         out[name] = np.asarray(value)
     return out

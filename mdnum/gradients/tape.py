@@ -341,8 +341,8 @@ class ReversibleTape(RunTape):
     def _astray(self, step: int, last: int) -> None:
         where = f"at step {step}" if last - step <= 1 else f"between steps {step} and {last}"
         raise NumericalError(
-            f"the reversed run differs from the forward run: positions or velocities deviate {where}",
-            remedy="Rebuild the neighbor list more often (neighbors.rebuild), since it may have missed pairs",
+            f"positions or velocities of the reversed run differ from those of the forward run {where}",
+            remedy="Rebuild the neighbor list more often (neighbors.rebuild): pairs may have been missed",
             where=self.simulation.name,
         )
 

@@ -157,7 +157,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
         ends = [_ends(made, power) for power in (1, 3)]
     if made.smoothness < _ORDERS and not any(ends):
         after = _DERIVATIVES[max(made.smoothness + 1, 0)]
-        raise ValueError(f"the cutoff's smoothness {made.smoothness} is too low: the {after} is continuous")
+        raise ValueError(f"smoothness {made.smoothness} of the cutoff is too low: its {after} is continuous")
 
 
 def _ends(made: Cutoff, power: int) -> bool:
@@ -182,7 +182,7 @@ def _ends(made: Cutoff, power: int) -> bool:
     off = ~(np.abs(2 * r * (slope - derivatives[1](jnp.asarray(r**2)))) <= 1e-9)
     if off.any():
         raise ValueError(
-            f"at r = {r[off.argmax()]:g}, r_cut = 2, the cutoff's slope is not the derivative of its energy"
+            f"if r_cut = 2, the cutoff's slope at r = {r[off.argmax()]:g} is not the derivative of its energy"
         )
     if made.switches and not np.allclose(energy[r < 1.6], r[r < 1.6] ** (-2 * power), rtol=1e-12):
         raise ValueError("the switching function changes the energy at distances below the switching onset")
@@ -205,7 +205,7 @@ def _ends(made: Cutoff, power: int) -> bool:
     for name, limit, least in (("energy", inside, 1e-9 * at.energy), ("force", -4 * steep, -1e-5 * at.slope)):
         told = float(getattr(made, f"{name}_jump")(at))
         if not abs(told - limit) <= least:
-            raise ValueError(f"{name}_jump is {told:g}, but the {name} just below r_cut is {limit:g}")
+            raise ValueError(f"{name}_jump is {told:g}; expected {limit:g}, the {name} just below r_cut")
     return ends
 
 

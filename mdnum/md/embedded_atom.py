@@ -50,7 +50,7 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
-        raise InputError("potential table not found", where=where, remedy="Correct potential.file") from None
+        raise InputError("potential table not found", where=where, remedy="Check potential.file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"the potential table cannot be read ({error})", where=where) from error
     try:

@@ -314,7 +314,7 @@ class KickDrift(Integrator):
         own = ("kick", "init", "finish", "begin", "deform")
         if other := [name for name in own if getattr(cls, name) is not getattr(KickDrift, name)]:
             raise TypeError(
-                f"the class {cls.__name__} overrides {other[0]}; derive it from Integrator instead"
+                f"the class {cls.__name__} overrides {other[0]}; derive the class from Integrator instead"
             )
 
     def kick(self, v: Vector, time: Number, acceleration: Vector) -> Vector:
@@ -358,7 +358,7 @@ def check_one_box(integrator: Integrator, what: str) -> None:
     """Raise `InputError` if an integrator changes the box although a fixed box is required."""
     if integrator.moves_cell:
         raise InputError(
-            f"{what} need a fixed box, but the integrator {integrator.name} changes it", where="dynamics.kind"
+            f"{what} need a fixed box, but {integrator.name} changes the box", where="dynamics.kind"
         )
 
 

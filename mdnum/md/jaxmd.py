@@ -253,8 +253,8 @@ class PairSearch:
         # a hair beyond half the width is the room that callers add for rounding, not another image
         if not 0 < r_list <= narrowest / 2 * (1 + 1e-9):
             raise InputError(
-                f"the radius of the neighbor list (cutoff plus skin) is {r_list:g}, but the cell is "
-                f"{narrowest:g} wide; expected a radius of at most half the width, {narrowest / 2:g}",
+                f"the radius of the neighbor list (cutoff plus skin) is {r_list:g}; expected at most "
+                f"{narrowest / 2:g}, which is half the width of the cell ({narrowest:g})",
                 remedy="Repeat the cell along its narrowest direction, or reduce the cutoff or the skin",
             )
         self.cell = complete(cell, np.asarray(pbc))

@@ -61,7 +61,7 @@ class Hysteresis:
     def __post_init__(self):
         if self.enter.space != self.leave.space:
             raise InputError(
-                f"enter and leave limit different quantities, {self.enter.space} and {self.leave.space}"
+                f"enter and leave apply to different quantities, {self.enter.space} and {self.leave.space}"
             )
         enter, leave = self.enter.value, self.leave.value
         # traced values are checked where they were made

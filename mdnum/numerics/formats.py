@@ -170,6 +170,6 @@ def check_scale(scale: float) -> None:
     """
     if not (scale > 0 and math.frexp(scale)[0] == 0.5):
         raise InputError(
-            f"the scale of the number format is {scale:g}; expected a power of two",
-            remedy="Give a power of two, so that scaling numbers causes no rounding errors",
+            f"the scale of the number format is {scale:g}, which is not a power of two",
+            remedy="Give a power of two, because other scales cause rounding errors",
         )

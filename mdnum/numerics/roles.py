@@ -43,7 +43,7 @@ def check_role(role: str, dtype: str) -> None:
         return
     if dtype in ALL and dtype not in known:
         raise InputError(
-            f"the precision {role} of molecular dynamics cannot be {dtype}: {_TOO_SHORT[role]}",
+            f"in molecular dynamics, precision.{role} cannot be {dtype}: {_TOO_SHORT[role]}",
             where=f"precision.{role}",
             remedy=f"Use {' or '.join(WIDE)}; only pair forces can be computed in {dtype} (precision.force)",
         )

@@ -106,7 +106,7 @@ class Scan:
             self._keep_nearest(flips, np.zeros(0))
             return
         if step.min() < 0 or step.max() >= steps:
-            raise ValueError(f"flips are at steps {step.min()} to {step.max()}; the run has {steps} steps")
+            raise ValueError(f"flips at steps {step.min()} to {step.max()} are not in a run of {steps} steps")
         came = flips["entered"].astype(bool)
         self.entered += np.bincount(step[came], minlength=steps)
         self.left += np.bincount(step[~came], minlength=steps)

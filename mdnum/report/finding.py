@@ -68,7 +68,7 @@ class _Fields(string.Formatter):
             return revived(super().get_value(key, args, kwargs))
         except (KeyError, IndexError):
             raise KeyError(
-                f"a sentence needs the field {key!r}; the given fields are {', '.join(kwargs) or 'no values'}"
+                f"the field {key!r} of a sentence has no value; given fields: {', '.join(kwargs) or 'none'}"
             ) from None
 
 

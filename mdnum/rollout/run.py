@@ -377,8 +377,8 @@ def run(
         given = system if isinstance(system, Simulation) else None
         if system is not given or save_every is not None or overrides:
             raise InputError(
-                "a resumed run keeps its own system, settings and save_every",
-                remedy="Give only the folder, and a number of steps to extend the run",
+                "a resumed run uses the system, settings and save_every of its folder",
+                remedy="Give only the folder and, to extend the run, a number of steps",
                 where=str(resume),
             )
         finished = _finished(Path(resume), steps, given)

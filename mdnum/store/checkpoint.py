@@ -87,7 +87,7 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         shape, _, dtype = header(stream)
         claimed = math.prod(shape) * dtype.itemsize
         if dtype.hasobject or claimed != member.file_size - stream.tell():
-            raise ValueError(f"{member.filename} should have {claimed:,} bytes, but has another size")
+            raise ValueError(f"{member.filename} has the wrong size; expected {claimed:,} bytes")
     with archive.open(member) as stream:
         return npy.read_array(stream, allow_pickle=False)
 
@@ -166,7 +166,7 @@ class FrameFile:
             return
         if self.mark()[2] < size:
             raise FolderError(
-                f"the trajectory is shorter than its checkpoint says ({frames} frames)",
+                f"the trajectory is shorter than its checkpoint states ({frames} frames)",
                 remedy="Run again in a new folder: the old folder was changed after the checkpoint",
                 where=str(self.path),
             )

@@ -163,7 +163,7 @@ def read_text(path: Path) -> str:
         return ""
     except UnicodeDecodeError as error:
         raise FolderError(
-            f"the file is damaged: not UTF-8 text ({error.reason} at byte {error.start})", where=str(path)
+            f"the file is damaged: it is not UTF-8 ({error.reason} at byte {error.start})", where=str(path)
         ) from error
     except OSError as error:
         raise FolderError(f"the file cannot be read: {error.strerror}", where=str(path)) from error

@@ -76,7 +76,7 @@ def _parsed(file: Path, text: str) -> Any:
         return json.loads(text) if is_json else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         kind = "JSON" if is_json else "TOML"
-        raise FolderError(f"the file is damaged: not valid {kind} ({error})", where=str(file)) from error
+        raise FolderError(f"the file is damaged: it is not {kind} ({error})", where=str(file)) from error
 
 
 class RunFolder:
@@ -709,7 +709,7 @@ class RunFolder:
         except BlockingIOError:
             lock.close()
             raise FolderError(
-                "another process is writing to this folder", remedy="Wait for it to end", where=str(self.path)
+                "another process is writing to this folder", remedy="Wait until it ends", where=str(self.path)
             ) from None
         except OSError:
             # a file system without locks (some network mounts): go on without

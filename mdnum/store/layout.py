@@ -59,7 +59,7 @@ class Layout:
                 f"invalid kind {self.kind!r}, command {self.command!r} or resumes_from {self.resumes_from!r}"
             )
         if len(self.further) > _MOST_COLUMNS:
-            raise ValueError(f"the list `further` has too many characters: {self.further[:100]!r}")
+            raise ValueError(f"the list `further` is too long: {self.further[:100]!r}")
         if len(self.tables) > _MOST_TABLES or not all(map(_TABLE.fullmatch, self.tables)):
             raise ValueError(f"the layout has too many tables or an invalid name: {list(self.tables)[:3]}")
         _ = self._columns
@@ -73,7 +73,7 @@ class Layout:
             for column, value in values.items():
                 kind, _ = self.columns(table)[column]
                 if type(value) not in TYPES[kind] or (type(value) is int and abs(value) >= 1 << 31):
-                    raise ValueError(f"{value!r} in {table}.{column} is not of its type {kind}")
+                    raise ValueError(f"{value!r} in column {table}.{column} is not of type {kind}")
 
     @cached_property
     def always(self) -> tuple[str, ...]:

@@ -141,7 +141,7 @@ def points(
         count = math.prod(len(axis.values) for axis in axes)
         if count * len(seeds) > MOST_POINTS:
             raise InputError(
-                f"{count * len(seeds):,} points are too many", remedy="Give fewer values or another design"
+                f"{count * len(seeds):,} runs are too many", remedy="Give fewer values, or use another design"
             )
         chosen = [dict(zip(keys, values, strict=True)) for values in product(*(axis.values for axis in axes))]
     elif design == "space-filling":
@@ -151,7 +151,7 @@ def points(
         for axis in axes:
             chosen += [{**base, axis.key: value} for value in axis.values if value != base[axis.key]]
     if len(chosen) * len(seeds) > MOST_POINTS:
-        raise InputError(f"the sweep has {len(chosen) * len(seeds):,} points; the limit is {MOST_POINTS:,}")
+        raise InputError(f"the sweep has {len(chosen) * len(seeds):,} runs; the limit is {MOST_POINTS:,}")
     return [Point(choices, seed) for seed in seeds for choices in chosen]
 
 

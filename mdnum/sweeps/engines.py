@@ -81,9 +81,9 @@ def _answered(
     try:
         if code(everywhere=True) != versions:
             raise InputError(
-                "a worker has another version of mdnum, jax or numpy than the process that started it",
+                "a worker uses a different version of mdnum, jax or numpy than the process that started it",
                 where=f"{sys.prefix} on {socket.gethostname()}",
-                remedy="Use the same environment: results depend on these versions",
+                remedy="Use the same environment in all processes: results depend on package versions",
             )
         with allow_code(allowed):
             return work(task), None
@@ -163,7 +163,7 @@ def _dask(address: str, workers: int | None) -> TaskEngine:
         engine = TaskEngine(make, 1, 1, lambda _: clients[0].close(timeout=5))
     except OSError as error:
         remedy = "Start the scheduler and a worker: dask scheduler; dask worker tcp://host:port"
-        raise InputError(f"no dask scheduler responds: {error}", where=address, remedy=remedy) from None
+        raise InputError(f"cannot connect to the scheduler: {error}", where=address, remedy=remedy) from None
     of_each: Any = clients[0].nthreads()
     threads = list(of_each.values())
     engine.width, engine.threads = workers or max(sum(threads), 1), max(threads, default=1)
@@ -254,7 +254,7 @@ def opened(on: str | Executor | TaskEngine | None, workers: int | None) -> Itera
     elif on.endswith(".toml"):
         engine = _executorlib(on, workers)
     else:
-        raise InputError(f"unknown engine {on!r}", remedy="Give a dask scheduler (tcp://...) or a .toml file")
+        raise InputError(f"unknown scheduler {on!r}", remedy="Give a dask address (tcp://...) or .toml file")
     try:
         yield engine
     finally:
@@ -387,7 +387,7 @@ def in_order(
 def _as_error(error: BaseException) -> MdnumError:
     if isinstance(error, MdnumError):
         return error
-    return MdnumError(f"a task gave no result: {type(error).__name__}: {error}")
+    return MdnumError(f"a task failed: {type(error).__name__}: {error}")
 
 
 def _numbered(work: Callable[[Any], Any], task: tuple[int, Any]) -> Any:

@@ -146,7 +146,7 @@ class Workspace:
         except (OSError, ValueError) as error:
             message = f"the file is not the result of a point: {error}"
             raise FolderError(
-                message, where=str(file), remedy="Delete this point's folder to compute the point again"
+                message, where=str(file), remedy="Delete the folder of the file, then repeat the sweep"
             ) from None
 
     def nearest(self, point: Mapping[str, Any]) -> list[str] | None:

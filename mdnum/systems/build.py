@@ -153,7 +153,7 @@ def again(folder: Path, given: Simulation | None = None) -> Simulation:
         seen = f"{other[0]} was {there.get(other[0])!r} and is {here.get(other[0])!r}"
         more = f", and so on: {', '.join(other[1:5])}" * (len(other) > 1)
         raise InputError(
-            f"this simulation differs from the one in the folder: {seen}{more}",
+            f"the given simulation differs from that in the folder: {seen}{more}",
             where=str(folder),
             remedy=GIVE_OBJECTS,
         )

@@ -63,9 +63,9 @@ def function(place: str, folder: Path, where: str = "potential.function") -> Cal
     file, name = parts(place, folder, where)
     if not is_allowed():
         raise InputError(
-            f"{where} names Python code ({file}:{name}), which is executed only with permission",
+            f"{where} refers to Python code ({file}:{name}), which is not executed without permission",
             where=where,
-            remedy="Read the code, then give --allow-code, or allow_code=True in Python",
+            remedy="Read the code; if you trust it, give --allow-code, or allow_code=True in Python",
         )
     if not file.is_file():
         raise InputError("file not found", where=str(file), remedy=f"Correct the file name in {where}")

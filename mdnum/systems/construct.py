@@ -180,7 +180,7 @@ def simulation(
     if isinstance(integrator, Integrator):
         if also := [*given, *(["timestep"] if timestep is not None else [])]:
             message = f"the integrator is an object, but {', '.join(also)} was given as well"
-            raise InputError(message, where=name, remedy="Omit other values, or give the integrator by name")
+            raise InputError(message, where=name, remedy="Give only the integrator, or its name and values")
         _check_instance(integrator, system, name)
     else:
         if timestep is None:
@@ -309,18 +309,18 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
     if not (ends := np.abs(u[-1] - u[-2]) <= _STEEP * _INSIDE * np.max(np.abs(u[-4:]), axis=0)).all():
         kind = int(np.argmin(ends))
         raise InputError(
-            f"the pair energy of {pairs_of[kind]} is {u[-2, kind]:.6g} at the cutoff {r_cut[kind]:g}, but "
-            f"{u[-1, kind]:.6g} just inside; expected a function that is smooth across the cutoff",
+            f"the pair energy of {pairs_of[kind]} jumps from {u[-1, kind]:.6g} to {u[-2, kind]:.6g} at the "
+            f"cutoff {r_cut[kind]:g}; expected an energy that is smooth across the cutoff",
             where=potential.name,
-            remedy="Remove the truncation from the function, because mdnum truncates it at the cutoff",
+            remedy="Remove the truncation from the function; mdnum truncates the energy at the cutoff",
         )
     differs = ~np.isclose(u, swapped, rtol=_SYMMETRIC, atol=_SYMMETRIC * scale, equal_nan=True)
     if differs.any():
         k, kind = np.unravel_index(np.argmax(differs), u.shape)
         first, second = pairs_of[kind].split("-")
         raise InputError(
-            f"the pair energy at distance {r[k, kind]:.6g} is {u[k, kind]:.12g} for the species "
-            f"{first}-{second}, but {swapped[k, kind]:.12g} for {second}-{first}; expected equal energies",
+            f"at distance {r[k, kind]:.6g}, the pair energy of {first}-{second} is {u[k, kind]:.12g}, but "
+            f"that of {second}-{first} is {swapped[k, kind]:.12g}; expected equal energies",
             where=potential.name,
             remedy="Combine the parameters of the two species symmetrically, for example as (a + b) / 2",
         )
@@ -524,8 +524,8 @@ def in_fixed_point(simulation: Simulation) -> Simulation:
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(
-            'with state = "lattice", forces are computed in float64, and decisions and sums in fixed '
-            "point; other precisions are not supported",
+            'with state = "lattice", forces are always computed in float64, and decisions and sums in '
+            "fixed-point arithmetic",
             where="precision",
             remedy="Omit the keys `force`, `decision` and `accumulate` of the table [precision]",
         )

@@ -237,7 +237,7 @@ def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation
         here, new = value(simulation, name), np.asarray(given)
         if new.shape != here.shape or np.iscomplexobj(new) or not np.isfinite(new).all():
             raise InputError(
-                f"the new value of {name} has shape {new.shape} and type {new.dtype} (all finite: "
+                f"the new value of {name} has shape {new.shape} and type {new.dtype} (all numbers finite: "
                 f"{bool(np.isfinite(new).all())}); expected finite real numbers of shape {here.shape}"
             )
         place = entry(simulation, name)

@@ -87,7 +87,7 @@ class PairPotentialTable(TomlTable):
         if not pairs:
             missing = [key for key in self.constants if getattr(self, key, None) is None]
             if missing:
-                raise ValueError(f"no value of {', '.join(missing)} was given; add it here or in [pairs]")
+                raise ValueError(f"no value of {', '.join(missing)} was given here or in [pairs]")
         return self
 
     @property
@@ -610,7 +610,7 @@ class SystemSpec(TomlTable):
     def _cutoff_fits_potential(self) -> SystemSpec:
         if (self.potential is None) != bool(self.terms) or (self.terms and self.cutoff):
             raise ValueError(
-                "give either the table [potential] (with [cutoff] for pairs) or [terms.NAME.potential]"
+                "give [potential] (and [cutoff] for a pair potential), or else tables [terms.NAME.potential]"
             )
         if self.potential is not None:
             check_interaction(self.potential, self.cutoff)

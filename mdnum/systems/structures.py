@@ -239,9 +239,9 @@ def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
     if (places > farthest).any():
         worst = int(np.argmax(places))
         raise InputError(
-            f"atom {worst} ({atoms.symbols[worst]}) has a coordinate of {places[worst]:g} {length}, with "
-            f"a rounding error of {np.spacing(places[worst]):.2g} {length}; expected at most {farthest:.3g} "
-            f"{length}, {_FARTHEST:g} times the cutoff radius",
+            f"atom {worst} ({atoms.symbols[worst]}) has a coordinate of {places[worst]:g} {length}; "
+            f"expected at most {farthest:.3g} {length} ({_FARTHEST:g} times the cutoff radius). The rounding "
+            f"error of the coordinate is {np.spacing(places[worst]):.2g} {length}",
             remedy="Correct the coordinates or the length unit of the structure, or the key structure.rattle",
         )
     sides = np.abs(np.asarray(atoms.cell)).max(axis=1)
@@ -249,7 +249,7 @@ def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
         axis = int(np.argmax(sides))
         raise InputError(
             f"the cell vector {'abc'[axis]} is {sides[axis]:g} {length} long; expected at most "
-            f"{farthest:.3g} {length}, {_FARTHEST:g} times the cutoff radius",
+            f"{farthest:.3g} {length} ({_FARTHEST:g} times the cutoff radius)",
             remedy="Correct the cell of the structure, or set structure.pbc to false along this vector",
         )
 
@@ -263,9 +263,9 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
         f"a skin up to {half - r_cut:.4g} {length}" if r_cut < half else f"a cutoff below {half:.4g} {length}"
     )
     raise InputError(
-        f"r_cut + skin = {r_cut:g} + {skin:g} = {r_cut + skin:.6g} {length}, but half the smallest "
-        f"perpendicular width of the box (along {axis}) is {half:.6g} {length}; beyond this distance, an "
-        "atom interacts with two images of the same neighbor",
+        f"r_cut + skin = {r_cut:g} + {skin:g} = {r_cut + skin:.6g} {length}; expected at most "
+        f"{half:.6g} {length}, half the smallest perpendicular width of the box (along {axis}). Beyond this "
+        "distance, an atom interacts with two images of the same neighbor",
         remedy=f"Choose {allowed}, or repeat the structure {repeats(cell, r_cut + skin)}",
     )
 
@@ -301,9 +301,9 @@ def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> No
     a, b = sorted((worst, int(other[worst])))
     more = f" ({pairs} such pairs)" if pairs > 1 else ""
     raise InputError(
-        f"atoms {a} ({atoms.symbols[a]}) and {b} ({atoms.symbols[b]}) are {distance[worst]:.4g} {length} "
-        f"apart; expected at least {smallest:.4g} {length}{more}",
-        remedy="Correct the positions, the cell or the length unit: the atoms overlap",
+        f"atoms {a} ({atoms.symbols[a]}) and {b} ({atoms.symbols[b]}) overlap: their distance is "
+        f"{distance[worst]:.4g} {length}; expected at least {smallest:.4g} {length}{more}",
+        remedy="Correct the positions, the cell or the length unit",
     )
 
 

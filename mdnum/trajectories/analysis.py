@@ -256,7 +256,7 @@ class NeighborFlips(AnalysisBase):
                 why = f"they change distances by up to {changed:.3g} Å"
                 why = "they have replaced the coordinates in memory" if self.library.replaced else why
                 raise InputError(
-                    f"the transformations of the trajectory hide the resolution of its coordinates: {why}",
+                    f"the trajectory's transformations make the resolution of coordinates unknown: {why}",
                     remedy=(
                         "Give the largest error of a distance with bound=LENGTH (0 for no error), or "
                         "remove the transformations"
@@ -400,7 +400,7 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):
             message = f"two processes found different pairs at the same frame (number {done - 1} of all)"
-            raise InputError(message, remedy="Run again; the file was changed while it was read")
+            raise InputError(message, remedy="Repeat the analysis; the file changed while it was read")
         for table in part.flips:
             # a part after the first has counted the frame before its own too
             table.frame[:] += done - (done > 0)

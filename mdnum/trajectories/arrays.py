@@ -86,7 +86,7 @@ class ArrayFrames(Trajectory):
         here, x = self._box_of(cell, box, pbc), host(positions, "positions")
         if x.ndim != 2 or x.shape[1] != 3:
             message = f"the positions have shape {x.shape}; expected (atoms, 3)"
-            raise InputError(message, remedy="Pass one frame to see, several to see_many", where="positions")
+            raise InputError(message, remedy="Pass one frame at a time, or use see_many", where="positions")
         bits, x = 32 if x.dtype == np.float32 else 64, np.array(x, np.float64)
         if not self._first:
             self._begin(x, here, bits)

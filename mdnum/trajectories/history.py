@@ -142,7 +142,7 @@ def contacts(history: History) -> Contacts:
     pair, inside, entered = history.pair, history.inside, history.entered
     odd = (np.arange(len(pair)) - history.rows[pair]) % 2 == 1
     if (entered == inside[pair] ^ odd).any():
-        raise ValueError("a flip is missing: a pair inside the cutoff enters it, or a pair outside leaves it")
+        raise ValueError("a flip is missing: a pair enters the cutoff while inside, or leaves while outside")
     # a stay begins where a pair enters or at the first frame, and ends where it leaves or behind the last
     first, last = np.flatnonzero(inside), np.flatnonzero(inside ^ (history.flips % 2 == 1))
     of, leaver = np.concatenate([first, pair[entered]]), np.concatenate([pair[~entered], last])

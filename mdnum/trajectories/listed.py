@@ -164,7 +164,7 @@ def arrays_of(neighbors: Any, atoms: int) -> list[np.ndarray]:
             parts = [*(first if len(first) == 2 else first.T), *more]
     if len(parts) not in (2, 3) or [one.ndim for one in parts] != [1, 1, 2][: len(parts)]:
         shapes = ", ".join(str(one.shape) for one in parts[:4])
-        raise InputError(f"neighbors have shape {shapes} for {atoms} atoms", remedy=_KNOWN, where="neighbors")
+        raise InputError(f"neighbors of {atoms} atoms have shape {shapes}", remedy=_KNOWN, where="neighbors")
     return parts
 
 

@@ -157,9 +157,9 @@ def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float)
     pairs = 0.5 * centers * others * images
     if images > _MOST_IMAGES_EACH and pairs > _MOST_REPEATED:
         raise InputError(
-            f"about {pairs:,.0f} pairs of atoms are closer than {radius:.6g}: in a box of widths "
-            f"{np.round(lattice.widths, 3).tolist()}, about {images:,.0f} periodic images of each atom "
-            f"are closer than {radius:.6g} to any other atom",
+            f"about {pairs:,.0f} pairs of atoms are closer than {radius:.6g}. In a box of widths "
+            f"{np.round(lattice.widths, 3).tolist()}, a sphere of radius {radius:.6g} contains about "
+            f"{images:,.0f} periodic images of each atom",
             remedy="Check the length unit of the cutoff and of the box, or select fewer atoms",
             where="cutoff",
         )
@@ -172,7 +172,7 @@ def _check_count(pairs: float, radius: float) -> None:
     memory = _memory()
     if pairs > min(MOST_PAIRS, memory / _BYTES):
         raise InputError(
-            f"about {pairs:,.0f} pairs of atoms are closer than {radius:.6g}, and their list needs "
+            f"a list of the pairs of atoms closer than {radius:.6g} (about {pairs:,.0f} pairs) needs "
             f"{pairs * _BYTES / 1e9:,.0f} GB of memory; the computer has {memory / 1e9:,.0f} GB",
             remedy="Check the length unit of the cutoff and of the box, or select fewer atoms",
             where="cutoff",

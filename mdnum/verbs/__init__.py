@@ -35,7 +35,7 @@ def _check(module: Any) -> None:
     for kind, said in texts.get("kinds", {}).items():
         Layout(kind, **said)
         if VERBS.place(home(kind)) != name:
-            raise ValueError(f"mdnum or another package already writes folders of kind {kind!r}")
+            raise ValueError(f"folders of kind {kind!r} are already written by mdnum or another package")
 
 
 #: Modules by command, with the subcommand if a command has several.

@@ -164,7 +164,7 @@ def conform(
         if state is not None and state.tested != name:
             was, now = (" ".join(filter(None, words)) for words in (state.tested, name))
             remedy = "Start in a new folder"
-            raise InputError(f"the folder holds tests of {was}, not {now}", where=str(resume), remedy=remedy)
+            raise InputError(f"the folder has tests of {was}, not of {now}", where=str(resume), remedy=remedy)
         # scripts of what is known already need its conventions
         opening = deadline if state is None else Deadline(time and max(time, 0.2))
         examiner = Examiner(tested, reuse=True, apart=True, deadline=opening)

@@ -122,7 +122,7 @@ def check(asked: PairQuestion) -> None:
 
     expect_at_least(1, steps=1 if asked.steps is None else asked.steps)
     if asked.split is not None and not 0 < asked.split < float("inf"):
-        raise InputError(f"split = {asked.split:g}; expected a distance between runs A and B above 0")
+        raise InputError(f"split = {asked.split:g}; expected a positive distance between runs A and B")
     repeats_asked(asked.repeats, asked.counterfactual)
 
 

@@ -105,7 +105,7 @@ def horizon(run: Sample, argument: str) -> Value:
     if found.trust is None:
         raise InputError(found.failed["trust"])
     if found.trust.verdict == "trusted":
-        raise InputError("the gradient can be trusted for all steps of the run", remedy="Use more steps")
+        raise InputError("the trust horizon lies beyond the end of the run", remedy="Use more steps")
     if found.trust.verdict != "limited":
         raise InputError(f"the trust horizon is undecided; missing tests: {', '.join(found.trust.unknown)}")
     return Value(float(found.trust.horizon * run.simulation.integrator.timestep))

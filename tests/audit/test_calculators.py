@@ -215,7 +215,7 @@ def test_who_fails_without_neighbors_gets_a_structure_and_a_finding(answer, rais
 
 
 def test_who_never_answers_is_named_in_one_line_with_the_structure_saved():
-    with pytest.raises(InputError, match="nor for water") as error:
+    with pytest.raises(InputError, match="or for water") as error:
         default_structure(LoadedCalculator("never", "never", lambda: Counting(raises=ValueError("no"))))
     assert "--structure" in str(error.value.remedy)
     saved = ase.io.read(str(error.value).partition("saved in ")[2].partition(")")[0])

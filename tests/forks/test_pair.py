@@ -108,7 +108,7 @@ def test_the_other_displacement_is_two_decades_away_where_there_is_room(ulp, sep
         ({"split": -1.0}, "split = -1"),
         ({"repeats": 4, "counterfactual": False}, "repeats = 4, .*decisions of run A"),
         ({"repeats": 3}, "repeats = 3"),
-        ({"back": True, "counterfactual": False}, "option back"),
+        ({"back": True, "counterfactual": False}, "option `back`"),
     ],
 )
 def test_what_would_not_be_run_is_refused(options, words):

@@ -200,7 +200,7 @@ def test_folders_compare_decisions_term_by_term(liquid, tmp_path):
     }  # fmt: skip
     with pytest.raises(mdnum.InputError, match=r"objects=\["):
         mdnum.fork_folders(liquid.folder, copy, out=tmp_path / "compared")
-    with pytest.raises(mdnum.InputError, match="differs from the one"):
+    with pytest.raises(mdnum.InputError, match="differs from that"):
         mdnum.fork_folders(liquid.folder, copy, objects=[two_terms()], out=tmp_path / "compared")
     objects = [two_terms(), hot()]
     shown = mdnum.fork_folders(liquid.folder, copy, objects=objects, out=tmp_path / "compared")

@@ -156,10 +156,10 @@ def test_a_cutoff_over_half_the_box_has_no_flag(md):
         "misses further images", "the refusal in PairSearch may be relaxed"
     )
     assert int(found.error.code) == 0
-    with pytest.raises(InputError, match=r"is 2\.6, .* 4 wide; .*, 2\."):
+    with pytest.raises(InputError, match=r"is 2\.6; .* at most 2, .*\(4\)"):
         jaxmd.PairSearch(np.eye(3) * side, ALWAYS, r_list)
     tilted = np.array([[6.0, 0, 0], [5.0, 6.0, 0], [0, 0, 6.0]])
-    with pytest.raises(InputError, match=r"the cell is 4\.60"):
+    with pytest.raises(InputError, match=r"the cell \(4\.60"):
         jaxmd.PairSearch(tilted, ALWAYS, 2.5)
 
 

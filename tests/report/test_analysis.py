@@ -96,7 +96,7 @@ def test_flips_are_matched_with_the_series_step_by_step():
     # the same number in all, at another step
     series["left"] = np.roll(series["left"], 1)
     assert np.flatnonzero(~seen.matches(series)).tolist() == [2, 4]
-    with pytest.raises(ValueError, match=r"steps 1 to 9; .* 9 steps"):
+    with pytest.raises(ValueError, match=r"steps 1 to 9 .* 9 steps"):
         analysis.scan(FLIPS, 9)
 
 

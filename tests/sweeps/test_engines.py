@@ -51,7 +51,7 @@ def test_a_worker_of_other_code_computes_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr("mdnum.sweeps.engines.code", lambda **_: next(versions))
     with ThreadPoolExecutor(1) as pool:
         ((_, error),) = computed(noted, [str(tmp_path)], on=pool)
-    assert isinstance(error, InputError) and "another version of mdnum" in str(error)
+    assert isinstance(error, InputError) and "different version of mdnum" in str(error)
     assert not list(tmp_path.iterdir())
 
 

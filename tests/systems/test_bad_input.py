@@ -194,9 +194,9 @@ def flatten(atoms: Atoms) -> None:
         (lambda atoms: place(atoms, _17=[0, np.nan, 0]), "atom 17 (Ar) has positions"),
         (lambda atoms: place(atoms, _17=[0, np.nan, 0], _40=[np.inf] * 3), "of 1 other atoms"),
         (lambda atoms: atoms.set_momenta([[np.nan] * 3] * len(atoms)), "atom 0 (Ar) has momenta"),
-        (lambda atoms: place(atoms, _0=atoms.positions[7] + [0.25, 0, 0]), "0.25 Å apart; expected … 1.362"),
-        (lambda atoms: place(atoms, _0=[0.05, 1, 1], _9=[21.55, 1, 1]), "0 (Ar) and 9 (Ar) are 0.1 Å apart"),
-        (lean, "perpendicular width … (along a) is 8.02"),
+        (lambda atoms: place(atoms, _0=atoms.positions[7] + [0.25, 0, 0]), "0.25 Å; expected … 1.362"),
+        (lambda atoms: place(atoms, _0=[0.05, 1, 1], _9=[21.55, 1, 1]), "0 (Ar) and 9 (Ar) overlap"),
+        (lean, "at most 8.02 … perpendicular width … (along a)"),
         (flatten, "vectors span no volume"),
     ],
 )

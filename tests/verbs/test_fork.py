@@ -272,7 +272,7 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch, name):
         ("argon/crystal-108", "precision", {"repeats": 2}, "repeats = 2"),
         # what would be left undone, and was without a word
         ("argon/crystal-108", "precision", {"repeats": 4, "counterfactual": False}, "repeats = 4"),
-        ("argon/crystal-108", "precision", {"back": True, "counterfactual": False}, "option back"),
+        ("argon/crystal-108", "precision", {"back": True, "counterfactual": False}, "option `back`"),
         ("silicon/tersoff-512", "precision", {"repeats": 4}, "many-body"),
         ("ball/drop", "start", {"repeats": 4, "counterfactual": False}, "repeats = 4"),
         ("ball/drop", "all", {"split": 0.1, "repeats": 4}, "split and repeats"),

@@ -144,7 +144,7 @@ def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> 
             raise
         message = f"{type(choice).__module__} reads the tables of a system file, but was given a Simulation"
         raise InputError(
-            message, where=choice.name, remedy="docs/extending.md explains how to write a choice"
+            message, where=choice.name, remedy="docs/extending.md explains how to write a numerical choice"
         ) from error
     except InputError as error:
         # the choice is named where this is printed
@@ -189,7 +189,7 @@ def parse(text: str, world: str | None = None) -> Choice:
     head, _, role = family.partition(".")
     if family in _PROGRAMS:
         raise InputError(
-            f"the choice {text} needs separate processes, so it cannot be varied between two runs",
+            f"the choice {text} applies to a whole process, so it cannot differ between runs in one process",
             remedy="Run `mdnum fork processes SYSTEM`, which compares runs in separate processes",
         )
     if head in CHOICES and (argument or not equals) and (both or not at):
@@ -201,8 +201,8 @@ def parse(text: str, world: str | None = None) -> Choice:
     families = [one for one in CHOICES if set(CHOICES[one].worlds) & set(worlds)]
     near = meant(text, [*families, *(name for one in worlds for name in shipped(one))])
     raise InputError(
-        f"unknown choice {text!r}",
-        remedy=f"{near}Known kinds are {', '.join(families)}; `mdnum fork choices` lists all choices",
+        f"unknown numerical choice {text!r}",
+        remedy=f"{near}Kinds of choices are {', '.join(families)}; `mdnum fork choices` lists all choices",
     )
 
 

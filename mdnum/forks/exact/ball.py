@@ -91,8 +91,8 @@ class _ExactBall:
         )
         if not served or getattr(contact, "smooth", False):
             raise InputError(
-                f"the contact {type(contact).__name__} with the integrator {type(scheme).__name__} cannot "
-                "be computed by exact sums and products",
+                f"the contact {type(contact).__name__} with the integrator {type(scheme).__name__} is not "
+                "supported in exact arithmetic",
                 remedy="Use explicit Euler, semi-implicit Euler or velocity Verlet, and a contact "
                 "without smoothing",
             )

@@ -271,7 +271,7 @@ class ExactProgram:
                 failed = run.step
             bits = max(more, bits + bits // 2)
         raise InputError(
-            f"at step {failed}, arithmetic with {bits} bits cannot decide if a pair is inside the cutoff; "
+            f"at step {failed}, {bits} bits are not enough to decide whether a pair is inside the cutoff; "
             "the distance of the pair may equal the cutoff exactly",
             remedy="Change one initial coordinate by one unit in the last place",
         )

@@ -195,8 +195,8 @@ def edges(
     value = float(here)
     if value == 0 or not 0 < reach < 1:
         raise InputError(
-            f"the parameter {full} is {value:g} and reach is {reach:g}; expected a nonzero parameter and, as "
-            "reach, a fraction of it between 0 and 1"
+            f"the parameter {full} is {value:g} and reach is {reach:g}; expected a parameter other "
+            "than 0, and a reach between 0 and 1"
         )
     program = MdProgram(problem.simulation)
 

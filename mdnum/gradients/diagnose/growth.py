@@ -295,7 +295,7 @@ class Jacobian:
     def __init__(self, tape: RunTape, clock: float):
         check_kick(tape.simulation.integrator)
         if not isinstance(tape.simulation.force, PairForce):
-            raise InputError("the Jacobian of a time step needs a pair potential", where=tape.simulation.name)
+            raise InputError("Jacobians are supported only for pair potentials", where=tape.simulation.name)
         self.tape, self.clock = tape, clock
         self.force: PairForce = tape.simulation.force
         self.coordinates = 6 * tape.simulation.atoms

@@ -299,12 +299,12 @@ def trust(
     kept = [name for name in full if np.size(parameters.value(simulation, name)) <= MOST]
     if not kept:
         raise InputError(
-            f"the parameter {', '.join(full)} has too many entries to give each a trust horizon",
+            f"the parameter {', '.join(full)} has too many entries to compute a trust horizon for each",
             remedy="Give a scalar parameter, such as dynamics.temperature",
         )
     if replicas == 1 or replicas < 0:
         raise InputError(
-            f"replicas = {replicas}; a standard error needs 2 replicas", remedy="Give 0 or at least 2"
+            f"replicas = {replicas}; standard errors need at least 2 replicas", remedy="Give 0, 2 or more"
         )
     if not 0 < tolerance < 1:
         raise InputError(f"tolerance = {tolerance:g}; expected a relative difference between 0 and 1")

@@ -399,8 +399,8 @@ class CaseAnswers:
         steps += [result.refused[0]] if result.refused is not None else []
         if result.case != case.name or any(step >= case.steps for step in steps):
             raise InputError(
-                f"test case {number} of the folder is {result.case!r}, but in the installed version of mdnum "
-                f"it is {case.name!r} with {case.steps} steps",
+                f"test case {number} in the folder is {result.case!r}; the installed version of mdnum has "
+                f"the test case {case.name!r} with {case.steps} steps instead",
                 remedy="Start the tests again in a new folder",
             )
         return result

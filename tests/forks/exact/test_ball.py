@@ -133,7 +133,7 @@ def test_a_stop_that_differs_is_dated():
 @pytest.mark.parametrize(
     ("contact", "scheme", "message"),
     [
-        (Impact(), EventLocated(0.01), "sums and products"),
+        (Impact(), EventLocated(0.01), "exact arithmetic"),
         (Penalty(900.0), ImplicitMidpoint(0.01), "ImplicitMidpoint"),
         (Penalty(900.0, eps=0.01, smooth=True), SemiImplicitEuler(0.01), "without smoothing"),
     ],

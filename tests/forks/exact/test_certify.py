@@ -130,5 +130,5 @@ def test_horizons_of_a_narrow_run_and_a_wide_one_and_a_wrong_decision_that_is_fo
 
 def test_what_gives_no_bound_is_refused():
     unsafe = replace(simulation(), rule=replace(simulation().rule, every=5))
-    with pytest.raises(InputError, match="may miss pairs"):
+    with pytest.raises(InputError, match="may lack pairs"):
         certified_horizon(unsafe, 10)
