@@ -201,7 +201,7 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
     if names_of[0] != names_of[1] or between[0] != between[1]:
         seen = " and ".join(f"{one} {two or ''}".rstrip() for one, two in zip(names_of, between, strict=True))
         raise InputError(
-            f"the two runs decide by different rules which pairs are neighbors: {seen}",
+            f"the two runs use different rules for neighbors: {seen}",
             where=where,
             remedy="Compare runs that use the same rule for neighbors",
         )

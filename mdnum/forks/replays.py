@@ -126,7 +126,7 @@ def pinned(
     last_step = fork.steps if steps is None else steps
     if pairs is None:
         if fork.decision is None:
-            raise InputError("runs A and B do not fork", remedy="Name the pairs whose decisions to impose")
+            raise InputError("runs A and B do not fork", remedy="Name the pairs whose decisions are imposed")
         i, j = fork.decision.subject
         pairs = [(i, j)]
         spell = disagreements(fork, i, j)[0]

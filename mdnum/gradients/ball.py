@@ -349,7 +349,7 @@ class RandomizedSmoothing(BallMethod):
         """
         if not self.width > 0 or self.samples < 2:
             raise InputError(
-                f"noise of width = {self.width} with samples = {self.samples} cannot be averaged over",
+                f"no average over noise is defined for width = {self.width} and samples = {self.samples}",
                 remedy="Choose a width above 0 and at least 2 samples.",
             )
         at = problem.origin(names)

@@ -191,6 +191,6 @@ class BackwardRun:
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(
-                f"the reversed run differs from the forward run: at step {step}, stored velocity bits are "
-                "left over, which friction did not remove in the forward run"
+                f"the reversed run differs from the forward run: at step {step}, the store of velocity "
+                "bits that friction removes is not empty"
             )

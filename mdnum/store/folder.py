@@ -76,7 +76,7 @@ def _parsed(file: Path, text: str) -> Any:
         return json.loads(text) if is_json else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         kind = "JSON" if is_json else "TOML"
-        raise FolderError(f"the file is damaged: it is not {kind} ({error})", where=str(file)) from error
+        raise FolderError(f"the file is damaged: it is invalid {kind} ({error})", where=str(file)) from error
 
 
 class RunFolder:

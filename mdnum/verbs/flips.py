@@ -193,7 +193,7 @@ def flips_each(
     from mdnum.sweeps import engines
 
     if isinstance(trajectories, str | Path):
-        raise InputError("expected a list of paths, found one", where=str(trajectories), remedy="Give [path]")
+        raise InputError("found one path; expected a list", where=str(trajectories), remedy="Give [path]")
     if options.get("topology") is not None:
         options["topology"] = Path(options["topology"]).absolute()
     tasks = [(Path(one).absolute(), Path(out).absolute(), options) for one in trajectories]

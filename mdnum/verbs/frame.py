@@ -244,7 +244,7 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
         text = json.dumps([__version__, verb, held], sort_keys=True)
     except TypeError as error:
         raise InputError(
-            f"the result folder cannot be named after a checksum of the input: {error}",
+            f"no name for the result folder can be derived from the input: {error}",
             remedy="Give a name for the folder with --out",
         ) from error
     return digest_of(text.encode())[:16]
