@@ -31,8 +31,8 @@ def json_escape(character: str) -> str:
 def printable(text: str, escape: Callable[[str], str] = python_escape) -> str:
     """Escape all characters of untrusted text that a terminal would interpret.
 
-    Control characters, except line ends and tabs, are written in Python notation, such as ``\\x1b``. So are
-    characters that reorder or hide text.
+    Control characters, except line ends and tabs, are written in Python notation, such as ``\\x1b``.
+    Characters that reorder or hide text are escaped, too.
     """
     return _CONTROL.sub(lambda found: escape(found[0]), text)
 

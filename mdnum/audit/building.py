@@ -131,7 +131,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return the crystal of the first supported element; if `paired`, two atoms determine the cutoff."""
+        """Return a crystal of the first supported element; if `paired`, find the cutoff with two atoms."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():
@@ -207,7 +207,7 @@ def meant_for(calculator: Any, words: str) -> list[str]:
 
 
 def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]:
-    """Yield the chemical symbols in a value or its attributes; use dictionary keys if all are symbols."""
+    """Yield the chemical symbols in a value, its attributes, and dictionary keys (if all are symbols)."""
     from ase.data import chemical_symbols
 
     value = value.tolist() if hasattr(value, "tolist") else value
@@ -310,7 +310,7 @@ def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
 def _grown(
     subject: CalculatorSubject, cell: Atoms, kind: str, scale: float, relaxed: bool, cutoff: float | None
 ) -> Atoms | None:
-    """Return the largest crystal, up to two cutoffs wide, that is evaluated fast enough; None if all fail."""
+    """Return the largest crystal, up to two cutoffs wide, whose energy is computed fast enough, or None."""
     at = "at the calculator's own least energy" if relaxed else _tabulated(scale)
     if cutoff and scale * _least_distance(cell) > _BARELY * cutoff:
         # nothing holds it together: a crystal in which nothing is felt would tell nothing
@@ -376,7 +376,7 @@ def _least_distance(cell: Atoms) -> float:
 def _least_energy(
     subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
 ) -> tuple[float, bool]:
-    """Search from `start` for the lattice scale of lowest energy; return it, and whether a minimum exists."""
+    """Return the scaling factor of the lattice with the lowest energy, and whether it is a minimum."""
 
     def energy(scale: float) -> float:
         try:

@@ -228,7 +228,7 @@ class HiddenJumps:
         return sum(jump.energy for jump in self.jumps if jump.step == step)
 
     def energies(self, rest: Steps) -> Steps:
-        """Energy change (eV) of each step due to hidden jumps; for steps not searched, `share` is used."""
+        """Energy change (eV) of each step due to hidden jumps; estimated for steps not searched."""
         found = np.zeros(len(rest))
         for step in self.candidates:
             found[step] = self.brought(step) if step in self.steps else self.share * rest[step]
@@ -236,7 +236,7 @@ class HiddenJumps:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Rank k of the neighbors k and k+1 that swap most often at jumps, and the number of such jumps."""
+        """Rank k whose neighbors k and k+1 swap most often at energy jumps, and the number of these jumps."""
         return _most_frequent(k for jump in self.jumps for k in {k for _, k in jump.ties})
 
     @property
@@ -320,7 +320,7 @@ class EnergyBalance:
 
     @property
     def filled(self) -> Steps:
-        """Unexplained energy change of each step minus its jumps, eV; the mean value at unmeasured steps."""
+        """Unexplained energy change of each step minus its jumps, eV; the mean for steps not measured."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 
@@ -333,7 +333,7 @@ class EnergyBalance:
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
 
     def by_means(self, crossed: Sequence[RunCrossing], steps: int) -> Steps:
-        """Estimate the energy changes (eV) by the flips of another run from this run's mean jumps."""
+        """Estimate the energy changes (eV) due to flips in another run, from this run's mean energy jumps."""
         jumps, means = np.zeros(steps), self.means
         for one in crossed:
             jumps[one.step] += one.sign * means.get(one.threshold, 0.0)

@@ -184,7 +184,7 @@ def _quantum(values: Float[np.ndarray, "points"]) -> float:
 
 
 def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
-    """Standard deviation of the noise in each column: the median over differences of orders 4, 5 and 6."""
+    """Standard deviation of the noise in each column of values, from differences of orders 4, 5 and 6."""
     found = []
     for order in (4, 5, 6):
         weight = math.factorial(order) ** 2 / math.factorial(2 * order)
@@ -197,9 +197,9 @@ def order_change(
 ) -> tuple[float, NoiseFloor]:
     """Reorder the atoms; return the largest energy change (eV), and the noise if rounding explains it.
 
-    The noise is 0 if rounding does not explain the energy change. It is also 0 if no energy or force changes
-    by more than the noise measured along a line. While atoms move along a line, the rounding error of a sum
-    varies randomly, but an error due to missing terms varies smoothly.
+    The noise is 0 if rounding does not explain the energy change. It is also 0 if energies and forces change
+    by no more than the noise along a line of structures. While atoms move along a line, the rounding error of
+    a sum varies randomly, but an error due to missing terms varies smoothly.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
@@ -235,7 +235,7 @@ def order_change(
 
 
 def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
-    """Return the larger of the noise along a line and the rounding noise from reordering the atoms."""
+    """Return the larger of two noise levels: along a line of structures, and from reordering the atoms."""
     noise = along_a_line(subject, atoms, rng)
     return noise.louder(order_change(subject, atoms, noise, rng)[1])
 
@@ -287,10 +287,10 @@ def under_jitter(
 def settled(
     subject: CalculatorSubject, rng: np.random.Generator, at_least: int = FEW, brief: bool = False
 ) -> tuple[Atoms, NoiseFloor]:
-    """Displace atoms slightly, so that no pair is at a threshold; return the structure and its noise.
+    """Displace atoms slightly, so that no pair is at a distance threshold; return structure and noise.
 
     In a perfect crystal, a whole neighbor shell can lie exactly at a cutoff, which would disturb the checks
-    that do not test thresholds. A step of the energy along the sampled line would be counted as noise. Of
+    that do not test thresholds. A jump of the energy along the sampled line would be counted as noise. Of
     several random displacements, the one with the least noise is therefore used.
 
     Args:
@@ -375,7 +375,7 @@ class Digits:
 
 
 def digits(values: np.ndarray) -> Digits:
-    """Return how many decimal places and bits values have; few distinct values count as unrounded."""
+    """Return how many decimal places and bits the values use; too few distinct values count as unrounded."""
     found = np.unique(np.asarray(values, dtype=np.float64))
     found = found[np.isfinite(found) & (found != 0.0)]
     if len(found) < _FEWEST:

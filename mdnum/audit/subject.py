@@ -62,7 +62,7 @@ class Repeats:
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
-        """Compare the first energy or force of calculator object `which` with that of an earlier object."""
+        """Compare the first energy or force from one calculator object with that from an earlier object."""
         before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
@@ -269,7 +269,7 @@ class CalculatorSubject:
         """Evaluate a structure again with the same calculator object, and count any difference in `repeats`.
 
         A difference counts as random only if the second result agrees with that of a new calculator object.
-        If it does not agree, earlier evaluations by this object may be the reason.
+        If the results of the two objects differ, earlier evaluations by the first object may be the reason.
 
         Args:
             energy: the earlier energy, eV; the energy or the forces are required.

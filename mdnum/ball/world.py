@@ -41,8 +41,8 @@ _MOST_ITERATIONS = 2**31 - 1  # iterations are counted in 32 bits
 class World(eqx.Module):
     """Model of balls above a floor at height 0: all settings of a time step except the state.
 
-    `World.create` checks ranges and casts every number to the dtype of its role. Pass a `World` to jitted
-    code as an argument, not by closure, because the compiler may remove operations with a constant of zero.
+    `World.create` checks all numbers and casts them to the dtypes in `policy`. Pass a `World` to jitted code
+    as an argument, not by closure, because the compiler may remove operations with a constant of zero.
 
     Attributes:
         contact: contact model of the floor.
@@ -72,7 +72,7 @@ class World(eqx.Module):
         policy: RolePrecision | None = None,
         hysteresis: float | None = None,
     ) -> World:
-        """Create a bouncing-ball model: check all numbers, and cast them to the dtypes of their roles.
+        """Create a bouncing-ball model: check all numbers, and cast them to the dtypes in `policy`.
 
         Args:
             contact, integrator: contact model and integration scheme with plain numbers as parameters.
@@ -146,7 +146,7 @@ class World(eqx.Module):
     # -- decide ----------------------------------------------------------------------------------------
 
     def touches(self, height: Balls, before: Bool[Array, "balls"]) -> Bool[Array, "balls"]:
-        """Return whether balls touch the floor: height < 0 or, if `lift` is given, until height > lift."""
+        """Return which balls touch the floor (height < 0); with `lift`, contact lasts until height > lift."""
         height = height.astype(self.policy.dtype("decision"))
         enter = Threshold(jnp.zeros((), height.dtype), "<", "height")
         if self.lift is None:

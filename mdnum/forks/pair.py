@@ -173,7 +173,7 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Return whether to run B with A's decisions, whether to run A with B's, and how often to repeat B.
+    """Return whether to impose run A's decisions on run B, whether B's on A, and how often to repeat run B.
 
     Raises:
         InputError: a requested counterfactual run or repeat is not possible.
@@ -217,10 +217,10 @@ def _beyond(step: int) -> int:
 
 
 def displacements(fork: Fork) -> tuple[float, float]:
-    """Return two initial displacements for repeats: the early distance between the runs, and a smaller one.
+    """Return two initial displacements for repeats of run B: the early distance to run A, and a smaller one.
 
-    The second displacement is a hundredth of the first. A repeat with a much smaller displacement would have
-    the rounding errors of the compared runs, and would be no evidence. If a hundredth of the first
+    The second displacement is a hundredth of the first. A repeat with a much smaller displacement would make
+    the same rounding errors as the compared runs, and so would prove nothing. If a hundredth of the first
     displacement is below one ulp, the second may be larger than the first.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
@@ -342,7 +342,7 @@ class Screened:
 
     @property
     def held(self) -> bool | None:
-        """True if all bits of the two runs agreed; None if the program with this choice was not run."""
+        """True if both runs were identical to the last bit; None if the run with this choice was not made."""
         return None if self.reason_unavailable is not None else self.first_bit is None
 
 

@@ -1,15 +1,15 @@
 """Simulations whose neighbor lists are reordered: in the order of a jax-md format, or at random.
 
-The two forces of a pair are exactly opposite, so that a list format changes only the order of sums. Dense and
-sparse lists contain each pair twice, and each entry contributes half of the pair force. For a sparse list,
-the half forces in an atom's own row form one sum, and those in other rows form a second sum; the two sums are
-added. If rows are sorted, a loop over atom labels gives the same result. For a dense list, half forces from
-other rows are added one by one to the sum of the own row. An ordered-sparse list contains each pair once.
-Forces from later atoms form one sum, and forces from earlier atoms form another.
+Newton's third law holds exactly, so the format of a neighbor list changes only the order of sums. A dense or
+sparse list contains each pair of atoms twice, and each entry contributes half of the pair force. In a sparse
+list, the entries in an atom's own row form one sum, those in other rows a second sum; both sums are added. A
+loop over atom labels gives the same result if rows are sorted. In a dense list, entries in other rows are
+added one by one to the sum over the atom's own row. An ordered-sparse list contains each pair of atoms once.
+Forces from atoms with larger labels form one sum, and forces from atoms with smaller labels form another.
 
 Source: jax_md.smap.pair_neighbor_list of jax-md 0.2.29, whose forces are reproduced bit for bit
-(tests/forks/test_choices.py). XLA sums rows of more than 32 slots in blocks of 32, which this module does not
-reproduce.
+(tests/forks/test_choices.py). XLA sums more than 32 slots of an atom in blocks of 32, which this module does
+not reproduce.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SUMS: Mapping[str, Reduction] = {"dense": Twice(), "sparse": Sequential(), "ord
 
 @dataclass(frozen=True)
 class ReorderedSimulation(Simulation):
-    """A simulation whose neighbor lists hold their pairs in another order."""
+    """A simulation in which the pairs of each neighbor list are in a prescribed or random order."""
 
     order: str | int = 0  # a format, or the seed of a shuffle
 
@@ -48,7 +48,7 @@ class ReorderedSimulation(Simulation):
         return (*super().lists, self.order)
 
     def verlet_list(self, skin: float | None = None) -> VerletList:
-        """Create the Verlet list of the simulation, with the pairs in another order."""
+        """Create the Verlet list of the simulation, with the pairs of atoms in the order given by `order`."""
         made = super().verlet_list(skin)
         if isinstance(self.order, str):
             return FormattedList(**_fields(VerletList, made), format=self.order)
@@ -62,7 +62,7 @@ def _fields(kind: type, value: object) -> dict:
 
 @dataclass
 class FormattedList(VerletList):
-    """A neighbor list whose slots are in the order in which a jax-md list format adds the pair terms."""
+    """A neighbor list with the neighbors of each atom in the order of a jax-md neighbor-list format."""
 
     # "dense" or "sparse" (by label), or "ordered-sparse" (later atoms in the first half of the slots, earlier
     # ones in the second, both by label)
@@ -92,7 +92,7 @@ def _first(
     chosen: Bool[np.ndarray, "slots atoms"],
     slots: int,
 ) -> Int[np.ndarray, "kept atoms"]:
-    """Return the chosen neighbors of each atom, sorted by label and followed by padding."""
+    """Return the selected neighbors of each atom, sorted by label; padding fills the remaining slots."""
     atoms = index.shape[1]
     keys = np.where(chosen, labels, atoms)
     order = np.argsort(keys, axis=0, kind="stable")[:slots]

@@ -18,7 +18,7 @@ from mdnum.rollout.program import MdProgram
 
 @dataclass(frozen=True)
 class DecisionTape:
-    """All pair decisions of a run from step 0: the pairs inside the cutoff at the start, and all changes."""
+    """All pair decisions of a run: the pairs of atoms inside the cutoff at step 0, and all later changes."""
 
     atoms: int  # number of atoms
     steps: int  # the last step that was decided
@@ -35,14 +35,14 @@ class DecisionTape:
 
     @cached_property
     def changes(self) -> dict[int, tuple[int, ...]]:
-        """Map from the integer key of each pair to the ascending steps at which the decision on it flips."""
+        """Map from the integer key of each pair of atoms to the steps (ascending) at which the pair flips."""
         order = np.argsort(self.key, kind="stable")
         keys, begins = np.unique(self.key[order], return_index=True)
         steps = np.split(self.step[order], begins[1:])
         return {key: tuple(own.tolist()) for key, own in zip(keys.tolist(), steps, strict=True)}
 
     def pins(self, keys: Iterable[int], first: int, last: int) -> Pins:
-        """Return the decisions on some pairs, to be imposed on another run from a first to a last step."""
+        """Return the decisions on pairs of atoms between two steps, to be imposed on another run."""
         begins = set(self.first.tolist())
         return Pins(
             [

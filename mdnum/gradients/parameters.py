@@ -49,7 +49,7 @@ class Cotangents:
 
 
 class Direction(NamedTuple):
-    """Derivatives of all inputs with respect to one parameter entry, or to several (along the first axis)."""
+    """Derivatives of all inputs with respect to one parameter entry or (along the first axis) several."""
 
     # x, v: of the positions and velocities of step 0, user's order
     x: Float[Array, "*columns 3 atoms"]
@@ -76,8 +76,8 @@ def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce 
 
 
 def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Array, Array]:
-    """Propagate cotangents of the extra state of step 0, such as thermostat variables, backward to the
-    parameters of the integrator and to the initial positions and velocities.
+    """Propagate derivatives of the loss backward, from the extra state of step 0 (such as thermostat
+    variables) to the integrator's parameters and the initial positions and velocities.
 
     Args:
         start: the state of step 0.
@@ -215,7 +215,7 @@ def gathered(
 
 
 def directions(simulation: Simulation, columns: Sequence[ParameterEntry]) -> Direction:
-    """Return derivatives of all inputs of a simulation with respect to each entry (along the first axis)."""
+    """Return derivatives of a simulation's inputs with respect to parameter entries (first axis)."""
     nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
     still = Direction(
         nothing,

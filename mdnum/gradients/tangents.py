@@ -48,7 +48,7 @@ class TangentCarry(NamedTuple):
 
 @dataclass(frozen=True)
 class StretchTangents:
-    """Tangents along one stretch of steps (with one neighbor list) of a run."""
+    """Tangents along one stretch of a run: consecutive time steps with the same neighbor list."""
 
     stretch: TapeStretch  # the steps
     columns: tuple[ParameterEntry, ...]  # the numbers by which it is differentiated
@@ -74,8 +74,8 @@ def tangents(
 ) -> Iterator[StretchTangents]:
     """For each stretch of steps of a recorded run, yield the tangents with respect to named parameters.
 
-    If saltation is False, the tangents omit flips. The contribution of flips is then the sum of weight *
-    (dr_cut - dr) over all crossings. The weights are those of an event-aware reverse pass.
+    If saltation is False, the tangents do not include the effect of flips. The contribution of flips is then
+    the sum of weight * (dr_cut - dr) over all crossings. Event-aware reverse mode provides the weights.
 
     Args:
         tape: the run; recorded with flips if crossings are needed. names: full names of parameters.
@@ -117,7 +117,7 @@ def tangents(
 
 
 def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
-    """Compute the derivatives of the loss from the tangents of the sums over frames."""
+    """Compute the derivatives of the loss from the tangents of its sums over frames."""
 
     def one(tangent):
         return jax.jvp(lambda total: tape.loss.value(total, tape.frames), (tape.total,), (tangent,))[1]

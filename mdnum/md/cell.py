@@ -2,7 +2,7 @@
 
 Code on the host and in jit executes the same operations in the same order. Lattice vectors are subtracted as
 n * L, where n is -1, 0 or 1 for wrapped positions. The products n * L are exact. Fused and separate
-operations therefore give the same bits, and numpy reproduces the results of jit.
+operations therefore give identical results, and numpy agrees with jit bit for bit.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class Cell(eqx.Module):
         return Cell(matrix, rows.T @ crossed.T / (square[0] @ crossed[0]), self.pbc, self.orthorhombic)
 
     def spent(self, x, reference: Cell, home, r_list):
-        """Return half of `strain_loss` plus the largest displacement relative to the box (inside jit).
+        """Return strain_loss / 2 + the largest displacement relative to the box (for use inside jit).
 
         A neighbor list is complete as long as the sum returned by `spent` is at most half the skin.
 
@@ -211,7 +211,7 @@ def _subtract(lattice, x, y, z, n):
 
 @njit(inline="always")
 def nearest_image(lattice, x, y, z):
-    """Return the minimum image in compiled code, with the same bits as `Cell.minimum_image`.
+    """Return the minimum image in compiled code, bit for bit equal to that of `Cell.minimum_image`.
 
     Args:
         lattice: the box as returned by `box_of`, in the dtype of the displacement.

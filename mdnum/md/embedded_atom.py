@@ -143,7 +143,7 @@ class Spline(eqx.Module):
     def on_host(
         self, x: Float[np.ndarray, "..."]
     ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
-        """Return value and slope of the spline at x without compilation; the value is bitwise as in jax."""
+        """Return value and slope of the spline at x with numpy; the value equals jax's bit for bit."""
         offset = x - self.start
         which = np.clip(np.floor(offset / self.step), 0, self.intervals - 1)
         t = offset - which * self.step

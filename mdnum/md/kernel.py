@@ -3,7 +3,7 @@
 jax traces a function of one pair. The operations of this function are written as LLVM text for vectors of
 eight atoms. The data of each atom are contiguous, so that loading a neighbor takes one or two instructions.
 The terms of eight neighbor slots are summed in registers. XLA's own loop gathers neighbor data and computes
-terms in separate passes. No operation is contracted or reordered, so that equal input gives equal bits on
+terms in separate passes. No operation is contracted or reordered, so that equal input gives equal output on
 every processor. XLA calls the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
 """
 
@@ -163,7 +163,7 @@ class _NotKnown(Exception):
 
 
 class _Value(NamedTuple):
-    """Name of an LLVM vector of numbers or decisions that differ between pairs."""
+    """Name of an LLVM vector whose numbers or decisions differ between pairs of atoms."""
 
     name: str
     kind: str = "VEC"

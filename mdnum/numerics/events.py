@@ -17,8 +17,8 @@ INCLUSIVE = {"<": False, "<=": True}
 class Threshold:
     """A threshold with which a computed quantity is compared, together with the comparison operator.
 
-    The comparison is part of the physical model. Two codes with the same cutoff that compare by `<` and `<=`,
-    or r and r², differ for pairs exactly at the cutoff.
+    The comparison is part of the physical model. Two programs that compare r by `<` and by `<=`, or that
+    compare r and r², can differ for pairs of atoms exactly at the cutoff.
     """
 
     # the threshold in the quantity's own space, exactly as the program compares it: a number, or an array
@@ -96,7 +96,7 @@ def _where(condition, yes, no):
 
 @dataclass(frozen=True)
 class Ledger:
-    """Table of all flips of one kind of decision (a channel), sorted by time step and then by subject.
+    """Table of all flips of one kind of decision, sorted by time step and then by labels of atoms or balls.
 
     A flip at step s means that the decision at s differs from the decision at s - 1.
 
@@ -125,7 +125,7 @@ class Ledger:
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "flips"]:
-        """Whether |margin| of each flip is within the error bound, so that rounding could change its step."""
+        """Whether rounding errors could change the step of each flip: |margin| is within the error bound."""
         return np.abs(self.margin) <= self.bound
 
     def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:

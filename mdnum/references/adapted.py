@@ -43,7 +43,7 @@ class StepAtCutoff(ClassicalCalculator):
 
 
 class SpeciesSum(ClassicalCalculator):
-    """ASE calculator of a mixture. Energies of unlike pairs are those of all pairs minus those of like pairs.
+    """ASE calculator of a mixture. The energy of unlike atoms is that of all pairs minus that of like pairs.
 
     Args:
         parts: (calculator, species a, species b) for every pair of species in the structure.
@@ -141,8 +141,8 @@ def short_listed_eam(file: Path) -> Calculator:
 class EnergyOnNeighborList(ClassicalCalculator):
     """ASE calculator for an energy function, compiled separately and evaluated on ASE's neighbor list.
 
-    This reference tests neighbor lists, cutoff decisions and time steps. The energy function and its
-    derivatives are not tested, because the reference computes them with jax, too.
+    The calculator is a reference for neighbor lists, cutoff decisions and time steps. The energy function and
+    its derivatives are not tested, because the calculator computes them with jax, too.
     """
 
     implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012

@@ -296,7 +296,7 @@ def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
 
 
 def _named(names: tuple[str, ...], value: float, _: int | None = None) -> str:
-    """Return the name of an integer position on an axis, or an empty string for any other position."""
+    """Return the label of an integer position on an axis, or an empty string at any other position."""
     return names[round(value)] if value == round(value) and 0 <= value < len(names) else ""
 
 

@@ -71,7 +71,7 @@ def _before(program: EpochProgram, masses, order, back: Back) -> Back:
 
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
 def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord):
-    """Reverse steps until a new list is needed, the record is full, or lost bits must be restored."""
+    """Reverse steps until a new neighbor list or stored velocity bits are needed, or the record is full."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
 
@@ -177,7 +177,7 @@ class BackwardRun:
         self._check_bath()
 
     def _change_bath(self) -> None:
-        """Restore the thermostat's bath, which stores bits lost by friction, where the run emptied it."""
+        """Restore the thermostat's bath (velocity bits removed by friction) at steps that emptied it."""
         step, period = int(self.back.step), self.simulation.propagator.pause
         if period is None or step % int(period):
             return

@@ -295,7 +295,7 @@ class Engine:
                 listed = self._listed(here)
 
     def again(self, start: Start) -> Segment:
-        """Recompute the time steps that follow a given state, with the same bits as before.
+        """Recompute the time steps that follow a given state; the results are the same bit for bit.
 
         Args:
             start: state at which a segment of this engine began (`resume_point` of the previous segment).

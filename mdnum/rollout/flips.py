@@ -174,8 +174,8 @@ class PairRecorder:
     """Recorder of all flips (pairs that cross the cutoff) in a simulation.
 
     A flip is a difference between the decisions for a pair at two consecutive steps, even if the neighbor
-    list was rebuilt in between. If a pair inside the cutoff is missing from the old list, the new list
-    records its flip. A pair beyond the range of the new list counts as outside.
+    list was rebuilt in between. If the old list lacks a pair inside the cutoff, the pair's flip is recorded
+    with the new list. A pair that is not in the new neighbor list counts as outside the cutoff.
 
     Args:
         simulation: the system as objects.
@@ -261,7 +261,7 @@ class PairRecorder:
         """Return a segment's flips sorted by step, i and j, with the user's atom labels (see `type_of`).
 
         Distance, margin and radial speed refer to the step of the flip. The margin (threshold minus r or r²)
-        equals that of the run bit for bit.
+        equals the margin computed in the run, bit for bit.
 
         Raises:
             MdnumError: a flip was recorded for only one atom of a pair, or a margin contradicts its decision
@@ -331,7 +331,7 @@ class PairRecorder:
         return (margin >= 0 if inclusive else margin > 0) != ledger.entered
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
-        """Return integer keys of the pairs that were inside the cutoff at the previous list's last step."""
+        """Return integer keys of the pairs inside the cutoff at the last step of the previous list."""
         if self._held_segment is not None:
             table, bits, _ = self._held_segment
             self._held_keys = _keys(self.simulation, table, np.asarray(bits))

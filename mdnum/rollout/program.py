@@ -135,7 +135,7 @@ class MdProgram:
     def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
         """Return randomly displaced copies of the simulation; the largest displacement is about `size`.
 
-        The largest displacement is at least one ulp, because rounding removes smaller displacements.
+        The largest displacement is at least one ulp of a coordinate; rounding removes smaller displacements.
         """
         rng = np.random.default_rng(seed)
         x, ulp = np.asarray(self.start.state.x), self.ulp
@@ -242,7 +242,7 @@ class MdProgram:
 def pair_margin(
     simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int, labels: Simulation | None = None
 ) -> float:
-    """Return the margin (threshold minus r or r²) of a pair's decision, with the same bits as in a run.
+    """Return the margin (threshold minus r or r²) of a pair of atoms, bit for bit as computed in a run.
 
     Args:
         x: wrapped positions, length.

@@ -392,7 +392,7 @@ class ListHealth:
     """Monitor of a run's neighbor lists, which counts missed pairs and dangerous rebuilds.
 
     A list can miss a pair only if the displacements of two atoms add up to more than the skin. A safe rule
-    rebuilds the list before pairs can be missed. With other rules, a new search checks for missed pairs.
+    rebuilds the list before pairs can be missed. For an unsafe rule, a new search checks for missed pairs.
     """
 
     simulation: Simulation  # the system as objects

@@ -92,7 +92,7 @@ class TableStream:
         return sorted((int(match[1]), path) for path in found if (match := named.fullmatch(path.name)))
 
     def files(self) -> list[tuple[Path, int]]:
-        """Return path and number of rows of each file of the table, without part files that were merged."""
+        """Return the path and the number of rows of each file of the table, except merged part files."""
         files: list[tuple[Path, int]] = []
         rows = 0
         if self.merged_path.exists():
@@ -182,7 +182,7 @@ class TableStream:
         self._buffer, self._buffered = [], 0
 
     def truncate(self, rows: int) -> None:
-        """Keep only the given number of first rows of the table, in memory and on disk."""
+        """Keep only the first `rows` rows of the table, in memory and on disk."""
         self._buffer, self._buffered = [], 0
         files = self.files()
         have = sum(count for _, count in files)

@@ -32,20 +32,20 @@ class EndComparison:
 
     @property
     def worst(self) -> str | None:
-        """Measure outside its tolerance or, if none is, the undecided measure that needs most seeds."""
+        """A measure outside its tolerance; otherwise the undecided measure that needs most seeds."""
         each = self.by_measure
         ranked = sorted(each, key=lambda name: (each[name].inside is not False, -each[name].more))
         return next((name for name in ranked if each[name].inside is not True), None)
 
     @property
     def inside(self) -> bool | None:
-        """True if all measures are within tolerance, False if one is not, None if errors are too large."""
+        """True if all measures are within tolerance, False if one is not, None if this cannot be decided."""
         each = [one.inside for one in self.by_measure.values()]
         return False if False in each else None if None in each else True
 
     @property
     def more(self) -> float:
-        """Factor by which the number of seeds must increase to decide on all tolerances."""
+        """Factor by which to increase the number of seeds so that every comparison can be decided."""
         return max((one.more for one in self.by_measure.values()), default=1.0)
 
 

@@ -176,7 +176,7 @@ def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[
 
 
 def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
-    """Return the change of each measure between the ends of each choice's range, from a linear fit."""
+    """Return the change of each measure over the range of each choice's values, from a linear fit."""
     choices, ends = {one.setting: one.point.choices for one in plan.points}, {}
 
     def share(axis: Axis, value: Any) -> float:
@@ -254,7 +254,7 @@ def _advice(
 
 
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the setting of all recommended values and that of all converged values; none if they are equal.
+    """Return two settings, of all recommended and of all converged values; an empty list if both are equal.
 
     Each choice was varied alone; runs with the two returned settings show the combined effect of all choices.
     """
@@ -281,7 +281,7 @@ def _together(
     means: Means, results: _Results, joint: Sequence[Setting],
     tolerances: Mapping[str, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Compare results at the setting of all recommended values with results at all converged values."""
+    """Compare results for two settings: all recommended values together, all converged values together."""
     setting, end = joint
     found = _along(means, results, {"": setting}, end, list(tolerances))
     one = compared_with_end(setting, "", found, tolerances, len(tolerances))

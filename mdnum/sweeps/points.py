@@ -10,8 +10,8 @@
 
 The address of a point is defined as in signac: the MD5 hash of the state point as JSON. A point is computed
 in a temporary folder, which a single rename moves to the address. A killed process therefore leaves no
-partial result. To claim a point, a process creates a claim file with O_EXCL, so that only one process can
-succeed. If the claiming process ends without a result, another process creates a claim with the next number.
+partial result. To claim a point of a sweep, a process creates a file with O_EXCL, so that only one process
+succeeds. If the claiming process ends without a result, another process creates a claim with the next number.
 """
 
 from __future__ import annotations

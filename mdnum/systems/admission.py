@@ -1,8 +1,8 @@
 """Classification and validation of a user's energy function by trial calls before the simulation.
 
 The signature of a function does not reveal whether positions are fractional, whether lattice vectors are rows
-or columns, or whether the box is used. Energies computed with wrong assumptions look plausible. The function
-is therefore tested at the first configuration, with equivalent neighbor lists and slightly different boxes.
+or columns, or whether the box is used. With a wrong calling convention, energies can look plausible. The
+function is therefore tested at step 0, with equivalent neighbor lists and slightly different boxes.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def admitted(simulation: Simulation) -> Simulation:
 
 
 def _of_a_part(simulation: Simulation) -> Trial | None:
-    """Classify the energy function with a few atoms of a large structure; return None if this fails."""
+    """Classify the energy function on a few atoms of a large structure; return None if the function fails."""
     if simulation.atoms <= _ENOUGH or simulation.model.start is not None:
         return None
     try:
@@ -72,7 +72,7 @@ def _of_a_part(simulation: Simulation) -> Trial | None:
 
 
 def _short(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Round values to six digits, because the last digits depend on the processor."""
+    """Round values to six significant digits, because further digits depend on the processor."""
     return {key: float(f"{one:.6g}") if isinstance(one, float) else one for key, one in values.items()}
 
 
@@ -141,7 +141,7 @@ def _keep(trial: Trial, box: str) -> None:
 class _Moved:
     """Energy changes when the atom with the most neighbors is displaced by lattice vectors.
 
-    Energies in the sheared box include only pairs whose nearest image is the same as in the original box.
+    Energies in the sheared box include only atom pairs with the nearest image of the original box.
     """
 
     def __init__(self, trial: Trial):
@@ -156,7 +156,7 @@ class _Moved:
         self.whole = np.where(whole, near, n).astype(np.int32)
 
     def by(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
-        """Return a copy of the positions per vector, with one atom moved by this vector, and the original."""
+        """Return positions with one atom moved by each vector in turn, and the original positions."""
         x, moved = self.trial.x, np.arange(self.trial.n) == self.central
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 
@@ -238,7 +238,7 @@ def _check(trial: Trial) -> None:
 
 
 def _over_both_lists(trial: Trial) -> dict[str, float]:
-    """Return the energy for the pairs inside the cutoff only, and for all pairs of the neighbor list."""
+    """Compute the energy twice: for the pairs inside the cutoff, and for all pairs of the neighbor list."""
     return {"inside": trial.energy(), "skin": trial.energy(idx=trial.idx)}
 
 
@@ -383,7 +383,7 @@ def _adds(trial: Trial) -> bool:
 
 
 def _reach(trial: Trial) -> tuple[float | None, float]:
-    """Return the largest distance at which two listed atoms exert a force, and the largest tested distance.
+    """Return the largest distance at which neighbors exert forces, and the largest distance tested.
 
     The first returned value is None if there is no force at any tested distance.
     """

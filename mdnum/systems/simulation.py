@@ -148,7 +148,7 @@ class Simulation:
 
     @property
     def imposable(self) -> bool:
-        """True if cutoff decisions can be imposed, False if the energy function itself applies a cutoff."""
+        """True if a run can use another run's decisions, False if the energy function applies a cutoff."""
         return self.pairwise or self.model.trusts_list
 
     @property
@@ -226,7 +226,7 @@ class Simulation:
 
     @property
     def channels(self) -> int:
-        """Number of cutoff decisions per pair; terms with the same cutoff radii share one decision."""
+        """Number of cutoff decisions per pair of atoms; terms with equal cutoff radii share one decision."""
         return len(self.model.parts) if self.pairwise else 1
 
     @property
@@ -235,7 +235,7 @@ class Simulation:
         return len(self.decider.r_cut) // self.channels
 
     def type_of(self, i, j) -> Int[np.ndarray, "..."]:
-        """Return the index of each pair's cutoff radius; radii differ by species and by group of terms.
+        """Return the index of the cutoff radius for each pair of atoms, by species and by group of terms.
 
         Args:
             i: index of the first atom, plus the number of atoms times the index of the channel.
@@ -246,14 +246,14 @@ class Simulation:
         return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
 
     def first_atoms(self, i: Any) -> dict[str, Any]:
-        """Return the first atom of each decision, and the potential term if terms have separate decisions."""
+        """Return the first atom of each pair, and the potential term if terms decide separately."""
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """Return a table column with the term of each decision; no column if all terms share decisions."""
+        """Return a table column with each decision's potential term; no column if terms share decisions."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])
@@ -286,7 +286,7 @@ class Simulation:
         return np.stack([np.asarray(own[0]) if own else np.ones(self.atoms) for own in each])
 
     def jumps_of(self, i, j) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """Return the jumps of energy and radial force when pairs enter the cutoff; for i, see `type_of`."""
+        """Return the jumps of energy and radial force when atoms i (see `type_of`) and j enter the cutoff."""
         kind, weights = self.type_of(i, j), self._weights
         if weights is None:
             energy, force = (jump[kind] for jump in self.jumps())
@@ -298,7 +298,7 @@ class Simulation:
 
     @property
     def lists(self) -> tuple[Any, ...]:
-        """Settings that determine the neighbor lists: systems with equal values have equal lists."""
+        """Settings that determine the neighbor lists; equal settings give equal neighbor lists."""
         return self.rule, self.builder
 
     def verlet_list(self, skin: float | None = None) -> VerletList:

@@ -1,7 +1,7 @@
 """Trial calls of a user's energy function at one configuration, with equivalent neighbor lists.
 
-One compiled function computes energy and derivatives. Another computes only the energy, for a list with more
-padding. The functions are compiled with few optimizations, because only a few dozen calls are needed.
+One compiled function computes energy and derivatives. Another function computes only the energy, for a list
+with more padding. The functions are compiled with few optimizations, because they are rarely called.
 """
 
 from __future__ import annotations

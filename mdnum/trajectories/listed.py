@@ -207,7 +207,7 @@ class ListCheck:
         flips: Mapping[str, np.ndarray],
         now: GivenList,
     ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """Compare a list with the pairs inside the cutoff; return (results, rows of pairs missing until now).
+        """Compare a list with the pairs inside the cutoff; return (results, rows of pairs that were missing).
 
         Args:
             at: index of the frame among the frames examined.
@@ -273,7 +273,7 @@ class ListCheck:
         return bool((distance <= self._radii[self._kinds[i], self._kinds[j]] + placed.rounding).any())
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
-        """Return table rows of pairs that were missing until frame `at`: all pairs, or those in `stays`."""
+        """Return table rows of pairs that were missing until frame `at`; `stays` restricts the pairs."""
         names = ("i", "j", "rank", "missing", "begin", "number", "deepest", "end")
         held = sorted((self._open if stays is None else stays).items())
         rows = [(*key, *told, at) for key, told in held if told[-1] > bound]

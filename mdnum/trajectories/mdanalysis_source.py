@@ -252,7 +252,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factors(trajectory: Any) -> tuple[float, float]:
-    """Return (time step in a DCD file / MDAnalysis's value, byte-swapped time step / time step)."""
+    """Return two ratios of time steps in a DCD file: stored / MDAnalysis's value, byte-swapped / stored."""
     read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
     if not read:
         return 1.0, math.nan

@@ -2,9 +2,9 @@
 
 Atoms are sorted into clusters of sixteen by bisecting space. A tile consists of two clusters and the lattice
 vector between them. For each atom of the first cluster, the tile stores sixteen decisions as bits. At each
-frame, the pairs of near clusters are decided in float32. Only decisions that changed since the previous frame
-are processed further. If float32 cannot decide a pair, or the margin of a pair is needed, the exact squared
-distance is computed (`search.exact_square`).
+frame, pairs of atoms in nearby clusters are compared with the cutoff in float32. Only decisions that changed
+since the previous frame are processed further. The exact squared distance of a pair is computed if float32
+cannot decide or the pair's margin is needed (`search.exact_square`).
 
 Tiles remain valid as long as all atoms of each cluster stay inside an enlarged bounding box of the cluster.
 Coordinates are unwrapped from frame to frame, so that wrapping in the file does not invalidate tiles.
@@ -56,7 +56,7 @@ class _Numbers(NamedTuple):
 
 
 class _Limits(NamedTuple):
-    """Thresholds of decisions for all pairs with the same cutoff radius."""
+    """Thresholds of distances and squared distances, for all pairs of atoms with the same cutoff radius."""
 
     radius: float
     square: float  # of the radius
@@ -424,7 +424,7 @@ def _follow(before, now, order, home, vectors, change, inverse, periodic, center
 
 @njit
 def _stays(boxes, around, drift):
-    """Return True if each cluster box is inside its enlarged box, reduced by `drift` on each side."""
+    """Return True if each cluster's box is at least `drift` inside its enlarged box on every side."""
     out = 0
     for k in range(boxes.shape[0]):
         for c in range(3):
@@ -446,7 +446,7 @@ def _box(columns, boxes):
 
 @njit
 def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count):
-    """Decide pairs from tile `begin` on; return (next tile, flips, number uncertain, smallest |margin|)."""
+    """Decide pairs of tiles `begin` and later; return (next tile, flips, uncertain pairs, least |margin|)."""
     close, smallest, room = 0, np.inf, flips.i.shape[0]
     first, second, vector, rows, inside = tiled.first, tiled.second, tiled.vector, tiled.rows, tiled.inside
     order, low, high, scratch = numbers.order, limits.low, limits.high, np.empty(4 * CLUSTER, np.float32)
@@ -499,7 +499,7 @@ def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count
 
 @njit(inline="never")
 def _settled(inside, doubtful, i, slot, code, numbers, limits):
-    """Decide an atom's doubtful pairs; return (bits of pairs inside, number uncertain, least |margin|)."""
+    """Decide an atom's doubtful pairs; return (decisions as bits, uncertain pairs, least |margin|)."""
     close, smallest, vectors, order = 0, np.inf, numbers.vectors, numbers.order
     n0, n1, n2 = np.intp(code // 9) - 1, np.intp(code // 3 % 3) - 1, np.intp(code % 3) - 1
     while doubtful != np.uintp(0):

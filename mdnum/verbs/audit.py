@@ -2,7 +2,7 @@
 
 The checks of `mdnum.audit.checks.CHECKS` run in order, and each result is saved in the output folder. If an
 audit is interrupted, the completed results are in the folder, and the remaining checks can be run later. A
-check returns codes of findings with values; audit.toml contains the sentences for these codes.
+check returns the code of each finding and the values in its text; audit.toml contains the texts.
 """
 
 from __future__ import annotations
@@ -220,7 +220,7 @@ def _ask_all(
 def answer_of(
     check: AuditCheck, subject: CalculatorSubject, log: frame.Progress, before: Iterable[CheckResult]
 ) -> CheckResult:
-    """Run a check and return its result; if the calculator fails, the result is a finding on the failure.
+    """Run a check and return its result; if the calculator fails, the result is a finding about the failure.
 
     If the calculator gave different results for the same input, a finding is added, once per audit.
     """
@@ -243,7 +243,7 @@ def answer_of(
 
 
 def _keep_evidence(folder: RunFolder, loaded: LoadedCalculator, check: AuditCheck) -> None:
-    """Write structures, exact to the last bit, and a script that reproduces a finding without mdnum."""
+    """Write structures in full precision, and a script that reproduces a finding without mdnum."""
     from mdnum.audit.record import STRUCTURES, script
 
     _write_structures(folder, check.structures)

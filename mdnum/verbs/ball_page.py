@@ -61,7 +61,7 @@ class BallView(View):
 
     @cached_property
     def ratio(self) -> np.ndarray:
-        """Absolute margin of each contact flip, divided by the rounding bound of the margin."""
+        """Absolute margin of each contact flip, divided by the bound on its rounding error."""
         return margins_in_bounds(self.table("contacts"))
 
 
@@ -146,7 +146,7 @@ def _nearest(view: BallView) -> Iterator[Plot]:
 
 
 def _ranges(view: BallView) -> Iterator[Any]:
-    """Yield a table of quantities' ranges, and of the first step at which they exceed narrower formats."""
+    """Yield a table of the range of each quantity, and of the first step at which narrower formats fail."""
     table = range_table(lambda name: TEXTS(f"range_{name}"), view.table("steps"))
     if table.rows:
         yield table
@@ -291,7 +291,7 @@ def _variants(view: BallView) -> Iterator[Any]:
 
 
 def _contacts(view: BallView) -> Iterator[Any]:
-    """Yield a table of the contact flips with the smallest margins, ordered by step."""
+    """Yield a table, ordered by step, of the contact flips that rounding errors could change most easily."""
     rows, ratio = view.table("contacts"), view.ratio
     if not len(ratio):
         yield TEXTS("no_contacts")
@@ -303,7 +303,7 @@ def _contacts(view: BallView) -> Iterator[Any]:
 
 
 def _stop_decisions(view: BallView) -> Iterator[Any]:
-    """Yield a table of the solver's stop decisions with the smallest margins, ordered by step."""
+    """Yield a table, ordered by step, of the solver's stop decisions closest to the stopping threshold."""
     rows = view.table("solver")
     if not len(rows["step"]):
         return

@@ -86,7 +86,7 @@ def as_python(in_memory: bool) -> Iterator[None]:
 
 
 def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = False) -> dict[str, Any]:
-    """Return summary entries on whether all frames were read and, if not, on the error."""
+    """Return summary entries: whether all frames were read, and the error if reading stopped early."""
     told = None if stopped is None else str(stopped)
     return {
         "stopped": in_python(told) if told and in_memory else told,
@@ -269,7 +269,7 @@ class FlipsView(View):
 
 
 def average(mean: float) -> str:
-    """Format a mean of integers: four digits, or the nearest integer for 1000 and more."""
+    """Format the mean of a count: four significant digits, or the nearest integer for 1000 and more."""
     return count(round(mean)) if mean >= 1000 else number(mean, 4)
 
 

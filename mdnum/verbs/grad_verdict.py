@@ -145,7 +145,7 @@ def _of_trust(view: View) -> Iterator[Finding]:
 
 
 def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
-    """Yield remedies for limits on trust that were not examined, named as variants of a finding's text."""
+    """Yield names of text variants that tell the user how to examine the limits of trust not yet examined."""
     unseen = {one["what"] for one in trust["limits"] if one["horizon"] is None}
     aware = by(view.summary, "event-aware") is not None
     if any(one["what"] == "half the time step" for one in view.summary["left_out"]):
@@ -168,7 +168,7 @@ def _averaged(view: View) -> bool:
 
 
 def _of_flips(view: View) -> Iterator[Finding]:
-    """Yield findings on derivatives dominated by one or two flips, and on excluded grazing flips."""
+    """Yield findings on derivatives dominated by one or two flips, and on omitted grazing flips."""
     section, totals = "Flips on the way", (view.summary.get("flips") or {}).get("total") or {}
     table = view.table("flip_contributions") if totals else {}
     for name, total in totals.items():

@@ -29,8 +29,8 @@ _OUTERMOST = threading.Lock()
 def reported(progress: Wanted) -> Iterator[Progress | None]:
     """Context manager: yield the function to which progress is reported, or None.
 
-    If `progress` is a function, it receives the reports. True always shows a bar, and False never does. None
-    shows a bar, except in worker processes and in a command called by another command.
+    A function `progress` receives the reports. If `progress` is True, a bar is always shown; if False, never.
+    If `progress` is None, no bar is shown in worker processes and in commands called by other commands.
     """
     from multiprocessing import parent_process
 

@@ -87,7 +87,7 @@ _energy, _length = partial(Measured, unit="energy"), partial(Measured, unit="len
 
 
 def place(threshold: PairThreshold) -> Measured:
-    """Return the distance of a threshold and the error of this distance, as text."""
+    """Return the distance at which a threshold lies, with its uncertainty, as text."""
     return _length(threshold.radius, floor=threshold.located)
 
 
@@ -285,7 +285,7 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
 
 
 def _steepness(walk: PairWalk) -> tuple[float, float] | None:
-    """Return the largest curvature beyond the minimum divided by that at the minimum, and its distance."""
+    """Return (largest curvature / curvature at the energy minimum, distance of the largest curvature)."""
     curvature = -np.gradient(walk.force, walk.distance)
     bottom = int(np.argmin(walk.energy))
     if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:
@@ -302,7 +302,7 @@ def _steepness(walk: PairWalk) -> tuple[float, float] | None:
 
 
 def _first_to_jump(event: Event) -> str:
-    """Return the name of the lowest derivative of the energy that jumps at a point on a route."""
+    """Return the name of the lowest derivative of the energy that jumps at a point of the atoms' path."""
     order = event.jump.order
     return ORDERS[max(order, event.threshold.order) if order == SMOOTH and event.threshold else order]
 

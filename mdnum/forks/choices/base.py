@@ -117,7 +117,7 @@ def choice(family: str | None):
 
 
 def shipped(world: str) -> dict[str, Choice]:
-    """Return, by name, the built-in choices for molecular dynamics or balls that are tested by default."""
+    """Return, by name, the choices tested by default in molecular dynamics ("md") or for a "ball"."""
 
     def of_family(kind: type[Choice]) -> Iterable[Choice]:
         words = kind.screened if isinstance(kind.screened, str) else kind.screened[world]
@@ -152,7 +152,7 @@ def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> 
 
 
 def twin_of(choice: Choice, system: Simulation | System | BallSystem) -> Twin:
-    """Make two programs of a system that differ in a choice.
+    """Make two programs that simulate the same system and differ in one choice.
 
     Raises:
         InputError: the choice does not apply to the system.
@@ -269,7 +269,7 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice that can set how both runs sum; if their sums do not depend on order, the runs must agree."""
+    """A choice that can set the summation method of both runs; they must agree if order has no effect."""
 
     worlds = ("md",)
     both: str | None = None  # reduction of both runs; None for the system's own
@@ -284,5 +284,5 @@ class Summed(Choice):
         return self.both in ORDERLESS
 
     def twin(self, a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
-        """Make a pair of programs from two simulations; the label of the pair includes the reduction."""
+        """Combine two simulations into a `Twin`, whose label includes the method of summation."""
         return simulations(a, b, difference + summing(self.both), frame)

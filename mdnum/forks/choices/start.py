@@ -175,9 +175,9 @@ class Translate(Summed):
 class Images(Choice):
     """Atoms that start in other periodic images.
 
-    Positions are wrapped before the first step, so this choice changes no bit if images are exact. Usually,
+    Positions are wrapped before the first step, so exact images give the same positions bit for bit. Usually,
     however, the sum of a position and a lattice vector is rounded. Both runs therefore start from positions
-    with exact images. These differ from the positions in the file by at most one ulp of the lattice vector.
+    with exact images. Atoms start within one ulp of the lattice vector from the positions in the file.
     """
 
     worlds = ("md",)
@@ -221,7 +221,7 @@ def exact_images(
 
     Wrapping an exact image restores the wrapped position, bit for bit. In an orthogonal box, wrapping a
     rounded image gives a position with an exact image, because the lattice vector is subtracted exactly
-    (Sterbenz's lemma). A second iteration is needed only if the first moves a position out of the box.
+    (Sterbenz's lemma). A second iteration is needed only if the first one moved an atom out of the box.
     """
     from mdnum.md.cell import wrap_positions
 

@@ -223,7 +223,7 @@ def _meaning(
 
 @result
 class GradientDiagnosis:
-    """Results that tell up to which step a gradient can be trusted; results that were not requested are None.
+    """Analysis of the steps for which a gradient can be trusted; results that were not requested are None.
 
     Attributes:
         horizon: number of steps. names: full names of the parameters. value: value of the loss.

@@ -33,7 +33,7 @@ SILENT = ("CRASHED", "NO_ANSWER", "RAISED")  # those of cases in which nothing c
 
 @dataclass(frozen=True)
 class Truth(PairSet):
-    """Exact pairs at one call of a test case, including pairs slightly beyond the cutoff."""
+    """Exact pairs for one call of a neighbor list in a test case, and pairs slightly beyond the cutoff."""
 
     # positions, cell: as the list was given them; rows of axes that do not repeat are zero
     positions: ndarray
@@ -55,7 +55,7 @@ class Truth(PairSet):
 
 
 def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DOUBLE) -> Truth:
-    """Compute the exact pairs that a neighbor list must return, and those that it may return, at one call.
+    """Compute the exact pairs for one call of a neighbor list: those it must return, and those it may return.
 
     Args:
         reach: largest distance of the pairs, length; the cutoff by default.

@@ -24,8 +24,8 @@ class KeptList(Protocol):
     `allocate` builds a new neighbor list and may be called again on the same object; `update` receives the
     current positions. The returned pairs must include every pair within r_cut at the current positions, and
     may include pairs that are farther apart by less than the skin. If a neighbor list uses its own padding
-    instead of the given skin, its attribute `skin` must contain this padding (length). The attribute is read
-    after each `allocate`.
+    instead of the given skin, its attribute `skin` must contain this padding (length). The attribute `skin`
+    is read after each call of `allocate`.
     """
 
     def allocate(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float, skin: float) -> Any:

@@ -1,8 +1,8 @@
 """Neighbor searches of libraries; any neighbor list can be found by name or `module:function`.
 
-Every function and class in this module imports what it requires and uses nothing else in the module. The
-source code of each is copied into scripts that reproduce a failure without mdnum. Each function calls its
-library as a user would: atoms outside the box, unusual cells and few atoms are passed on unchanged.
+Every function and class in this module imports what it requires and uses nothing else in the module, because
+its source code is copied into scripts that reproduce a failure without mdnum. Each function calls its library
+as a user would: atoms outside the box, unusual cells and few atoms are passed on unchanged.
 """
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalCall=false
