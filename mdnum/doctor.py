@@ -274,7 +274,7 @@ def subnormals() -> DoctorRow:
     """Test whether numpy and jax keep numbers below 2.2e-308, or flush them to zero.
 
     XLA flushes subnormal numbers to zero on CPUs, and a loaded library can make the processor flush all
-    subnormal numbers. The test also uses arrays large enough for XLA to split the work among its own threads.
+    subnormal numbers. Subnormal numbers are also tested in arrays that XLA splits among its own threads.
     Results are compared as integers, since a comparison of floats can treat subnormal numbers as zero.
     """
 
@@ -326,7 +326,7 @@ def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) -> jax.Array:
-    """Compute r² of every listed pair by one matrix-vector product, as in jax-md; r² is 0 for padding."""
+    """Compute r² of listed pairs of atoms by one matrix-vector product, as in jax-md; 0 for padding."""
     used = slots[:, 0] < fractional.shape[0]
     index = jnp.where(used[:, None], slots, 0)
     separation = fractional[index[:, 0]] - fractional[index[:, 1]]
@@ -465,7 +465,7 @@ class Child:
         )
 
     def answer(self, seconds: float) -> tuple[str | None, str]:
-        """Wait for at most `seconds`; return (output, "") or (None, reason for the missing output)."""
+        """Wait at most `seconds` for output; return (output, "") or (None, reason for missing output)."""
         try:
             out, err = self.process.communicate(timeout=max(seconds, 0.1))
         except subprocess.TimeoutExpired:
@@ -488,7 +488,7 @@ def imports(child: Child, seconds: float) -> DoctorRow:
 
 
 def second_process(child: Child, here: str, seconds: float) -> DoctorRow:
-    """Test that a jitted simulation has the same bits in another process, as is required to resume a run."""
+    """Test that a jitted simulation gives the same bits in another process, as required to resume runs."""
     answer, why = child.answer(seconds)
     status = "info" if why == _LATE else answer == here
     return _row("second_process", status, here=here[:12], there=answer[:12] if answer else why)

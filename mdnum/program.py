@@ -215,7 +215,7 @@ class Decision:
 
     @property
     def margin(self) -> float:
-        """Margin (threshold minus quantity) in run `run`; in run A if the runs differ from the start."""
+        """Decision margin (threshold minus quantity) in run `run`, or in A if runs differ from the start."""
         return self.margins["A" if self.run == "start" else self.run]
 
     @property

@@ -66,7 +66,7 @@ def guard(parent: int) -> None:
 
 
 def executed(file: Path, name: str) -> ModuleType:
-    """Run a Python file, and return the resulting module with a given name.
+    """Execute a Python file as a module with the given name, and return this module.
 
     Raises:
         BaseException: the code in the file raises this exception.

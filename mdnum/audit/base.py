@@ -1,4 +1,4 @@
-"""Base classes of calculator checks: `AuditCheck`, results, findings, limits on calculator calls and time."""
+"""Base class `AuditCheck` of calculator checks, their results and findings, and limits on calls and time."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ class AuditCheck:
 
 
 def _above_limits(result: CheckResult) -> Iterator[Observed]:
-    """Yield a finding for each number above its limit that the check itself has not reported."""
+    """Yield a finding for each result above its limit that the check itself has not reported."""
     codes = {one.code for one in result.findings}
     for name, (limit, reports) in result.limits.items():
         value = result.numbers.get(name)

@@ -21,7 +21,7 @@ _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked abou
 
 
 class SequenceStep(NamedTuple):
-    """A structure of a sequence, its change from the previous structure, and whether results are compared."""
+    """A structure in a sequence, its change from the previous one, and whether results are compared."""
 
     what: str
     atoms: Atoms
@@ -131,7 +131,7 @@ def _scaled(atoms: Atoms, factor: float) -> Atoms:
 
 
 def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
-    """Yield sequences in which two particles come within the cutoff; each requires a new calculator object.
+    """Yield sequences in which two atoms come within the cutoff; each requires a new calculator object.
 
     Args:
         radius: cutoff distance, beyond which the particles do not interact, Å.

@@ -2,9 +2,9 @@
 
 The package works for molecular dynamics and the bouncing ball. `fork` compares the runs of two programs
 (`Twin`) that differ in a choice (`forks.choices`) or belong to two run folders (`forks.folders`).
-`forks.boundaries` finds parameter values at which decisions change; `forks.exact` uses exact arithmetic. Four
-modules are for molecular dynamics only: `forks.replays` (overridden decisions, minimal causes),
-`forks.linearized` (exponents and forecasts), `forks.processes` (compilers) and `forks.benign` (ensembles).
+`forks.boundaries` finds parameter values at which decisions change; `forks.exact` uses exact arithmetic. The
+modules `forks.replays` (overridden decisions, minimal causes), `forks.linearized` (exponents and forecasts),
+`forks.processes` (compilers) and `forks.benign` (ensembles) are for molecular dynamics only.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
 """Test whether a fork is benign, that is, whether two programs with diverging runs give the same averages.
 
-Runs of program B are compared with an ensemble of runs of program A at one step. A calibration determines
-this step. At early steps, rounding errors can change a run by more than the runs of the ensemble differ. At
-late steps, every run has forgotten its start, and a changed program has the same scatter as the ensemble. The
-steps suitable for a comparison depend on the system. For calibration, programs with deliberate changes are
-run; at the chosen step, all deliberate changes are distinguishable from rounding.
+Runs of program B are compared with an ensemble of runs of program A at a step that is found by a calibration.
+At early steps, rounding errors can change a run by more than the runs of the ensemble differ from each other.
+At late steps, no run depends on its initial state any more, and a changed program has the same scatter as the
+ensemble. The steps suitable for a comparison depend on the system. For calibration, programs with deliberate
+changes are run; at the chosen step, all deliberate changes are distinguishable from rounding.
 
 The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
 Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
-run is an outlier if at least two of its principal components exceed the limit. A program fails the test if at
-least two of its three runs are outliers. Equivalently, a program fails if the median of the second-largest
-component over its three runs exceeds the limit.
+run is an outlier if at least two of its principal components exceed the outlier limit. A program fails the
+test if at least two of its three runs are outliers. Equivalently, a program fails if the median of the
+second-largest principal component over its three runs exceeds the limit.
 """
 
 from __future__ import annotations
@@ -111,8 +111,8 @@ class Space:
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations above which a principal component counts as an outlier.
 
-    The limit is two standard deviations. It is larger if over a tenth of the ensemble's runs would exceed it.
-    The components for a run are computed from other runs, because a run influences its own components.
+    The outlier limit is two standard deviations, or more if over a tenth of the ensemble's runs would exceed
+    two. For a run, components are computed from other runs, because a run influences its own components.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -122,18 +122,18 @@ def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
 
 
 def triples(seconds: Float[np.ndarray, "runs"]) -> Float[np.ndarray, "tries"]:
-    """Return the median of the second-largest component for each group of three successive runs."""
+    """Return the median of the second-largest principal component for each group of three successive runs."""
     tries = len(seconds) // RUNS
     return np.median(seconds[: RUNS * tries].reshape(tries, RUNS), axis=1)
 
 
 def two_of_three(rate: float) -> float:
-    """Compute the probability that two or all of three runs are outliers, from the outlier rate of a run."""
+    """Return the probability that two or all of three runs are outliers, given the probability for one."""
     return 3 * rate**2 - 2 * rate**3
 
 
 def bounds(count: int, of: int) -> tuple[float, float]:
-    """Compute the exact (Clopper-Pearson) 95 % confidence interval of a rate: `count` of `of` trials."""
+    """Compute the exact (Clopper-Pearson) 95 % confidence interval of the rate `count` / `of` of trials."""
     tail = 0.025
     low = betaincinv(count, of - count + 1, tail) if count else 0.0
     high = betaincinv(count + 1, of - count, 1 - tail) if count < of else 1.0
@@ -173,7 +173,7 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest ratio of score to limit among the changes that must be detected; infinity without any."""
+        """Smallest score, in outlier limits, of the changes that must be detected; infinity without any."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property
@@ -285,7 +285,7 @@ def calibrate(
 
 
 def choose(windows: Sequence[Window], name: str) -> Window:
-    """Return the latest step at which all deliberate changes are clear, or else the most sensitive step.
+    """Return the latest step at which all deliberate changes are clearly seen, or the most sensitive step.
 
     Raises:
         InputError: at no step are the deliberate changes distinguishable from rounding.
@@ -355,8 +355,8 @@ def benign(
 ) -> Benign:
     """Compare three runs of program B with an ensemble of runs of program A.
 
-    Program B fails if at least two principal components exceed the limit in two of three runs. If B passes,
-    replacing A by B has no larger effect than the smallest perturbation of the initial state.
+    Program B fails if at least two principal components exceed the outlier limit in two of three runs. If B
+    passes, replacing A by B has no larger effect than the smallest perturbation of the initial state.
 
     Args:
         twin: the programs. Atom labels and axes of B do not matter, because no feature depends on them.
@@ -382,7 +382,7 @@ def benign(
 
 
 def _check(twin: Twin) -> None:
-    """Raise an error if an ensemble of one program cannot be used to test the other program of a pair."""
+    """Raise an error if an ensemble of one program cannot be used to test another program."""
     twin.a.check(twin.b)
     keys = [one.simulation.integrator.random for one in (twin.a, twin.b)]
     a, b = (() if key is None else np.asarray(jax.random.key_data(key)) for key in keys)

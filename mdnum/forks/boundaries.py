@@ -162,7 +162,7 @@ class NumberLine:
         return self.known[place].digest
 
     def changes(self, a: int, b: int) -> Iterator[tuple[int, int, dict[int, DecisionHistory]]]:
-        """Yield adjacent ordinals whose decisions differ, in ascending order, and the runs made to find them.
+        """Yield adjacent ordinals with different decisions, in ascending order, and runs made to find them.
 
         A cell is not searched if both of its ends have the same history of decisions.
         """
@@ -182,7 +182,7 @@ class NumberLine:
             yield a, b, runs
 
     def boundary(self, below: int, above: int) -> Boundary | None:
-        """Find the first decision that differs between runs at two ordinals; None if a run ends earlier."""
+        """Find the first decision that differs between two parameter values; None if a run ends earlier."""
         places = (below, above)
         runs = [self.run(place) for place in places]
         step = runs[0].first_difference(runs[1])

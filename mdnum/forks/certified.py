@@ -1,13 +1,13 @@
 """Certify the decisions of one run, and the agreement of its decisions with those of another run.
 
 Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound. Exact arithmetic
-would give the same decisions for the same states. Up to the end of *protection*, every pair distance was
-farther from its cutoff than the two runs can differ. Up to the certified horizon and the end of protection,
-the decisions of the two runs agree. If one of two programs is at least as precise as the other in every role,
-their decisions agree up to the *shadow horizon*.
+would give the same decisions for the same states. Up to the end of *protection*, every pair distance differed
+from its cutoff by more than it can differ between the two runs. Up to the certified horizon and the end of
+protection, the decisions of the two runs agree. If one of two programs is at least as precise as the other in
+every role, their decisions agree up to the *shadow horizon*.
 
 Decisions are certified only for the actual states of the run. A run whose decisions are correct for its
-states may have left the exact history long ago (`forks.exact.certify` finds the step).
+states may have left the exact trajectory at an earlier step (`forks.exact.certify` finds the step).
 """
 
 from __future__ import annotations
@@ -92,11 +92,11 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 
 
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """For each step, return the smallest |pair distance - cutoff| and the value that ensures equal decisions.
+    """For each step, return the smallest |pair distance - cutoff|, and the bound above which decisions agree.
 
     If positions of atoms differ between the two runs by at most d, a pair distance differs by at most 2 d.
-    Pair distances are taken from the run with the smaller rounding error. This rounding error is added to the
-    required value.
+    Pair distances are taken from the run with the smaller rounding error. The rounding error of the distances
+    is added to the bound.
     """
     deciders = {"A": fork.twin.a.simulation.decider, "B": fork.twin.b.simulation.decider}
     a, b = deciders.values()
@@ -113,9 +113,9 @@ def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
 
 
 def wider(twin: Twin) -> str | None:
-    """Return the program that is more precise in some role and less precise in none; None if neither is.
+    """Return the program that is more precise in at least one role and in no role less precise, or None.
 
-    Only the precision of roles may differ: the effect of a different time step is not rounding.
+    Programs may differ only in the precision of roles: the effect of another time step is not rounding.
     """
     a, b = twin.a.simulation, twin.b.simulation
     if twin.a.begin is not None or twin.b.begin is not None or _but_for_roles(a) != _but_for_roles(b):

@@ -131,8 +131,8 @@ def variants(
 ) -> Variants:
     """Run a system in several variants of its program, two processes at a time, and find which results agree.
 
-    All variants use one neighbor list, whose skin is doubled if the box is large enough. Variants stop before
-    an atom moves too far. Groups may differ between machines, since some processors lack fused multiply-add.
+    All variants use one neighbor list; its skin is doubled if the box is large enough. Variants stop before
+    an atom moves half the skin. Groups may differ between machines: some processors lack fused multiply-add.
 
     Args:
         system: a system that was loaded from a file and has a pair potential.
@@ -228,8 +228,8 @@ def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
     """Return codes for the causes of differences between variants; variants without a result are ignored.
 
     The codes "fused", "others" and "not_fused" describe programs without fused operations, "eager_..." the
-    program without a compiler, and "reversed" reversed sums. Other codes describe the program in "program".
-    If a variant differs from the reference, "step" is the first step at which they differ.
+    program without a compiler, and "reversed" reversed sums. Other codes describe the program that the entry
+    "program" names. If a variant differs from the reference, "step" is the first step at which they differ.
     """
     by_name = {row.variant.name: row for row in rows if not row.failed}
     reference = next(iter(by_name.values()))

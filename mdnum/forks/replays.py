@@ -1,8 +1,8 @@
 """Repeat molecular-dynamics runs around a fork: find nearby atoms, override decisions, find minimal causes.
 
 To override a decision of run B, the decision of run A is imposed on B; B makes all other decisions itself.
-The smallest set of overridden pairs that keeps run B close to run A is found by bisection and delta
-debugging. The tool Verrou finds instructions that cause an error by delta debugging.
+Bisection and delta debugging find the smallest set of atom pairs whose overridden decisions keep run B close
+to run A. The tool Verrou finds instructions that cause an error by delta debugging.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Neighborhood:
 
 
 def neighborhood(fork: Fork) -> Neighborhood | None:
-    """Repeat both runs and return the atoms around the pair at the fork; None if there is no such pair."""
+    """Repeat both runs and return the atoms around the pair of atoms at the fork, or None without a pair."""
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
@@ -108,7 +108,7 @@ def pinned(
     last: int | None = None,
     steps: int | None = None,
 ) -> Pinned:
-    """Repeat run B with run A's decisions on some pairs, and compute the distance between the two runs.
+    """Repeat run B with run A's decisions on some pairs of atoms, and compute the distance between the runs.
 
     Args:
         fork: a pair of runs with the same atom labels.
@@ -177,7 +177,7 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
 
 
 def check_pins(fork: Fork) -> None:
-    """Raise an error if single decisions of one run cannot be imposed on the other run of a pair.
+    """Raise an error if decisions on pairs of atoms cannot be imposed from one run on the other run.
 
     Raises:
         InputError: a potential is many-body, or the runs have different atom labels or axes.
@@ -196,7 +196,7 @@ def check_pins(fork: Fork) -> None:
 
 
 def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
-    """Return intervals (first step, end step or None) in which two runs make different decisions on a pair.
+    """Return step intervals (first, end or None) in which two runs decide differently on a pair of atoms.
 
     Only the stored differences between the decisions of the two runs are used.
     """
@@ -230,14 +230,14 @@ class Minimal:
 
     @property
     def proven(self) -> bool:
-        """True if each pair in the set was shown to be necessary."""
+        """True if each pair of atoms in the set was shown to be necessary."""
         return self.code in ("alone", "proven")
 
 
 def minimal_cause(
     fork: Fork, *, tests: int = 80, progress: Callable[[int, int], None] | None = None
 ) -> Minimal:
-    """Find a minimal set of atom pairs on which imposing run A's decisions prevents the split of the runs.
+    """Find a minimal set of atom pairs on which imposing run A's decisions keeps run B close to run A.
 
     Args:
         fork: a pair of runs with the same atom labels that has forked and split.
@@ -271,7 +271,7 @@ def minimal_cause(
 
 
 class _Search:
-    """Search that repeats run B with run A's decisions on some pairs, to test whether B stays close to A."""
+    """Search that repeats run B with A's decisions on some atom pairs, to test whether B stays close to A."""
 
     def __init__(
         self,
@@ -289,7 +289,7 @@ class _Search:
         self._tape = taped(fork.twin.a, horizon, self._keep)
 
     def spent(self) -> bool:
-        """Return True if the allowed number of runs is used up."""
+        """Return True if the allowed number of repeated runs has been reached."""
         return self.made >= self.allowed
 
     def _keep(self, segment: Segment) -> None:
@@ -300,7 +300,7 @@ class _Search:
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Test whether run B, with A's decisions on some pairs, stays close to A; False if no run is left."""
+        """Test if B stays near A with A's decisions on given atom pairs; False at the limit of runs."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():
@@ -329,10 +329,10 @@ class _Search:
 
 
 def _required(keys: list[int], search: _Search, until: int) -> list[int]:
-    """Find a sufficient set of pairs by bisection, one necessary pair after another (QuickXplain).
+    """Find a sufficient set of atom pairs by bisection, one necessary pair after another (QuickXplain).
 
-    For n pairs, QuickXplain needs about log2(n) runs per necessary pair; delta debugging needs about n² runs.
-    The search assumes that imposing more decisions never causes a split. It stops after `until` runs.
+    For n atom pairs, QuickXplain needs about log2(n) runs per necessary pair; delta debugging needs about n²
+    runs. The search assumes that more imposed decisions never cause a split. It stops after `until` runs.
 
     Source: Junker, QuickXplain, AAAI 2004.
     """

@@ -1,13 +1,13 @@
 """Let JAX differentiate all operations of the steps in reverse mode, like `jax.grad` of the whole run.
 
-A chunk is a scan over a fixed number of steps with one neighbor list. Chunks limit the memory of reverse
-mode. When the neighbor list expires, the remaining steps of the chunk are skipped. The host then builds the
-next list at the present positions. The states between chunks are stored. If memory is insufficient, every
-second state is dropped, and the steps between the remaining states are run again.
+A chunk is a scan over a fixed number of steps with one neighbor list. Chunks of steps limit the memory that
+reverse mode needs. When the neighbor list expires, the remaining steps of the chunk are skipped. The host
+then builds the next neighbor list at the present positions. The states between chunks are stored. If memory
+is insufficient, every second state is dropped, and the steps between the remaining states are run again.
 
-The differentiated program may round differently from an ordinary run, and then make other decisions. In this
-case, the gradient belongs to another trajectory. Therefore, the states and decisions of all steps are
-compared with those of an ordinary run.
+The differentiated program may round differently from an ordinary run, and then make other decisions. If
+decisions differ, the gradient belongs to another trajectory. Therefore, the states and decisions of all steps
+are compared with those of an ordinary run.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Inputs(NamedTuple):
 
 class StepEnds(NamedTuple):
     """Differentiable state between two steps: wrapped positions and half-kicked velocities of the atoms in
-    the user's order, sums of the loss, floating-point part of the extra state, and the box.
+    the user's order, sums of the loss, floating-point numbers of the integrator's extra state, and the box.
     """
 
     x: Float[Array, "3 atoms"]
@@ -196,7 +196,7 @@ def chunk(
 
 @partial(jax.jit, static_argnames=("rule",))
 def keep(inputs, between, *rest, rule):
-    """Return the final state of a chunk of steps, its reverse function, and its record."""
+    """Return the final state of a chunk of steps, its vector-Jacobian product (`jax.vjp`), and its record."""
     return jax.vjp(lambda *given: chunk(*given, *rest, rule), inputs, between, has_aux=True)
 
 
@@ -260,7 +260,7 @@ class ChunkedProgram:
         return Snapshot(between, record.place, self.list_of(at)[0].slots)
 
     def keep(self, at: Snapshot, rows: int) -> tuple[ChunkRecord, Any]:
-        """Run one chunk of steps; return its record and its reverse function."""
+        """Run one chunk of steps; return its record and its vector-Jacobian product (`jax.vjp`)."""
         _, back, record = keep(*self._arguments(at, rows), rule=self.rule)
         return record, back
 
@@ -277,7 +277,7 @@ class ChunkedProgram:
         return self._used[1]
 
     def cotangents(self, start: StepEnds, inputs: Inputs) -> Cotangents:
-        """Convert cotangents of `Inputs` and of the start to derivatives with respect to all inputs."""
+        """Convert cotangents of `Inputs` and initial state to derivatives with respect to all inputs."""
         numbers, x, v = onto_start(self.simulation, self.start.between, start.extra)
         inputs = inputs._replace(numbers=jax.tree.map(jnp.add, inputs.numbers, numbers))
         start = start._replace(x=start.x + x, v=start.v + v)
@@ -374,7 +374,7 @@ def marks(first: int, rows: range, x, v, bits, table: PairTable) -> Iterator[tup
 
 
 def departure(run: Mapping[int, Any], other: Mapping[int, Any]) -> dict[str, int | None]:
-    """Return the first steps with different states, and with different decisions, of two programs."""
+    """Return the first steps at which states, and at which decisions, of two programs differ."""
     both = sorted(run.keys() & other.keys())
     different = [[step for step in both if run[step][k] != other[step][k]] for k in (0, 1)]
     state, decision = (steps[0] if steps else None for steps in different)

@@ -1,9 +1,9 @@
 """Neighbor search in XLA; neighbor lists are built and stored on the device that holds the positions.
 
 An atom is compared with the atoms in neighboring bins, in the same order as in `md.host_search`. Searches on
-the device and on the host therefore build the same table from the same bins. A search copies two numbers to
-the host: the largest number of atoms in a bin, and the largest number of neighbors. Extents of the atoms
-along nonperiodic axes are also copied to the host.
+the device and on the host therefore build the same neighbor table from the same bins. A search copies two
+numbers to the host: the largest number of atoms in a bin, and the largest number of neighbors. Extents of the
+atoms along nonperiodic axes are also copied to the host.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _binned(x, cell: Cell, low, span, bins: _Whole):
 def _searched(
     x, places, cell: Cell, start, r2_list, bins: _Whole, reach: _Whole, room: int, slots: int, blocks: int
 ):
-    """Return the neighbors of sorted atoms, and the largest count; above `slots`, neighbors are missing."""
+    """Return neighbors of sorted atoms, and their largest number; above `slots`, neighbors are missing."""
     atoms = x.shape[1]
     matrix = cell.matrix
     # layer after layer along the third axis, as the host goes

@@ -7,7 +7,7 @@ this integer.
 
 A pair force is computed in float64 from the exact integer distance, by operations that round equally with
 every compiler. The force is then rounded to its unit. The forces on both atoms are exactly opposite, so that
-momentum is conserved to the last bit. Forces do not depend on atom labels or on the neighbor list.
+the total momentum is exactly constant. Forces do not depend on atom labels or on the neighbor list.
 """
 
 from __future__ import annotations
@@ -165,9 +165,9 @@ def _depth(model: CutPotential) -> float:
 class FixedPointDecider(PairDecider):
     """Decision whether a pair is inside the cutoff, by comparison of two integers.
 
-    The squared distance is an integer in units of the squared spacing. Every comparison is converted to the
-    form `r2 < limit` with an integer limit. For margins, the threshold is half a unit below the integer
-    limit. Margins are therefore never zero and have no rounding error.
+    The squared distance is an integer in units of the squared position spacing. Every comparison is converted
+    to the form `r2 < limit` with an integer limit. For margins, the threshold is half a unit below the
+    integer limit. Margins are therefore never zero and have no rounding error.
     """
 
     spacing: float = 1.0  # of positions, length
@@ -179,7 +179,7 @@ class FixedPointDecider(PairDecider):
 
     @property
     def limits(self) -> tuple[int, ...]:
-        """Smallest squared distance outside the cutoff, in units of the squared spacing, by pair type."""
+        """Smallest r² outside the cutoff, in units of the squared position spacing, by pair type."""
         unit = Fraction(self.spacing) ** 2
         square = self.compare.startswith("r2")
         exact = [(Fraction(r * r) if square else Fraction(r) ** 2) / unit for r in self.r_cut]
@@ -200,7 +200,7 @@ class FixedPointDecider(PairDecider):
         return quantity < value
 
     def host_squares(self, dx, dy, dz) -> Int[np.ndarray, "..."]:
-        """Return squared distances as integers, in units of the squared spacing."""
+        """Return squared distances as integers, in units of the squared position spacing."""
         edge = float(2**REACH_BITS)
         parts = (np.round(np.asarray(c, np.float64) / self.spacing) for c in (dx, dy, dz))
         whole = [np.clip(c, -edge, edge).astype(np.int64) for c in parts]
@@ -268,7 +268,7 @@ class FixedPointStep(Integrator):
         return self.units.total(0.5 * (masses * squared_norm(v[0], v[1], v[2], self.zero)))
 
     def glide(self, x, p, masses, share: float, direction: int):
-        """Move atoms for a `share` of a step at constant momenta, backward in time if direction is -1."""
+        """Move atoms for a `share` of a time step at constant momenta; backward if direction is -1."""
         moved = jnp.round(p * (share * self.stride / masses))
         return x + direction * self.units.spacing * moved
 
@@ -287,7 +287,7 @@ class FixedPointVerlet(FixedPointStep):
 
 
 class FixedPointLangevin(FixedPointStep):
-    """BAOAB Langevin integrator in fixed-point numbers; the extra state stores the bits lost to friction."""
+    """Fixed-point Langevin integrator (BAOAB); the extra state stores the momentum bits lost to friction."""
 
     name = "langevin"
     keeps_momentum = False
@@ -378,7 +378,7 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
 
 
 def _period(kept: int) -> int:
-    """Return after how many steps an integer may overflow if it grows by a factor of 2^24/kept per step."""
+    """Return after how many steps an integer may overflow if each step multiplies it by 2^24 / `kept`."""
     if not 0 < kept < 2**_SHIFT:
         return 0
     growth = 2**_SHIFT / kept
@@ -431,11 +431,11 @@ class FixedPointJudge(SlotJudge):
         self.value = limits
 
     def start(self) -> jax.Array:
-        """Return the initial smallest |margin| of each atom, in units of the squared position spacing."""
+        """Return the start value for each atom's smallest |margin|, in squared position spacings."""
         return jnp.full(self.atoms, jnp.iinfo(jnp.int64).max, jnp.int64)
 
     def group(self, j, types):
-        """Return displacements, squared distances, decisions and limits of neighbors j, in grid units."""
+        """Return displacements, r², decisions and limits of neighbors j, in units of the position spacing."""
         d = displacements(self.components, self.cell, j)
         edge = float(2**REACH_BITS)
         # what is further away than any listed pair is outside; its square might not fit
@@ -450,7 +450,7 @@ class FixedPointJudge(SlotJudge):
         return d, r2, r2 < limit, limit
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return the decisions on a group of slots, one bit each, and the smallest |margin| of each atom."""
+        """Return decisions on some neighbor-list slots, one bit each, and each atom's smallest |margin|."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         left = threshold - quantity
         away = jnp.maximum(left, 1 - left)
@@ -478,7 +478,7 @@ class FixedPointForce(PairForce):
     def on(
         cls, units: FixedPointUnits, model: CutPotential, cell: Cell, decider, policy, reduction
     ) -> FixedPointForce:
-        """Make the force object in float64; `reduction` has no effect, since sums are exact."""
+        """Create the force object in float64; `reduction` has no effect, since sums are exact."""
         return cls(
             model.astype(np.float64),
             cell.astype(np.float64),

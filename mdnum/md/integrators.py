@@ -39,13 +39,13 @@ def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Arra
 
 
 class ByAtom(NamedTuple):
-    """Array in an extra state with one entry per atom along its last axis, sorted like the atoms."""
+    """Array in an integrator's extra state, with one entry per atom (last axis), sorted like the atoms."""
 
     value: Array
 
 
 def by_atom(change: Callable[[Array], Array], extra: Any) -> Any:
-    """Apply a function to all per-atom arrays of an extra state."""
+    """Apply a function to all per-atom arrays of an integrator's extra state."""
 
     def one(part: Any) -> Any:
         return ByAtom(change(part.value)) if isinstance(part, ByAtom) else part
@@ -65,7 +65,7 @@ _INSIDE = {
 
 
 def converted(field: Field[Any], value: Any, units: Units, *, back: bool = False) -> Any:
-    """Convert a number from the unit in a system file to the internal unit of a field, or back."""
+    """Convert a number from a system file's unit to the internal unit of an integrator field, or back."""
     if (unit := field.metadata.get("unit")) not in _INSIDE:
         return value
     *ways, factor = _INSIDE[unit]
@@ -98,7 +98,7 @@ class AtStep(NamedTuple):
 class Integrator(eqx.Module):
     """Base class of integrators, which update positions and velocities between force evaluations.
 
-    All fields except keyword-only fields are keys in a system file. Fields with units are declared by
+    All fields except keyword-only fields are keys in a system file. Fields that have a unit are declared by
     `quantity`. Values of static fields are not converted between units.
 
     Example:

@@ -121,7 +121,7 @@ class Tersoff(ManyBody):
         return self.R + self.D
 
     def taper(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the taper: 1 for r up to R - D, then a squared quarter sine, and exactly 0 beyond R + D."""
+        """Return the taper: 1 for r up to R - D, then a squared sine that falls to exactly 0 at R + D."""
         # (1 - sin(pi x / 2)) / 2 with x = (r - R) / D, in the form that does not cancel where it vanishes
         inward = jnp.clip((self.r_cut - r) / (2 * self.D), 0.0, 1.0)
         return jnp.sin(0.5 * np.pi * inward) ** 2

@@ -1,8 +1,8 @@
 """Differences of floats in ulps, and bounds on the rounding errors of pair distances.
 
 A displacement is x_j - x_i minus at most one lattice vector for each periodic axis, rounded after every
-subtraction. The squared components of the displacement are added in the order x, y, z. The error of each
-rounding is proportional to the magnitude of the rounded result. The class `Reach` bounds the magnitudes.
+subtraction. The squared components of the displacement are added in the order x, y, z. The error of a
+rounding is proportional to the magnitude of its result. The class `Reach` bounds the results' magnitudes.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Reach:
         return cls(tuple(_three(row) for row in lattice), _three(coordinate))
 
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
-        """Return the sum of |lattice components| over all rounded results, by axis, and the rounding count.
+        """Return, by axis, the sum of |lattice components| over all rounded results, and the rounding count.
 
         After the first subtraction, a component of the displacement is d + n_1 a_1 + n_2 a_2 + n_3 a_3, where
         d is its final value and each n is -1, 0 or 1. Each further subtraction of a lattice vector removes

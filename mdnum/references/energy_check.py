@@ -212,7 +212,7 @@ def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Eval
 
 
 def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:
-    """Select the results for a cluster's atoms from those for the whole system; add the cluster's pairs."""
+    """Select results for a cluster's atoms from those for the whole system; add the cluster's atom pairs."""
     edges = edges_of(cluster, r_cut)
     once = edges.i < edges.j
     pairs = edges.i[once], edges.j[once], edges.r[once]
@@ -287,7 +287,7 @@ class _Scales:
 
     @classmethod
     def of(cls, simulation: Simulation, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]) -> _Scales:
-        """Return the scales of a frame, from sums over pairs or, for many-body potentials, from totals."""
+        """Return the scales of energy, force and stress, from pairs or, for many-body potentials, totals."""
         unit, places = unit_roundoff(narrowest(simulation)), unit_roundoff(_places(simulation))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")

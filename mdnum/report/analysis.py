@@ -39,7 +39,7 @@ class Stays:
 
 
 def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
-    """Return the median residence time from the numbers of stays of 0, 1, 2, ... steps, or None."""
+    """Return the median residence time from a histogram of residence times (0, 1, 2, ... steps), or None."""
     total = int(counts.sum())
     if not total:
         return None
@@ -66,8 +66,8 @@ class PairCounts:
 class Scan:
     """Statistics of a table of flips that may be larger than memory, read block by block.
 
-    A scan keeps a row for each pair, counts by step and by residence time, the margin of every flip, and the
-    flips nearest to their threshold.
+    A scan of the table keeps a row for each pair of atoms, counts by step and by residence time, the margin
+    of every flip, and the flips nearest to their threshold.
 
     Args:
         steps: number of steps in the run's series; flips happen at the steps 0 to steps - 1.
@@ -126,7 +126,7 @@ class Scan:
 
     @property
     def alternates(self) -> bool:
-        """True if entries and exits alternate for every pair; False shows that a flip is missing."""
+        """True if each pair alternately enters and leaves the cutoff; False shows that a flip is missing."""
         self._follow()
         return self._alternates
 
@@ -140,8 +140,8 @@ class Scan:
     def stays(self) -> Stays:
         """Residence times of pairs inside and outside the cutoff.
 
-        Stays before the first flip and after the last flip of a pair are incomplete and not counted. Long
-        stays are therefore underrepresented in short runs.
+        Stays inside or outside the cutoff before the first or after the last flip of a pair are incomplete
+        and not counted. Long stays are therefore underrepresented in short runs.
         """
         self._follow()
         return Stays(inside=self._lengths[1], outside=self._lengths[0])
@@ -204,7 +204,7 @@ def scan(flips: Flips, steps: int | None = None, nearest: int = 0) -> Scan:
 def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
     """Return |margin| divided by its rounding bound for each flip; ambiguous flips have ratios up to 1.
 
-    If the bound is zero (an exact comparison), the ratio of any nonzero margin is infinite.
+    If the rounding bound is zero (an exact comparison), the ratio of any nonzero margin is infinite.
     """
     margin, bound = np.abs(flips["margin"]), flips["bound"]
     ratio = np.full(margin.shape, np.inf)
@@ -251,9 +251,9 @@ class Conservation:
     ) -> Conservation | None:
         """Compute fluctuation and drift of the conserved energy; None for few steps or atoms at rest.
 
-        The linear trend is removed before the fluctuation is computed, since the drift is reported
-        separately. The first half of the run is omitted, because a run that starts from a lattice turns half
-        of its kinetic energy into potential energy.
+        The linear trend of the energy is removed before the fluctuation is computed, since the drift is
+        reported separately. The first half of the run is omitted, because a run that starts from a lattice
+        turns half of its kinetic energy into potential energy.
 
         Args:
             conserved: the energy that should be constant. kinetic: the kinetic energy.

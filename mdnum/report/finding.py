@@ -221,7 +221,7 @@ class Verdict:
         return " ".join((self.headline, *self.evidence))
 
     def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a summary with the verdict and its findings; an empty one has the status "unfinished"."""
+        """Return a summary with verdict and findings; an empty `summary` has the status "unfinished"."""
         usual = {"status": "complete" if summary else "unfinished", "seconds": None}
         found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
         return headed(kind, {**usual, **summary, **found})
@@ -235,7 +235,7 @@ def conclude(
     best: Tone = "info",
     judged: bool = False,
 ) -> Verdict:
-    """Return a verdict with the tone of the most severe finding, which is also named in the headline.
+    """Return a verdict whose tone and headline follow from the most severe finding.
 
     Args:
         found: findings in the order in which they are to be read, regardless of severity.

@@ -160,7 +160,7 @@ def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.n
 
 @dataclass(frozen=True)
 class Region:
-    """Map of classes: an integer for each grid cell, and a word for each integer (such as "stable")."""
+    """Grid of classified cells: an integer for each cell, and a word for each integer (such as "stable")."""
 
     # x, y: centers of the cells, shapes (columns,) and (rows,)
     x: np.ndarray

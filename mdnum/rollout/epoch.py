@@ -118,7 +118,7 @@ class EpochState(NamedTuple):
 
 
 class StepInputs(NamedTuple):
-    """Inputs of a time step for its derivatives, in addition to positions, box and virial."""
+    """Inputs of a time step that its derivatives need, in addition to positions, box and virial."""
 
     v: Float[Array, "3 atoms"]  # velocities that lead there, as the step before left them
     extra: Any  # the extra state then
@@ -224,9 +224,9 @@ def over_rows(
 ) -> tuple[Any, Any]:
     """Scan like `jax.lax.scan` over the first `used` rows, in reverse order if `backward` is True.
 
-    Buffers have the size of the longest segment, so that one compiled function can be used for all segments.
-    A loop over the whole buffer would spend most of its time on empty rows. Outputs for unused rows of the
-    buffers are zero.
+    Buffers have the size of the longest segment of steps, so that one compiled function can be used for all
+    segments. A loop over the whole buffer would spend most of its time on empty rows. Outputs for unused rows
+    of the buffers are zero.
     """
     first = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
     _, out = jax.eval_shape(step, carry, first)

@@ -26,7 +26,7 @@ _META, _STORE = "mdnum meta", "mdnum store"
 def write(
     path: Path, state: Mapping[str, Any], store: Mapping[str, Any], beside: Mapping[str, list[str]]
 ) -> None:
-    """Write a checkpoint file, and list this file and new part files in the manifest.
+    """Write a checkpoint file, and list in the manifest this file and others written since the last one.
 
     Args:
         state: state of the run: arrays, and values that JSON can represent.
@@ -146,7 +146,7 @@ class FrameFile:
                 raise
 
     def mark(self) -> tuple[int, int, int]:
-        """Return the number of frames, the position of the offset table, and the size of the file."""
+        """Return the number of frames, the offset table's position, and the size of the trajectory file."""
         if not self.path.exists() or self.path.stat().st_size < _FRAMES_AT + _HEADER.size:
             return (0, 0, 0)
         with opened(self.path) as file:

@@ -1,7 +1,7 @@
 """Execution of tasks by a `concurrent.futures.Executor`, by default in processes on all cores.
 
-An engine (executor) only starts worker processes. The folder of a point shows whether the point was computed.
-A worker process that dies therefore loses only its current point.
+An engine (executor) only starts worker processes. The folder of a sweep point shows whether the point was
+computed. A worker process that dies therefore loses only the point that it was computing.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ class Plan:
 
     @property
     def origin(self) -> Setting:
-        """The setting with the system's own value of each choice."""
+        """The setting in which every choice has the value that the system file gives."""
         return self.setting(self.base)
 
     def setting(self, choices: Mapping[str, Any]) -> Setting:
@@ -181,7 +181,7 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
 
 
 def _of_seed(one: Planned, point: Point, settings: Mapping[str, Any]) -> Planned:
-    """Return a planned point that differs from the given one only in its seed."""
+    """Return a planned point that differs from the given one only in its random seed."""
     system = one.state["system"]
     dynamics = {**system["dynamics"], "seed": settings["dynamics.seed"]}
     state = {**one.state, "system": {**system, "dynamics": dynamics}}
@@ -220,7 +220,7 @@ def _axes(over: Any) -> list[Axis]:
 
 
 def _own_value(axis: Axis, own: Mapping[str, Any], loaded: Any, system: Any, overrides: Any) -> Any:
-    """Return the value of a choice in the system file or, if there is none, the first value of the sweep."""
+    """Return a choice's base value: that of the system file or, if there is none, the first in the sweep."""
     from mdnum.systems import BallSystem, load
     from mdnum.systems.parameters import names, number, resolve
 

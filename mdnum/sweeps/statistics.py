@@ -1,9 +1,9 @@
 """Means over random seeds, and differences between settings, each with its statistical error.
 
 The error of a run's mean is estimated from autocorrelation, and also from the scatter of means over random
-seeds. Errors from autocorrelation have many degrees of freedom, but are too small if a mode relaxes more
-slowly than the length of a run. Errors from autocorrelation are therefore multiplied by one factor, which is
-determined from the scatter of means over all seeds and settings.
+seeds. Errors from autocorrelation have many degrees of freedom, but are too small if a mode of the system
+relaxes in a longer time than the run. Errors from autocorrelation are therefore multiplied by one factor,
+which is determined from the scatter of means over all seeds and settings.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class SeedMean:
 def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K, SeedMean]:
     """Return the mean of one measure at each setting, over runs that differ only in their random seed.
 
-    The error estimated from the runs of a mean is multiplied by the ratio of the observed scatter between
+    The error of a mean, estimated from its runs, is multiplied by the ratio of the observed scatter between
     seeds to the scatter expected from such errors. One ratio is used for all settings of a measure; more
     settings make the ratio more precise. The scatter between the seeds of a single setting is used instead if
     it has more degrees of freedom.
@@ -199,7 +199,7 @@ def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Diff
 
 
 def effects(places: Float[np.ndarray, "points axes"], values: Float[np.ndarray, "points"]) -> list[Any]:
-    """Return the change of a measure between the ends of each axis (varied choice), from a linear fit.
+    """Return the change of a measure from the first to the last value of each varied choice, by a linear fit.
 
     Args:
         places: position of each point along each axis, from 0 to 1.

@@ -158,13 +158,13 @@ class System:
 
     @property
     def ignored(self) -> list[str]:
-        """Columns of the structure file that look like velocities (none if the file gives velocities)."""
+        """Columns of the structure file that look like velocities but are not read as velocities."""
         structure = self.spec.structure
         return structures.ignored(structure, self.folder) if structure.velocities == "file" else []
 
     @property
     def r_cut(self) -> float:
-        """Longest interaction radius (length)."""
+        """Longest interaction radius, in length units."""
         return pairs.longest_radius(self.spec, self.species, self.folder)
 
     @property

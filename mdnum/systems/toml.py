@@ -71,7 +71,7 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
 def scalar(text: str) -> Any:
     """Parse a command-line value as TOML; text that is not valid TOML is used as a string.
 
-    `switched` and `"switched"` are equivalent; `0.5` is a number, `true` a Boolean, `[2, 2, 2]` an array.
+    As values, `switched` and `"switched"` are equal; `0.5` is a number, `true` a Boolean, `[2, 2]` an array.
     """
     try:
         parsed = tomllib.loads(f"value = {text}")

@@ -31,7 +31,7 @@ def pair_keys(i: np.ndarray, j: np.ndarray, shifts: np.ndarray, atoms: int) -> I
 
 
 def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """Return a matrix whose rows are the lattice vectors (unit normals if nonperiodic), and its inverse."""
+    """Return a matrix of lattice vectors as rows (unit normals along nonperiodic axes), and its inverse."""
     from ase.geometry import complete_cell
 
     matrix = complete_cell(np.where(frame.box.pbc[:, None], frame.box.matrix, 0.0))

@@ -143,7 +143,7 @@ def _first_lines(file: Path) -> tuple[str, str]:
 
 
 def split_path(text: str) -> tuple[Path, str]:
-    """Return (path, slice after the last @); if a file is named like the whole text, the slice is empty."""
+    """Return (path, slice after the last @); if the whole text is the name of a file, the slice is empty."""
     whole = Path(text).expanduser()
     name, at, words = text.rpartition("@")
     if not at or whole.exists():

@@ -105,7 +105,7 @@ class ResidueTracker:
     """Tracker of contacts between residues, with the same interface as `Tracker` for pairs of atoms.
 
     Pairs of atoms within one residue are ignored. `near` counts atom pairs whose distance equals the cutoff
-    within error: at least one for each such residue pair. The attribute `min_margin` is always inf.
+    within rounding error, at least one for each pair of residues. The attribute `min_margin` is always inf.
 
     Args:
         rule: membership rule for atoms.

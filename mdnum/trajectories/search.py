@@ -1,6 +1,6 @@
 """Searches for pairs within a distance and for nearest neighbors in a frame; comparison of two frames.
 
-Distances in a search contain the rounding error of wrapped coordinates. A pair in a guard band around its
+Distances in a search contain the rounding error of wrapped coordinates. A pair of atoms close to its
 threshold is decided from the stored coordinates (`lattice.square_of`), so all search algorithms agree.
 """
 
@@ -44,7 +44,7 @@ _MOST_IMAGES_EACH, _MOST_REPEATED = 100, 2_000_000
 
 
 class Found(NamedTuple):
-    """Pairs found by a search, one entry per pair and image, in no particular order."""
+    """Pairs of atoms found by a search, one entry per pair and image, in no particular order."""
 
     kind: int  # `INSIDE` or `DIRECTED`
     i: Int[np.ndarray, "pairs"]  # the center of a directed one, else either
@@ -117,9 +117,9 @@ def search(
 
 @njit(inline="always")
 def exact_square(x, home, i, j, n0, n1, n2, vectors):
-    """Return the squared distance by which a pair is decided; n is the image shift of j after wrapping.
+    """Return the squared distance that decides on a pair of atoms; n is the image shift of j after wrapping.
 
-    The result is bitwise the same if the two atoms are exchanged: only signs of rounded numbers change.
+    The squared distance is bitwise the same if atoms are exchanged: only signs of rounded numbers change.
     """
     s0, s1, s2 = n0 + home[i, 0] - home[j, 0], n1 + home[i, 1] - home[j, 1], n2 + home[i, 2] - home[j, 2]
     return square_of(x, i, j, s0, s1, s2, vectors)
@@ -127,7 +127,7 @@ def exact_square(x, home, i, j, n0, n1, n2, vectors):
 
 @njit
 def _settle(x, atoms, kind, square, radius, bound, found):
-    """Decide the remaining pairs from stored coordinates; return the smallest |margin|.
+    """Decide pairs of atoms near their thresholds from stored coordinates; return the smallest |margin|.
 
     In a directed search, the squared distances in `found.value` are recomputed from stored coordinates.
     """
@@ -168,7 +168,7 @@ def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float)
 
 
 def _check_count(pairs: float, radius: float) -> None:
-    """Raise an error if the pairs do not fit into memory."""
+    """Raise an error if the pairs of atoms do not fit into memory."""
     memory = _memory()
     if pairs > min(MOST_PAIRS, memory / _BYTES):
         raise InputError(
@@ -253,7 +253,7 @@ def nearest(
 def _choose(
     rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
 ):  # fmt: skip
-    """Keep nearest neighbors; return (number kept, number uncertain, smallest |margin|, rows too short)."""
+    """Keep nearest neighbors; return numbers kept and uncertain, smallest |margin|, and incomplete rows."""
     written, close, smallest, short = 0, 0, np.inf, 0
     for i in range(rows.first.shape[0]):
         if not centers[i]:
@@ -324,7 +324,7 @@ def _guess(placed: Placed, who: Participants, most: int, everything: float) -> f
 
 
 class Changed(NamedTuple):
-    """Pairs whose decision differs between two frames, unsorted, as indices of the participating atoms."""
+    """Unsorted pairs of atoms for which decisions differ between two frames, as indices of the atoms."""
 
     i: Int[np.ndarray, "flips"]
     j: Int[np.ndarray, "flips"]
@@ -338,7 +338,7 @@ class Changed(NamedTuple):
 
 
 def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
-    """Return all pairs whose decision differs between two frames; `room` is the initial buffer size."""
+    """Return atom pairs whose decision differs between two frames; `room` is the initial buffer size."""
     while True:
         made = Changed.room(room)
         total = _compared(before, now, made)
@@ -349,7 +349,7 @@ def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
 
 @njit
 def _compared(old, new, made):
-    """Write pairs whose decision differs, as many as the buffer holds; return the number of all of them."""
+    """Write pairs of atoms whose decision differs, as many as the buffer holds; return their total number."""
     atoms = old.first.shape[0]
     seen = np.zeros((atoms, 2), np.int32)
     total, room = 0, made.i.shape[0]
@@ -381,7 +381,7 @@ def image_distances(
 ) -> Float[np.ndarray, "pairs"]:
     """Return the distance from i to an image of j; `rank` is the number of nearer images of j.
 
-    If there is no such image, the distance is inf. In a directed rule, opposite images are two neighbors.
+    If there is no such image of j, the distance is inf. A directed rule counts opposite images separately.
     """
     out = np.empty(len(i))
     rank = np.where(i == j, rank // 2, rank) if directed else rank
@@ -405,7 +405,7 @@ def _image_distances(x, lattice, i, j, rank, out):
 
 
 def ranks(i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-    """Return the numbers 0, 1, 2, ... within each run of entries with equal (i, j)."""
+    """Return the numbers 0, 1, 2, ... within each sequence of entries with equal (i, j)."""
     new = np.ones(len(i), bool)
     new[1:] = (i[1:] != i[:-1]) | (j[1:] != j[:-1])
     at = np.flatnonzero(new)

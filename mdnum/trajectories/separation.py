@@ -1,4 +1,4 @@
-"""Comparison of two frames of the same atoms: distances and their growth, common shift, and velocities."""
+"""Comparison of two frames of the same atoms: displacements, their growth, common shift, and velocities."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Separation:
 def displacements(
     start: Frame, end: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | float = 0.0
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-    """Return displacements of atoms between two frames minus `shift`, and the lattice vectors removed."""
+    """Return atoms' displacements between two frames minus `shift`, and the lattice vectors subtracted."""
     x, y = (one.positions if atoms is None else one.positions[atoms] for one in (start, end))
     shared = np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool)
     return shortest(y - x - shift, Box(end.box.matrix, shared))

@@ -453,7 +453,7 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
 def _with_other_box(
     trajectory: Trajectory, frame: Any, found: Pass, of: Groups | ByResidue
 ) -> dict[str, Any] | None:
-    """Count the neighbor pairs of a frame in another plausible box; None if there is no other box."""
+    """Count the neighbor pairs of a frame in another plausible box; None if no other box is plausible."""
     from mdnum.trajectories.tracker import Tracker
 
     if (other := trajectory.other_box(frame.index)) is None:
@@ -524,10 +524,10 @@ def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
-    """Yield the flips of one neighbor rule in parts, sorted by pair: (part, number of parts, history).
+    """Yield the flips of one neighbor rule in blocks, sorted by atom pair: (block, number of blocks, flips).
 
-    The table of flips is ordered by frame and may be larger than memory. Each part contains all flips of some
-    of the pairs. The table is read once for each group of parts that fits into memory.
+    The table of flips is ordered by frame and may be larger than memory. Each block contains all flips of
+    some atom pairs. The table is read once for each group of blocks that fits into memory.
     """
     from mdnum.trajectories.history import History
 
@@ -535,7 +535,7 @@ def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, 
     parts = max(1, -(-sum(stream.flushed for stream in streams.values()) // _PART_ROWS))
 
     def columns(name: str, wanted: range, kinds: list[str]) -> Iterator[dict[str, np.ndarray]]:
-        """Yield the columns of a table, part by part."""
+        """Yield the columns of a table, block by block."""
         found: list[list[dict[str, np.ndarray]]] = [[] for _ in wanted]
         names, stream = ["rule", *kinds], streams[name]
         for batch in chain([stream.read(names, rows=0)], stream.batches(names)):
@@ -648,7 +648,7 @@ def _rule_told(
 def _counted(
     total: Statistics, motion: FrameMotion | None, flux: Mapping[str, Any] | None, reach: float | None
 ) -> dict[str, Any]:
-    """Return contact statistics as plain values, in frames; if `reach` is given, also estimate lost flips."""
+    """Return contact statistics as plain values, in frames; given `reach`, also estimate missed flips."""
     from mdnum.trajectories.lost import lost_flips
     from mdnum.trajectories.statistics import Lifetime
 

@@ -116,22 +116,22 @@ def _alike(a: Trajectory, b: Trajectory) -> bool:
 
 
 class ComparisonView(FlipsView):
-    """Read access to the folder of a comparison of two trajectories, and values for the page's sentences."""
+    """Results of a comparison of two trajectories, read from its folder and formatted for sentences."""
 
     @property
     def certain(self) -> bool:
-        """True if any difference between the trajectories exceeds the resolution of the files."""
+        """True if the trajectories differ by more than the resolution of the files."""
         certain = any(one["certain"] is not None for one in self.summary["rules"])
         return certain or any(self.summary[name] is not None for name in ("beyond", "other_box"))
 
     @property
     def differ(self) -> bool:
-        """True if neighbor sets differ, and a difference between the trajectories exceeds the resolution."""
+        """True if neighbor sets differ, and the trajectories differ by more than the files' resolution."""
         return self.certain and any(one["first"] is not None for one in self.summary["rules"])
 
     @property
     def largest(self) -> tuple[str, str]:
-        """Largest distance of an atom between trajectories, and the distance that rounding can explain."""
+        """Largest distance between an atom's two positions, and the distance that rounding can explain."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
@@ -149,7 +149,7 @@ class ComparisonView(FlipsView):
 
     @property
     def shift(self) -> dict[str, Any]:
-        """Common displacement of all atoms between trajectories: a vector, and the range of its length."""
+        """Displacement common to all atoms: a vector at one frame, and its range of lengths over frames."""
         table, at = self.table("apart"), self.summary["shift"]
         vectors = np.stack([table[f"shift_{one}"] for one in "xyz"], axis=1)
         sizes = np.sqrt((vectors**2).sum(axis=1))

@@ -89,7 +89,7 @@ def fork_certify(
 
 
 def _ranking(answer: Answer) -> list[dict[str, Any]]:
-    """Return the ranking of precisions; add tables of the ranking and of distances from the exact run."""
+    """Return the ranking of precisions; store tables of the ranking and of distances from the exact run."""
     ranking, rows, table = answer.result.ranking, [], []
     for row in ranking:
         decision, growth, separation = row.decision, row.growth, row.separation
@@ -111,7 +111,7 @@ def _ranking(answer: Answer) -> list[dict[str, Any]]:
 
 
 def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[str, Any]:
-    """Join several named data series into one table, with the columns name, step and separation."""
+    """Join named series of distances between runs into a table with the columns name, step and separation."""
     return {
         name: np.concatenate([np.full(len(line), key) for key, line in lines.items()]),
         "step": np.concatenate([first + np.arange(len(line)) for line in lines.values()]),
@@ -120,7 +120,7 @@ def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[s
 
 
 def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
-    """For each precision, count the decisions within rounding bounds, and evaluate them exactly."""
+    """For each precision, count decisions with margins below rounding bounds; evaluate them exactly."""
     from mdnum.forks.certified import certified_horizon
     from mdnum.numerics import PrecisionPolicy
 
@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """Yield sentences on how the precision of one role (such as forces) changes the number of exact steps."""
+    """Yield sentences on how one role's precision changes the number of steps with exact decisions."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip
@@ -229,7 +229,7 @@ def page_certify(view: View, verdict: Verdict) -> Page:
 
 
 def _drawn(table: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> tuple[Series, ...]:
-    """Return a data series for each selected line of a table that `_lines` made."""
+    """Return a plot series for each selected name in a table that `_lines` made."""
     names = next(iter(table.values()))
     steps = np.unique(table["step"])
     lines = {label: np.full(len(steps), np.nan) for label in labels.values()}
@@ -266,7 +266,7 @@ def fork_processes(
     which: Sequence[Variant] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system in several ways (jit, eager, batched, in a gradient, XLA flags); compare the results.
+    """Run a system in several ways (jit, eager, batched, differentiated, XLA flags); compare the results.
 
     Example:
         >>> mdnum.fork_processes("argon/crystal-108", steps=100)

@@ -331,7 +331,7 @@ def _with_unit(text: str, unit: str) -> str:
 def fork_forecast(
     system: Simulation | System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Predict, from one tangent run, which decisions change first if the start is randomly displaced.
+    """Predict, from one tangent run, which decisions change first if initial positions change randomly.
 
     Example:
         >>> mdnum.fork_forecast("argon/liquid-864", 1e-9)
@@ -379,7 +379,7 @@ def fork_forecast(
 
 
 def judge_forecast(view: View) -> Verdict:
-    """Return the verdict on a forecast: the first decisions expected to change, and the range of validity."""
+    """Return the verdict on a forecast: decisions expected to change first, and last step of its validity."""
     s, unit = view.summary, view.units.length
     first, nearest, until, ends = s["first"], s["nearest"], s["until"], s["ends"]
     values = {**s, "unit": unit, "after": until + 1}

@@ -10,7 +10,7 @@ from mdnum.verbs.frame import finish
 
 
 def report(folder: Path) -> Reply:
-    """Judge the results in an output folder again, and write its report page."""
+    """Give the verdict on the results in an output folder again, and write the report page of the folder."""
     outcome = finish(folder)
     written = outcome.folder / "report.html"
     kept = {name: outcome.summary[name] for name in HEAD} | {"of": outcome.kind}

@@ -37,7 +37,7 @@ def _unit(view: View, name: str) -> str:
 
 
 def _moved(view: View) -> dict[str, list[str]]:
-    """Return, for each choice, the names of the physical measures that the choice changes significantly."""
+    """Return, for each varied choice, the names of the physical measures that it changes significantly."""
     found: dict[str, list[str]] = {axis["key"]: [] for axis in view.summary["axes"]}
     physical = {one["name"] for one in view.summary["measures"] if one["physical"]}
     for row in view.summary["differences"]:
@@ -48,7 +48,7 @@ def _moved(view: View) -> dict[str, list[str]]:
 
 
 def judge(view: View) -> Verdict:
-    """Return the verdict on a sweep: choices that change results, and recommended values."""
+    """Return the verdict on a sweep: varied choices that change results, and recommended values."""
     s = view.summary
     moved = _moved(view)
     said = [TEXTS("moves", key=key, measures=listed(names)) for key, names in moved.items() if names]
@@ -107,7 +107,7 @@ def _findings(view: View, moved: Mapping[str, list[str]]) -> Iterator[Finding]:
 
 
 def _advised(view: View, advice: Mapping[str, Any]) -> str:
-    """Return a sentence on the recommended value of one choice."""
+    """Return a sentence on the recommended value of one varied choice."""
     key, end, best = advice["choice"], label(advice["end"]), label(advice["best"])
     if key in FREE:
         return "" if advice["best"] is None else TEXTS("use_fastest", key=key, best=best)
@@ -122,7 +122,7 @@ def _advised(view: View, advice: Mapping[str, Any]) -> str:
 
 
 def _further_seeds(view: View, factor: float) -> int:
-    """Return the number of random seeds to add so that the total grows by the given factor."""
+    """Return the number of random seeds to add so that the number of all seeds grows by the given factor."""
     return int(np.ceil(len(view.summary["seeds"]) * (factor - 1)))
 
 
@@ -179,7 +179,7 @@ def _sections(view: View) -> Iterator[Section]:
 def _most(
     rows: Sequence[Any], columns: Mapping[str, str], stored: str, bad: Callable[[Any], Any] | None = None
 ) -> list[Any]:
-    """Return a table of the first rows, preceded by a note on the file with all rows if there are more."""
+    """Return a table of the first rows; if there are more rows, a note before the table names their file."""
     more = [TEXTS("more_rows", shown=_ROWS, all=len(rows), stored=stored)] if len(rows) > _ROWS else []
     return [*more, table_of(rows[:_ROWS], columns, bad=bad)]
 
@@ -238,7 +238,7 @@ def _settings(view: View) -> list[Any]:
 
 
 def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
-    """Yield figures of each measure versus one choice's values; other choices have their base values."""
+    """Yield figures of each measure versus the values of one choice; other choices keep their base values."""
     s, values = view.summary, axis["values"]
     if not all(isinstance(one, int | float) for one in values):
         return

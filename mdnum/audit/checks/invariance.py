@@ -286,7 +286,7 @@ def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]
 
 
 def _in_turns(ways: Iterable[Same]) -> list[Same]:
-    """Order representations so that one of each kind is tested before a second one of any kind is tested."""
+    """Order representations so that every kind is tested once before any kind is tested twice."""
     seen: dict[str, int] = {}
     turns = []
     for same in ways:
@@ -436,8 +436,8 @@ def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     """Yield a supercell of a dense four-atom cell, for comparison with the four-atom cell.
 
     In cells at least two cutoffs wide, no atom interacts with two images of another atom. The four-atom cell
-    has one species, or two in equal numbers. Structures with more than two species are not tested, since the
-    result would be ambiguous.
+    contains one species, or equal numbers of atoms of two species. Structures with more than two species are
+    not tested, since the result would be ambiguous.
     """
     species = list(dict.fromkeys(atoms.symbols))
     nearest = nearest_distance(atoms)

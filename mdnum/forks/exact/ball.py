@@ -139,7 +139,7 @@ class _ExactBall:
         return _plus(ys, h, vs), _plus(vs, self.half, a)
 
     def step(self, index: int):
-        """Make one step; return heights, velocities, heights used in decisions, contacts and iterations."""
+        """Make a time step; return heights, velocities, heights used in decisions, contacts, iterations."""
         free, counts = self._free(index), [0] * len(self.y)
         if isinstance(self.contact_model, Penalty):
             heights = self._push(free)
@@ -217,7 +217,7 @@ class _ExactRule:
         self.tol = None if isinstance(rule, FixedCount) else _held(world, rule.tol)
 
     def measure(self, depths: Balls) -> Balls:
-        """Return the residual of the whole batch of balls, or the residual of each ball."""
+        """Return the solver's residual for the whole batch of balls, or for each ball."""
         if isinstance(self.rule, PerInstance):
             return depths
         if isinstance(self.rule, GlobalSum):
@@ -231,7 +231,7 @@ class _ExactRule:
         return [largest]
 
     def stops(self, residual: Decimal, first: Decimal, iteration: int) -> bool:
-        """Return True if the residual is below the threshold."""
+        """Return True if the solver's residual is below the threshold of the stopping rule."""
         if self.enter is not None and iteration == 0:
             return residual < self.enter
         if self.tol is None:
@@ -242,7 +242,7 @@ class _ExactRule:
 
 
 def _held(world: World, value: Any) -> Decimal:
-    """Return a threshold, rounded to the dtype in which decisions are made."""
+    """Return the threshold of a decision, rounded to the dtype in which decisions are made."""
     return exactly(float(np.asarray(value).astype(world.policy.dtype("decision"))))
 
 

@@ -399,11 +399,11 @@ class _Run:
     def _decide(
         self, x, centers: Float[np.ndarray, "atoms 3"], radius: float, thresholds: list
     ) -> tuple[Bool[np.ndarray, "all_pairs"], Int[np.ndarray, "all_pairs 3"], Float[np.ndarray, "all_pairs"]]:
-        """Make all decisions of a step with double-precision bounds, or with intervals if these do not
+        """Make all decisions of a step by double-precision bounds, or by intervals if the bounds do not
         suffice.
 
-        Double precision and exact arithmetic may choose different nearest images. Both images are then
-        outside the cutoff, because half the box exceeds r_cut by more than the rounding errors.
+        Double precision and exact arithmetic may choose different nearest images. Different nearest images
+        are both outside the cutoff, because half the box exceeds r_cut by more than the rounding errors.
         """
         program = self.program
         i, j, matrix = program._i, program._j, program._matrix

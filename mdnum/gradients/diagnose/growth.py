@@ -2,8 +2,8 @@
 
 The cotangent of the state h steps before the end is the gradient of a run of h steps (horizon h) from this
 state. One reverse pass over T steps therefore gives gradients for all horizons up to T. Each gradient belongs
-to a different start on the same trajectory. Cotangents of a chaotic run span many powers of two. A loss scale
-helps if all cotangents are small, but not if their range exceeds that of the narrow format.
+to a different start on the same trajectory. Cotangents of a chaotic run span many powers of two. Scaling the
+loss helps if all cotangents are small, but not if their range exceeds that of the narrow format.
 
 The largest singular value of a run's Jacobian bounds the gradient of any loss of the last state. Singular
 values are computed by subspace iteration with a random block of vectors (Halko, Martinsson and Tropp 2011).
@@ -219,7 +219,7 @@ class ScalingWatch:
             table["largest"][step] = np.inf
 
     def result(self) -> Scaling:
-        """Count cotangents that overflow or underflow, for the unscaled loss and for its best scale."""
+        """Count cotangents that overflow or underflow, for the unscaled and for the best-scaled loss."""
         form = self.format
         largest = float(self.table["largest"].max())
         there = self.exponents.sum(axis=1, dtype=np.int64)

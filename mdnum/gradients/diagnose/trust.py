@@ -1,11 +1,11 @@
 """The largest number of steps (horizon) for which a gradient can be trusted, and what limits this number.
 
 A gradient ceases to be trusted in five cases. (1) Another precision gives a different gradient, because
-rounding errors have grown. (2) Half the time step gives a different gradient. (3) A pair turned around so
-close to its cutoff that another time step could add or remove a flip with a relevant contribution. (4) A
-decision was so close to its threshold that rounding determined the decision. (5) Gradients from other starts
-of the same system scatter by more than their mean. If one of the five cases was not examined, the verdict on
-a gradient is undecided.
+rounding errors have grown. (2) Half the time step gives a different gradient. (3) A pair of atoms turned
+around so close to its cutoff that another time step could add or remove a flip that changes the gradient. (4)
+A decision was so close to its threshold that rounding determined the decision. (5) Gradients from other
+initial states of the same system scatter by more than their mean. If one of the five cases was not examined,
+the verdict on a gradient is undecided.
 
 A single run, with its tangents (derivatives in forward mode), gives the gradients for all horizons.
 """
@@ -249,8 +249,8 @@ def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[
     """Return a simulation that rounds differently, and the formats in use that are narrower than float64.
 
     If the given run uses formats narrower than float64, the run for comparison is in float64. No hardware
-    format is wider than float64. A float64 run is therefore compared with a run whose start is shifted by one
-    rounding error. The shifted start shows how rounding affects the gradient, up to a factor of order one.
+    format is wider than float64. A float64 run is therefore compared with one whose initial state is shifted
+    by one rounding error. The shift shows how rounding affects the gradient, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -475,7 +475,7 @@ def _missed(
 
 
 def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
-    """Return contributions divided by derivatives, and the cumulative root sum of squares of these ratios."""
+    """Return contributions relative to the derivative, and their cumulative root sum of squares."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
         share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))
@@ -486,7 +486,7 @@ def _left_out(
     made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
     tolerance: float,
 ) -> Limit | None:  # fmt: skip
-    """Return a limit if grazing flips or jumps of the loss, which gradients omit, contribute too much."""
+    """Return a limit of trust if grazing flips or loss jumps, which gradients omit, contribute too much."""
     tape, met = made.tape, made.crossings[::-1]
     energy, virial, speed, weight, slow = (
         joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")

@@ -1,7 +1,7 @@
 """Test cases for neighbor lists: past failures by name, dense clusters, lattices, and random test cases.
 
-For the tests of a library: `@given(cases())` draws test cases with all kinds of boxes and positions. Their
-cutoffs are at and between neighbor shells. `boxes()` draws only (cell, pbc, description).
+For the tests of a library: `@given(cases())` draws test cases with all kinds of boxes and positions. Cutoffs
+of the test cases are at and between neighbor shells. `boxes()` draws only (cell, pbc, description).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _TURN = np.array([[2.0, -2.0, 1.0], [1.0, 2.0, 2.0], [2.0, 1.0, -2.0]]) / 3.0
 
 
 def catalog() -> Iterator[Case]:
-    """Yield every named test case with a single call, including those in questions.toml."""
+    """Yield every named test case with one call of the neighbor list, including those in questions.toml."""
     computed = {"boxes": _boxes(), "axes": _axes(), "outside": _outside(), "ties": _ties()}
     for area in ("few", "boxes", "axes", "images", "outside", "ties", "coincident"):
         yield from (once(name, area, *rest) for name, *rest in computed.get(area, ()))
@@ -120,7 +120,7 @@ def _outside() -> Named:
 
 
 def _across_walls() -> ndarray:
-    """Return pairs along x with a distance just below r_cut; one atom is just below a multiple of r_cut.
+    """Return pairs of atoms along x, just less than r_cut apart; one atom is just below a multiple of r_cut.
 
     If rounding to float32 assigns an atom to the next cell, its partner is two cells away.
     """
@@ -178,7 +178,7 @@ def lattice(edge: int, seed: int = 0) -> Case:
     """Return atoms on a cubic integer lattice with vacancies, in random order and random periodic images.
 
     The neighbors of each atom are on the 26 sites around it. Neighbors are found from site indices modulo the
-    edge, without a search and without rounding.
+    edge length of the lattice, without a search and without rounding.
 
     Args:
         edge: number of sites along an edge.
@@ -283,7 +283,7 @@ def _edges(size: str, rng: np.random.Generator) -> ndarray:
 
 @st.composite
 def cases(draw: Any, most: int = 40) -> Case:
-    """Draw a random test case with a single call and at most `most` atoms."""
+    """Draw a random test case with at most `most` atoms and a single call of the neighbor list."""
     scale = draw(st.sampled_from((1.0, 1.0, 1.0, 2.5, 6.0, 0.1, 3.405)))
     cell, pbc, words = draw(boxes(scale))
     place = draw(st.sampled_from(PLACES))
@@ -299,7 +299,7 @@ def cases(draw: Any, most: int = 40) -> Case:
 
 
 def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
-    """Return the number of lattice vectors to search for pairs inside the cutoff."""
+    """Return how many lattice vectors must be searched for pairs of atoms inside the cutoff."""
     if not any(pbc):
         return 1
     width = widths(completed(cell, np.array(pbc)))
@@ -426,7 +426,7 @@ def drawn(count: int, seed: int) -> list[Case]:
 
 
 def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
-    """Yield (description, whether the pairs must stay the same, variant) for variants of a test case."""
+    """Yield (description, whether neighbor pairs must stay the same, variant) for variants of a test case."""
     yield "when it is asked anew", True, case
     if case.atoms > 1:
         yield "with its atoms in reverse order", True, case.only(np.arange(case.atoms)[::-1])

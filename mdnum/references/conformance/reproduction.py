@@ -34,7 +34,7 @@ def script(
     """Return a script that calls the neighbor list for a failing test case and checks it by brute force.
 
     The script requires only numpy and the neighbor list. The script prints the error and exits with status 1,
-    or with 0 if the list is correct. Exceptions raised by the neighbor list are not caught by the script.
+    or with 0 if the neighbor list is correct. The script does not catch the neighbor list's exceptions.
 
     Args:
         how: conventions of the neighbor list.
