@@ -416,7 +416,7 @@ def bits_of(segment: Segment, row: int) -> UInt8[np.ndarray, "words atoms"]:
 
 
 def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "pairs"]:
-    """Find all pairs inside the cutoff by a new search with the arithmetic of the run; return keys."""
+    """Find all pairs inside the cutoff by a new search with the run's arithmetic; return their keys."""
     decider = simulation.decider
     table = simulation.verlet_list(skin=0.0).build(np.asarray(wrapped, np.float64), simulation.cell)
     _, _, i, j = table.listed(simulation.channels)
