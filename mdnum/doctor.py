@@ -336,7 +336,7 @@ def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) 
 
 
 def pair_energy(r2: jax.Array) -> jax.Array:
-    """Return the Lennard-Jones energy of the listed pairs inside a hard cutoff, eV."""
+    """Return the Lennard-Jones energy (eV) of the listed pairs of atoms inside a hard cutoff."""
     inside = (r2 > 0) & (r2 < _R_CUT**2)
     inverse = (_SIGMA**2) / jnp.where(inside, r2, jnp.ones_like(r2))
     sixth = inverse * inverse * inverse

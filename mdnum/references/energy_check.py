@@ -266,7 +266,7 @@ def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
 
 
 def _over(difference: float, scale: float) -> float:
-    """Return a difference divided by its scale; 0 for a zero difference, even if the scale is 0."""
+    """Return a difference divided by the scale of its quantity; 0 for a zero difference, even at scale 0."""
     return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
 
 

@@ -23,7 +23,7 @@ _LEAST_ROWS, _BLOCKS = 40, 10
 
 @dataclass(frozen=True)
 class Stays:
-    """Residence times of pairs inside and outside the cutoff: numbers of steps between flips of a pair."""
+    """Residence times of pairs of atoms inside and outside the cutoff: numbers of steps between flips."""
 
     inside: Int[np.ndarray, "lengths"]  # from entering to leaving: how many stays last 0, 1, 2, ... steps
     outside: Int[np.ndarray, "lengths"]  # from leaving to entering again, likewise
@@ -148,13 +148,13 @@ class Scan:
 
     @property
     def pairs(self) -> int:
-        """Number of pairs that flipped at least once."""
+        """Number of pairs of atoms that flipped at least once."""
         self._follow()
         return len(self._key)
 
     @property
     def busiest(self) -> PairCounts:
-        """Pairs that flipped, in descending order of the number of flips."""
+        """Pairs of atoms that flipped, in descending order of the number of flips."""
         self._follow()
         order = np.argsort(-self._count, kind="stable")
         key = self._key[order]

@@ -42,7 +42,7 @@ class Pin:
 
 @dataclass(frozen=True)
 class Pins:
-    """Cutoff decisions that are imposed on selected pairs; the run makes all other decisions."""
+    """Cutoff decisions that are imposed on selected pairs of atoms; the run makes all other decisions."""
 
     pins: Sequence[Pin]
 
@@ -51,7 +51,7 @@ class Pins:
     ) -> tuple[UInt8[np.ndarray, "rows words atoms"], UInt8[np.ndarray, "rows words atoms"]]:
         """Return the decisions imposed at consecutive steps as packed bits, with a mask of imposed entries.
 
-        No decision can be imposed on a pair that is not in the neighbor list, because it is too distant.
+        No decision can be imposed on a pair of atoms that is too distant to be in the neighbor list.
 
         Args:
             table: the neighbor list.

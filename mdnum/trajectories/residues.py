@@ -220,7 +220,7 @@ def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[n
 
 @dataclass(frozen=True)
 class Occupancy(Columns):
-    """Fraction of the frames in which each pair was in contact, sorted by (i, j): a sparse contact matrix."""
+    """Fraction of the frames in which each residue pair was in contact, sorted by (i, j): a sparse matrix."""
 
     i: Int[np.ndarray, "pairs"]  # the pair
     j: Int[np.ndarray, "pairs"]

@@ -64,7 +64,7 @@ class NeighborRows(NamedTuple):
     square: Float[np.ndarray, "stored"]  # squared distances, where the rule is directed; else empty
 
     def pairs(self) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Return the arrays i and j of all pairs, row by row."""
+        """Return the arrays i and j of all pairs of atoms, row by row."""
         i = np.repeat(np.arange(len(self.first)), self.count)
         inside = np.arange(len(i)) - np.repeat(np.cumsum(self.count) - self.count, self.count)
         return i, self.other[self.first[i] + inside].astype(np.int64)
@@ -150,7 +150,7 @@ def _settle(x, atoms, kind, square, radius, bound, found):
 
 
 def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float) -> float:
-    """Estimate the number of pairs within `radius` from the density; 0 if the box is not fully periodic."""
+    """Estimate the number of atom pairs within `radius` from the density; 0 if an axis is not periodic."""
     if not lattice.periodic.all():
         return 0.0
     images = (4.0 / 3.0 * np.pi * radius**3) / lattice.volume

@@ -183,7 +183,7 @@ def _around(view: View) -> Iterator[Any]:
 
 
 def _atoms(view: View, figure: Canvas) -> None:
-    """Draw the atoms of A and B in two panels, with the pair in the plane and the cutoff as a circle."""
+    """Draw the atoms of runs A and B in two panels, with the pair in the plane and the cutoff as a circle."""
     d, table = view.summary["decision"], view.table("neighborhood")
     x, moved = (
         np.stack([table[k] for k in names], axis=1) for names in (("x", "y", "z"), ("dx", "dy", "dz"))
