@@ -315,7 +315,7 @@ class EnergyBalance:
 
     @property
     def elsewhere(self) -> Steps:
-        """Energy change at each step due to jumps other than those at pair thresholds, eV."""
+        """Energy change at each step due to jumps other than those at distance thresholds, eV."""
         return self.hidden.energies(self.rest)
 
     @property

@@ -128,7 +128,7 @@ class CalculatorSubject:
     """An ASE calculator and the structure for which it is audited.
 
     ASE returns its cached energy if no coordinate moved by more than 1e-15 Å. A smaller move can change a
-    coordinate near zero, so this class clears the cache if any bit differs. If no bit differs, cached
+    coordinate near zero, so this class clears the cache after any change. If the input did not change, cached
     energies and forces are used; the method `forget` forces another calculation. The calculator is attached
     to the atoms, as in a run, since some calculators require this. An evaluation raises a `CalculatorError`
     if the calculator raised an exception or returned nan. The structure is then saved.
@@ -189,7 +189,7 @@ class CalculatorSubject:
         return other
 
     def used(self) -> CalculatorSubject:
-        """Return a copy that does not clear the cache, to test whether a calculator detects changes."""
+        """Return a copy that does not clear the cache, to test whether a calculator detects new input."""
         other = self.fresh()
         other.forgets = other.renews = False
         return other
@@ -313,7 +313,7 @@ class CalculatorSubject:
         return asked
 
     def _nearly(self, atoms: Atoms) -> bool:
-        """Return whether ASE would treat a structure as unchanged although some of its bits differ."""
+        """Return whether ASE would treat a structure as unchanged although bits of its data differ."""
         check = getattr(self.calculator, "check_state", None)
         if not callable(check):
             return False

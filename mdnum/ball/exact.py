@@ -46,7 +46,7 @@ Parameters = Mapping[str, complex]
 
 
 class _Motion:
-    """Base class of a ball's exact motions: checks the start; computes height, velocity and derivatives.
+    """Base class of a ball's exact motions: checks initial values; computes height, velocity and derivatives.
 
     Complex-step derivatives have no cancellation (Squire & Trapp, SIAM Review 40 (1998) 110).
     """

@@ -1,4 +1,4 @@
-"""Compare two runs: find the step at which decisions first differ, the step of the split, and the verdict."""
+"""Compare two runs: find the steps at which decisions first differ and at which the runs split."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ class FormattedList(VerletList):
     half: int = 0  # slots of one half; grows with what it must hold
 
     def build(self, positions, cell) -> PairTable:
-        """Build the pair table of the neighbor search, with the pairs in the order of the list format."""
+        """Build the table of atom pairs from the neighbor search, in the order of the jax-md list format."""
         table = super().build(positions, cell)
         atoms = len(table.order)
         labels = np.append(table.order, atoms)[table.index]
@@ -116,7 +116,7 @@ class ShuffledBuilder:
         return self.inner.name
 
     def build(self, positions, cell, r_list, slots):
-        """Build the pair table, with the neighbors of each atom shuffled and the padding at the end."""
+        """Build the table of atom pairs: shuffled neighbors of each atom, with padding at the end."""
         table, order, most = self.inner.build(positions, cell, r_list, slots)
         table, atoms = np.asarray(table), table.shape[1]
         keys = np.random.default_rng(self.seed).random(table.shape)

@@ -1,4 +1,4 @@
-"""All pair decisions of a run, stored for comparison with another run or to be imposed on another run."""
+"""Cutoff decisions on all pairs of atoms in a run, to be compared with or imposed on another run."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
 
 
 def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, told, values, matrix) -> Forces:
-    """Evaluate forces for other parameters and lattice vectors, but for the same nearest images."""
+    """Evaluate forces with other parameters and lattice vectors, keeping the nearest image of each pair."""
     other: Any = with_quantities(force, values)
     other = replace(other, cell=replace(force.cell, matrix=matrix))
     if isinstance(force, PairForce):

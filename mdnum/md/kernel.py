@@ -79,7 +79,7 @@ _Pair = Callable[..., Sequence[Any]]
 
 
 class Shortcut(NamedTuple):
-    """A faster version of a pair function, used for vectors of pairs in which no pair is far (see `far`)."""
+    """A faster version of a pair function, used if all pairs of atoms in a vector are close (see `far`)."""
 
     # whether a pair is far, from the arguments of a function of a pair
     far: Callable[..., Any]

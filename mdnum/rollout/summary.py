@@ -406,7 +406,7 @@ class ListHealth:
     mismatches: int = 0
 
     def take(self, segment: Segment, missed: int) -> list[dict[str, np.ndarray]]:
-        """Add a group of time steps; return a table row for each neighbor list that was replaced.
+        """Add a group of time steps to the counts; return a table row for each neighbor list replaced.
 
         Args:
             segment: the engine's record.

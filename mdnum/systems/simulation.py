@@ -260,7 +260,7 @@ class Simulation:
         return {"terms": names[kind // self.pair_types]}
 
     def pair_of(self, i: int, j: int) -> dict[str, Any]:
-        """Return a table row with both atoms of a pair, and the term if terms have separate decisions."""
+        """Return a table row with both atoms of a pair, and the potential term if terms decide separately."""
         return {key: np.asarray(one).item() for key, one in self.first_atoms(i).items()} | {"j": int(j)}
 
     def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:

@@ -1,4 +1,4 @@
-"""Decisions on all near pairs of each frame, made in float32 for sixteen pairs at a time.
+"""Cutoff decisions on all nearby pairs of atoms in each frame, in float32 for sixteen pairs at a time.
 
 Atoms are sorted into clusters of sixteen by bisecting space. A tile consists of two clusters and the lattice
 vector between them. For each atom of the first cluster, the tile stores sixteen decisions as bits. At each
@@ -116,7 +116,7 @@ class Tiles:
     def examine(
         self, now: Placed, *, bound: float, horizon: float, pairs: int, record: bool = True
     ) -> tuple[Changed, int, float]:
-        """Decide all pairs at the frame to which the coordinates were last updated.
+        """Decide which pairs are inside the cutoff, for the frame of the last coordinate update.
 
         Args:
             bound: pairs whose distance deviates from their radius by at most this length are counted.

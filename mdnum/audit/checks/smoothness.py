@@ -157,7 +157,7 @@ def _rounded_up(value: float) -> float:
 
 
 def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield findings about pair thresholds, grouped by the lowest derivative of the energy that jumps."""
+    """Yield findings about distance thresholds, grouped by the lowest derivative of the energy that jumps."""
     for order, code in enumerate(("ENERGY_JUMP", "FORCE_JUMP", "CURVATURE_JUMP")):
         same = [one for one in _all(walks) if one.order == order]
         if not same:
@@ -186,7 +186,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
 
 
 def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield a finding if, at a pair threshold, the energy of many atoms is less smooth than that of two."""
+    """Yield a finding if the energy of many atoms is less smooth at a threshold than that of two."""
     if not around.lower:
         return
     worst = min(
