@@ -15,8 +15,8 @@ def on_first_use(
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` for a package that imports its names on first use.
 
-    The names are taken from the imports under `if TYPE_CHECKING` in the source of the package. These imports
-    must use full module names. Type checkers and the Python interpreter therefore use the same list of names.
+    The names are taken from the imports under `if TYPE_CHECKING` in the source of the package. Imports under
+    `if TYPE_CHECKING` must use full module names. Type checkers and Python therefore use the same names.
 
     Args:
         package: `__name__` of the package.

@@ -305,9 +305,9 @@ def _outliers(
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
     """Return three mismatches for each interval, which are small where the curve is smooth.
 
-    The first two are differences at the midpoint between predictions from left and right: of the energy and
-    of the force. The third is the energy change plus the work of the force. On a smooth curve, the third
-    falls with the fifth power of the spacing. It is the most sensitive to jumps of the energy alone.
+    The first two mismatches, of energy and of force, are differences at the midpoint between predictions from
+    left and right. The third mismatch, energy change plus work of the force, falls with the fifth power of
+    the spacing on a smooth curve. The third mismatch detects the smallest jumps of the energy alone.
     """
     values = curve.many(places)
     windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
@@ -405,7 +405,7 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """Locate a jump of the energy's third derivative, using the force's second derivative on both sides.
 
-    Several widths of the fit are tried. The one whose result changes least when it is halved is used.
+    Of several widths of the fit, the width whose halving changes the result least is used.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

@@ -247,7 +247,7 @@ def _seen(
     rounding: float,
     known: Sequence[float],
 ) -> tuple[float, float, float, float] | None:
-    """Return the range of examined distances, and median and maximum of the smallest detectable force steps.
+    """Return the range of examined distances, and median and maximum of the smallest detectable force jumps.
 
     Distances beyond the end of the interaction are omitted. Distances close to a known threshold are omitted
     too, because a second threshold would be hidden there.
@@ -272,7 +272,7 @@ def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThresh
 
 
 def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairThreshold]) -> bool:
-    """Return whether companion atoms of the pair cross another threshold at the given pair distance."""
+    """Return whether other atoms of the two particles cross another threshold at the given pair distance."""
     others = pair.others(threshold.radius)
     radii = [one.radius for one in thresholds if one is not threshold]
     return len(others) > 0 and any(np.abs(others - radius).min() < 1e-5 for radius in radii)
@@ -343,7 +343,7 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
     """Extrapolate a power law of the force to find the distance at which an interaction ends.
 
     If the last distance with a nonzero force agrees with the extrapolation within its error, this distance is
-    returned instead. It is more exact, unless rounding made the force zero.
+    returned instead. The last distance is more exact, unless rounding made the force zero.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])
     far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
@@ -363,7 +363,7 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
 def _beyond(
     subject: CalculatorSubject, pair: Pair, start: float, noise: Float[np.ndarray, "2"], calls: float
 ) -> Beyond | None:
-    """Search for a cutoff beyond the scanned distances, as long as the remaining energy is not negligible.
+    """Search for a cutoff beyond the scanned distances, until the rest of the pair energy is negligible.
 
     The result is None if no distance could be evaluated, because periodic images of the particles come too
     close or because the calculator fails.
@@ -446,7 +446,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 
 
 def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
-    """Energy change from the last point to infinity if the force follows a power law; may be infinite."""
+    """Return the energy change (maybe infinite) from the last point to infinity, for a power-law force."""
     first, last = abs(float(forces[0])), abs(float(forces[-1]))
     if not last or not first:
         return np.inf

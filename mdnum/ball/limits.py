@@ -37,11 +37,11 @@ def rounded(value: float, name: str) -> float:
 
 
 def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") -> dict[str, float]:
-    """For each role, return the smallest tolerance (m) that a solver can reach in the role's number format.
+    """Return the smallest tolerance (m) that a solver can reach in each floating-point format that it uses.
 
     Iterations no longer reduce a penetration once `gain` times the penetration rounds to zero. A tolerance
-    below the smallest number of a format rounds to zero. A usable tolerance is at least the largest returned
-    value.
+    below the smallest number of a format rounds to zero. A usable tolerance is at least the largest of the
+    returned tolerances.
 
     Args:
         precision: names of formats by role, as attributes.

@@ -124,21 +124,21 @@ class Relative(GlobalSum):
 
 
 class HysteresisStop(eqx.Module):
-    """Stopping rule with hysteresis: a solve starts only above one threshold, and ends below a lower one."""
+    """Hysteresis: the solver starts only if the residual exceeds `enter`, and stops at a lower threshold."""
 
     rule: _ToleranceRule  # says what the residual is, and where a solver that has started stops
     enter: Any  # a residual below this starts no solve; at least the rule's tolerance
 
     @property
     def max_iter(self) -> int:
-        """Largest number of iterations of the inner stopping rule."""
+        """Largest permitted number of iterations, as set by the rule that stops the solver."""
         return self.rule.max_iter
 
     def measure(self, terms, accumulate, decision, zero):
         return self.rule.measure(terms, accumulate, decision, zero)  # type: ignore[attr-defined]
 
     def threshold(self, first, iteration):
-        """Return `enter` before the first iteration, and the threshold of the inner rule at later ones."""
+        """Return `enter` before the first iteration, and the threshold for stopping at later iterations."""
         enter = jnp.asarray(self.enter).astype(first.dtype)
         return jnp.where(iteration == 0, enter, self.rule.threshold(first, iteration))
 

@@ -128,7 +128,7 @@ def noise_size(simulation: Simulation) -> float:
 
 
 def starts(simulation: Simulation, count: int, seed: int, start: Start | None = None) -> list[Start]:
-    """Create the starts of an ensemble: the simulation's own start, with different noise for each run."""
+    """Create the initial states of an ensemble: that of the simulation, with different noise for each run."""
     programs = MdProgram(simulation, start).nudged(noise_size(simulation), count, seed)
     return [program.start for program in programs]
 

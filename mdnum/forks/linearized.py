@@ -7,10 +7,10 @@ Strelcyn 1980) and, unlike the distance between two runs, does not saturate.
 
 Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation. To first
 order, the decision flips at a = -m / (dm/da). At each step, a perturbation below the smallest flip amplitude
-flips no decision. This holds as long as the perturbed run remains close to the reference run and makes the
-same decisions. If the force jumps at the cutoff, the first flip changes the momenta of both atoms. The
-forecast ends at this flip, because the linearization no longer describes the perturbed run. If the force is
-continuous at the cutoff, a flip does not change the motion to first order.
+flips no decision. The prediction holds as long as the perturbed run remains close to the reference run and
+makes the same decisions. If the force jumps at the cutoff, the first flip changes the momenta of both atoms.
+The forecast ends at this flip, because the linearization no longer describes the perturbed run. If the force
+is continuous at the cutoff, a flip does not change the motion to first order.
 """
 
 from __future__ import annotations
@@ -244,8 +244,8 @@ class Lyapunov:
     def steps_to(self, start: float, end: float) -> float | None:
         """Return the step at which a displacement has grown from an initial length to a given length.
 
-        During the run, a displacement grows like the tangent. Later growth is extrapolated exponentially. The
-        method returns None for a run that is not chaotic if the displacement does not reach `end`.
+        During the run, a displacement grows like the tangent. Later growth is extrapolated exponentially. For
+        a run that is not chaotic, the result is None if the displacement does not reach `end`.
 
         Args:
             start: largest displacement of an atom at the start, length; for example one rounding unit.
@@ -366,7 +366,7 @@ class Forecast:
         return last
 
     def first(self, amplitude: float, count: int = 3) -> tuple[PredictedFlip, ...]:
-        """Predict the decisions that a perturbation flips first, by step, while the forecast is valid.
+        """Predict which decisions a perturbation flips first, by time step, while the forecast is valid.
 
         At most `KEPT` flips per step are listed; if `KEPT` flips are listed, the step may have more flips.
 

@@ -153,7 +153,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
     def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
         """Return, in this order, each neighbor slot's contributions to the cotangents of positions, forces,
-        scale and pair-type parameters. Also return each block's contributions to those of shared parameters.
+        box scale and pair-type parameters. Also return each block's contributions for shared parameters.
         """
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
@@ -220,7 +220,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
 
 def _differences(cell, own, other):
-    """Return differences of positions and vectors, products of weights, and the weights of second atoms."""
+    """Return differences of two atoms' positions and vectors, products of weights, and weights of atom 2."""
     d = [b - a for a, b in zip(own[:6], other[:6], strict=True)]
     products = (a * b for a, b in zip(own[6:], other[6:], strict=True))
     return [*cell.minimum_image(*d[:3]), *d[3:], *products, *other[6:]]
@@ -306,8 +306,8 @@ class AdjointCarry(NamedTuple):
 
     A trace is an `AdjointCarry` that contains the cotangents at every step, but not those of the first frame.
     Row k of a trace contains the cotangents of positions and half-kicked velocities at the beginning of step
-    first + k. Cutoff crossings that lead to this state do not contribute. Atoms in a trace are in the order
-    of the neighbor list. Unused rows at the end of a trace are undefined.
+    first + k. Row k excludes contributions of the cutoff crossings that lead to the state at step first + k.
+    Atoms in a trace are in the order of the neighbor list. Unused rows at the end of a trace are undefined.
     """
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
@@ -477,7 +477,7 @@ def transposed(
         return end.x, end.kicked, ahead, end.cell.matrix, end.v
 
     def look(row):
-        """Compute cotangents of a frame and of the first frame from those of the summed observations."""
+        """Convert cotangents of the summed observations to cotangents of a frame and of the first frame."""
 
         def seen_at(x, v, potential, virial, origin, timestep, *box):
             here = (in_box(around, *box) if box else around)._replace(timestep=timestep)

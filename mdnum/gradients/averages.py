@@ -38,7 +38,7 @@ WIDTHS = 5
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a run that a loss uses, with the loss, the energies and the derivatives of each frame."""
+    """Frames of a run that contribute to the loss, with the loss, energies and derivatives of each frame."""
 
     step: Int[np.ndarray, "frames"]  # of each
     x: Float[np.ndarray, "frames 3 atoms"]  # wrapped positions, user's order, length
@@ -211,7 +211,7 @@ def density(
     The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
     of the width. Extrapolation from three widths (w, w/2, w/4) removes the second and fourth powers. The
     result is the extrapolation from the widest kernels that agrees with those from all narrower kernels. Two
-    of them agree within twice the standard error of their difference.
+    extrapolations agree if they differ by at most twice the standard error of their difference.
 
     Args:
         weights: one per frame and pair type. reach: the largest width, length.
@@ -320,7 +320,7 @@ class Reweighting(Method):
     """Gradient method: differentiable trajectory reweighting, for averages over a canonical ensemble.
 
     The derivative is the explicit derivative of the loss (see `BoundaryTerm`) minus cov(loss, dU/dp) / kT,
-    where U is the energy and p the parameter. The second term describes how the weights of the frames change.
+    where U is the energy and p the parameter. The covariance describes how the weights of the frames change.
 
     Error: the error is statistical; `details` contains a standard error from block averages. The standard
     error is large for few independent frames, and it covers only fluctuations within one run. Source: Thaler

@@ -1,9 +1,9 @@
 """Contributions to a gradient from changes of the times at which pairs cross their cutoff (saltation).
 
 A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the perturbation then
-changes the pair's momentum after the crossing. The derivative of the time steps does not include changes of
-crossing times, however short the steps are. A saltation matrix (mdnum.numerics) at each crossing adds the
-effect of the crossing time. The potential energy and the virial also jump at a crossing. If a loss sums
+changes the pair's momentum after the crossing. The derivative at fixed decisions does not include changes of
+crossing times, however short the time steps are. A saltation matrix (mdnum.numerics) at each crossing adds
+the effect of the crossing time. The potential energy and the virial also jump at a crossing. If a loss sums
 energies or virials over equally spaced frames, a later crossing shifts the jump by a fraction of a frame.
 
 For a pair with radial force jump f (positive: repulsive) and radial speed s, a change dr of the distance
@@ -251,7 +251,7 @@ def _along(
     met: Met, vectors: Float[Array, "3 atoms"], matrix: Float[Array, "3 3"] | None = None
 ) -> Float[Array, "most"]:
     """Return, for each pair, the difference between both atoms' vectors, projected onto the pair's direction.
-    If `matrix` contains lattice vectors, the nearest image of the difference is used.
+    If `matrix` contains lattice vectors, the vector of the second atom is that of its nearest image.
     """
     dtype = vectors.dtype
     there = vectors.at[:, met.j].get(mode="fill", fill_value=0)
@@ -318,7 +318,7 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
     atoms = stretch.x.shape[2]
 
     def positions(rows: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return the positions of atoms at given rows (steps); row -1 is the step before the first row."""
+        """Return atom positions at the time steps in `rows`; row -1 is the step before the first row."""
         axes = [of + k * atoms for k in range(3)]
         seen = [x.take(3 * atoms * rows + at, mode="clip") for at in axes]
         return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)

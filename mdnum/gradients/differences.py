@@ -4,8 +4,8 @@ A replica is the same system with different initial velocities and, with a therm
 Replicas have different neighbor lists and are therefore run one after another on each device.
 
 If a parameter changes, pairs cross the cutoff at other steps. If the force jumps at the cutoff, the loss then
-jumps as a function of the parameter. Between two jumps, the slope of the loss is the derivative of the time
-steps. The event-aware gradient is the slope of the loss across many jumps. Finite differences that are
+jumps as a function of the parameter. Between two jumps, the slope of the loss is the derivative at fixed
+decisions. The event-aware gradient is the slope of the loss across many jumps. Finite differences that are
 compared with this gradient must span many jumps.
 """
 
@@ -65,8 +65,8 @@ class Differentiated(NamedTuple):
 def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
     """Differentiate f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
-    Steps decrease by factors of 1.4. The extrapolation with the smallest estimated error, which is returned,
-    balances the truncation error of large steps against the noise of small steps.
+    The finite-difference step decreases by factors of 1.4. The extrapolation with the smallest estimated
+    error, which is returned, balances the truncation error of large steps against the noise of small steps.
 
     Args:
         f: function of one number. x: point. step: the largest step. levels: number of steps.
@@ -176,7 +176,7 @@ def nonzero(problem: Problem, name: str) -> float:
 class FiniteDifferences(Method):
     """Gradient method: central differences of the loss at shifted parameters, extrapolated to zero shift.
 
-    The details of the gradient contain errors, steps and the noise of the loss.
+    The details of the gradient contain errors, finite-difference steps and the noise of the loss.
     """
 
     # the largest step as a share of the parameter; None for one that the noise of the loss and its third
@@ -436,7 +436,7 @@ class SmoothedDifferences(Method):
 
     The two runs of a difference use the same random numbers. Differences with steps h and h/2 are
     extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with those from
-    all narrower steps within twice the standard error. Narrower steps have more noise from single flips.
+    all narrower steps within twice the standard error. Single flips add more noise if steps are narrower.
     """
 
     relative: float = 0.002  # the widest step as a share of the parameter
@@ -507,7 +507,7 @@ def _share(high, low) -> float | None:
 
 
 def _chosen(found: Float[np.ndarray, "steps replicas"]) -> tuple[Estimate, float, int]:
-    """Choose one extrapolated difference; return the derivative, its error and the index of its step."""
+    """Choose one extrapolated difference; return the derivative, its error and the index of its step size."""
     if len(found) == 1:
         only = Estimate.from_replicas(found[0])
         return only, float(only.error), 0

@@ -75,7 +75,7 @@ def passed(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> ReversePass:
-    """Run a problem and its reverse pass; callbacks receive the cotangents of each stretch of steps.
+    """Make the run of a problem and its reverse pass; callbacks receive the cotangents of groups of steps.
 
     Args:
         names: full names of the parameters. saltation: whether to include the contribution of flips.
@@ -111,7 +111,7 @@ def passed(
 
 
 def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progress | None = None) -> RunTape:
-    """Run a problem and return the recorded run."""
+    """Make the run that a problem describes, and return the recorded run."""
     return RunTape(
         problem.simulation, problem.loss, problem.steps, flips=flips, budget=budget,
         progress=in_phase(progress, "run"),
@@ -120,7 +120,7 @@ def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progres
 
 @dataclass(frozen=True)
 class Symmetric(Method):
-    """Gradient method: derivative of the time steps at fixed decisions, from one low-memory reverse pass."""
+    """Gradient method: derivative of the loss at fixed decisions, from one low-memory reverse pass."""
 
     # bytes of the recorded run that are kept in memory; what does not fit is run again, stretch by stretch,
     # with the same bits
@@ -147,7 +147,7 @@ class Symmetric(Method):
 
 @dataclass(frozen=True)
 class EventAware(Method):
-    """Gradient method: derivative of the time steps, plus contributions from changes of all flip times."""
+    """Gradient method: derivative at fixed decisions, plus contributions from changes of all flip times."""
 
     # radial speed below which a crossing grazes and is left out, as a share of the rms radial speed of a
     # pair. Left in, single crossings would dominate: their terms go with one over that speed
@@ -182,7 +182,7 @@ class EventAware(Method):
 
 @dataclass(frozen=True)
 class Forward(Method):
-    """Gradient method: derivative of the time steps at fixed decisions, in forward mode (tangents)."""
+    """Gradient method: derivative of the loss at fixed decisions, in forward mode (tangents)."""
 
     # whether every flip adds what moving its time does, as the method event-aware has it
     saltation: bool = False
@@ -231,7 +231,7 @@ class Forward(Method):
 
 @dataclass(frozen=True)
 class Reversible(Method):
-    """Gradient method: derivative of the time steps of a fixed-point run, which is reversed, not stored.
+    """Gradient method: derivative at fixed decisions; a fixed-point run is reversed in time, not stored.
 
     The forward pass stores only the last state. Rounding to integers is differentiated as the identity.
 
@@ -267,7 +267,7 @@ class Reversible(Method):
 
 @dataclass(frozen=True)
 class Surrogate(Method):
-    """Gradient method: gradient of a program with a switched cutoff, so that the force does not jump."""
+    """Gradient method: gradient for a switched version of the cutoff, so that the force does not jump."""
 
     cutoff: str = "quintic"  # of the twin; one with an onset
     onset: float = ONSET_FRACTION  # where its switching begins, as a share of the cutoff
@@ -298,7 +298,7 @@ class Surrogate(Method):
 
 
 def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
-    """Return the numbers of all and of grazing crossings, and the crossings with the largest weights."""
+    """Return the numbers of all crossings and of grazing ones, and the crossings with the largest weights."""
     speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
     flips = {name: joined(crossings, name, ledger=True) for name in ("step", "i", "j", "entered")}
     key, heavy = -np.abs(weight), np.arange(len(weight))

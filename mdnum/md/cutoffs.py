@@ -161,7 +161,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
 
 
 def _ends(made: Cutoff, power: int) -> bool:
-    """Check a cutoff of u = r^(-2 power); return True if the derivative above the smoothness jumps."""
+    """Check a cutoff of u = r^(-2 power); return True if the derivative of order smoothness + 1 jumps."""
     import jax
     import jax.numpy as jnp
 

@@ -88,7 +88,7 @@ class PairTable:
     ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
         """Return the atoms i < j of all pairs whose decision is true, each pair once, in table order.
 
-        For channel number c (counted from 0), c times the number of atoms is added to i.
+        For cutoff number c (counted from 0), c times the number of atoms is added to the atom index i.
         """
         slots, columns = set_bits(bits)
         channel, slots = np.divmod(slots, self.slots)
@@ -97,7 +97,7 @@ class PairTable:
         return (i + channel * len(self.order))[keep], j[keep]
 
     def listed(self, channels: int = 1) -> tuple[Int[np.ndarray, "pairs"], ...]:
-        """Return, for every pair in every channel, both sorted indices, and i and j as `decided` does."""
+        """Return, for each pair and cutoff, the sorted indices of both atoms, and i and j as in `decided`."""
         slots, first = np.nonzero(self.index < len(self.order))
         second = self.index[slots, first]
         i, j = self.order[first], self.order[second]
@@ -127,7 +127,7 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Return the neighbor table, atom order and largest count; above `slots`, pairs are missing."""
+        """Return neighbor table, atom order and largest neighbor count; above `slots`, pairs are missing."""
         ...
 
 

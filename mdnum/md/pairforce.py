@@ -122,7 +122,7 @@ class PairForce(eqx.Module):
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
     def _near(self, pair: Callable[..., Any], tensor: bool) -> kernel.Shortcut | None:
-        """Return the pair function without minimum image, for close pairs; None if it would save no time."""
+        """Return a pair function without minimum image, for close atoms; None if it would save no time."""
         if not any(self.cell.pbc) or (self.cell.orthorhombic and not tensor):
             return None
 
@@ -262,7 +262,7 @@ class ChannelForce(PairForce):
 
     @property
     def parts(self) -> list[PairForce]:
-        """Pair forces of the channels, one for each cutoff radius."""
+        """Pair forces of the potential terms, with one object for each cutoff radius."""
         thresholds = self.thresholds.reshape(len(self.model.parts), -1)
         rest = self.cell, self.zero
         return [
@@ -271,7 +271,7 @@ class ChannelForce(PairForce):
         ]
 
     def split(self, bits: UInt8[Array, "words atoms"] | None) -> Sequence[Any]:
-        """Split concatenated decisions into the decisions of each channel."""
+        """Split concatenated decisions into one array for each cutoff radius."""
         parts = len(self.model.parts)
         return [None] * parts if bits is None else jnp.split(bits, parts)
 
@@ -378,8 +378,8 @@ def imposed(
 ) -> Bool[Array, "4 atoms"]:
     """Return the decisions on a group of slots: imposed decisions if given, otherwise computed (`inside`).
 
-    With a simple mask, distances are computed twice, and a step of 864 atoms takes 2.2 times as long as
-    usual. The step takes 1.3 times as long with a mask per slot (`unpacked`), and 1.2 times with this code.
+    With a simple mask, distances are computed twice, and a time step of 864 atoms takes 2.2 times as long. A
+    time step takes 1.3 times as long with a mask per slot (`unpacked`), and 1.2 times with this code.
 
     Args:
         where: slots in which decisions are imposed; None for all.
@@ -390,7 +390,7 @@ def imposed(
 
 
 class Guarded(eqx.Module):
-    """A potential with cutoff; `how` makes every operation rounded, or makes results reproducible."""
+    """A potential with cutoff; `how` rounds the result of every operation, or makes results reproducible."""
 
     model: CutPotential
     zero: Int[Array, ""]

@@ -62,11 +62,11 @@ class Delay:
 
 @cache
 def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
-    """Return, for each stage of the sequential sign test, the number of run pairs and how many must agree.
+    """Return, for each stage of the sign test, the number of pairs of runs and how many of them must agree.
 
-    The allowed error probability is used up in proportion to the number of pairs (Lan and DeMets, Biometrika
-    70, 659, 1983). For fair coin tosses, the probability of a given result by some stage is at most the error
-    probability times the fraction of pairs used until then.
+    The allowed error probability is used up in proportion to the number of pairs of runs (Lan and DeMets,
+    Biometrika 70, 659, 1983). For fair coin tosses, the probability of a given result by some stage is at
+    most the error probability times the fraction of pairs of runs used until then.
 
     Args:
         pairs: largest number of pairs of runs.
@@ -109,12 +109,12 @@ class Count:
 
     @property
     def needed(self) -> tuple[int, int] | None:
-        """Current or next stage of the sign test, if any: number of run pairs, and how many must agree."""
+        """Current or next stage of the sign test, if any: number of pairs of runs; how many must agree."""
         return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
 
     @property
     def delayed(self) -> bool | None:
-        """Whether most run pairs split later without flips, or None if the sign test has no result yet."""
+        """Whether most pairs of runs split later without flips, or None if the sign test has no result."""
         need = dict(looks(self.most)).get(self.pairs)
         if need is None:
             return None
@@ -122,14 +122,14 @@ class Count:
 
     @property
     def majority(self) -> bool | None:
-        """Whether most run pairs split later without flips, or None if too few pairs were run to decide."""
+        """Whether most pairs of runs split later without flips, or None if more pairs of runs are needed."""
         if self.later > self.most / 2 or self.later == self.pairs >= _ALIKE:
             return True
         return False if self.not_later > self.most / 2 or self.not_later == self.pairs >= _ALIKE else None
 
     @property
     def wanted_for_majority(self) -> int:
-        """Run pairs still needed to decide the majority if all agree; 0 if decided or impossible."""
+        """Pairs of runs still needed to decide the majority if all agree; 0 if decided or impossible."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -137,7 +137,7 @@ class Count:
 
     @property
     def wanted(self) -> int:
-        """Number of pairs to run before the next stage of the test, or 0 if the test has ended."""
+        """Number of pairs of runs to simulate before the sign test's next stage; 0 if the test has ended."""
         if self.delayed is not None:
             return 0
         return next((end - self.pairs for end, _ in looks(self.most) if end > self.pairs), 0)
@@ -212,8 +212,8 @@ class Growth:
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
     """Return the growth rate of a quantity, its standard error, and whether growth is faster than linear.
 
-    The rate is the slope of the logarithm over the later rows, with a standard error from blocks of rows. The
-    result is NaN, NaN, False if there are too few rows, or if numbers are not finite.
+    The rate is the slope of the logarithm over the later data rows, with a standard error from blocks of
+    rows. The result is NaN, NaN, False if there are too few data rows, or if numbers are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
@@ -396,7 +396,7 @@ def _counted(
     gained: float,
     reasons: tuple[Reason, ...],
 ) -> ForkVerdict:
-    """Return the verdict on runs that split even with imposed decisions, from the count of delayed run pairs.
+    """Return the verdict on runs that split despite imposed decisions, from the count of delayed splits.
 
     Repeats with a displacement of another size can only withdraw a verdict and thus add no false verdicts.
     """

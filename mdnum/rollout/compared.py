@@ -1,4 +1,4 @@
-"""Comparison of two runs; their atom labels and axes may differ by a permutation, symmetry and shift."""
+"""Comparison of two runs whose atom labels and axes may differ (permutation, symmetry operation, shift)."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class ReferenceFrame:
 
 @dataclass(frozen=True)
 class CrossFlip:
-    """Pair of atoms whose cutoff decisions in two runs start or stop differing at a step."""
+    """Pair of atoms whose cutoff decision starts or stops differing between two runs at a time step."""
 
     step: int  # of the flip
     # i, j: the pair, labels of the first run, i < j
@@ -118,7 +118,7 @@ class CrossFlip:
 
 @dataclass(frozen=True)
 class PairFlips(Columns):
-    """Flips in one of two runs, as columns; pairs have the atom labels of the first run."""
+    """Flips in one of two runs, stored as columns; pairs are named by the atom labels of the first run."""
 
     step: Int[np.ndarray, "flips"]  # of the flip
     key: Int[np.ndarray, "flips"]  # i * atoms + j of the pair, i < j
@@ -329,7 +329,7 @@ def overridden(
     species: Int[np.ndarray, "atoms"],
     r_cut: Float[np.ndarray, "channels species species"],
 ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
-    """Return the number of pairs with different decisions, and the largest |r - r_cut| of these pairs.
+    """Return the number of atom pairs with different decisions, and the largest |r - r_cut| of these pairs.
 
     Args:
         cells: as for `separations`.

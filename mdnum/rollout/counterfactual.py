@@ -25,7 +25,7 @@ class Counterfactual:
     """A run with its own arithmetic, on which the cutoff decisions of another run (the leader) are imposed.
 
     The run's own decisions are also computed, and those that differ from the leader's are counted. The object
-    is called with each segment of the leader; `until` returns the simulated steps.
+    is called with each segment of the leader. The method `until` returns the simulated time steps.
 
     Args:
         simulation: the run whose arithmetic is used.
@@ -70,7 +70,7 @@ class Counterfactual:
         self._record: EpochRecord | None = None
 
     def __call__(self, segment: Segment) -> None:
-        """Simulate a segment of the leader with the leader's decisions imposed, and store the results."""
+        """Simulate the steps of a leader's segment with the leader's decisions, and store the results."""
         if self._over:
             return
         rows = self.follow(segment)
@@ -86,7 +86,7 @@ class Counterfactual:
         return taken(self._ahead, last)
 
     def follow(self, segment: Segment) -> Rows:
-        """Simulate a segment of the leader with the leader's decisions imposed, and return the results."""
+        """Simulate the steps of a leader's segment with the leader's decisions, and return the results."""
         parts: list[Rows] = []
         row = 0
         while row < segment.rows and not self.failed:

@@ -39,7 +39,7 @@ Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
 
 
 class BoundaryTable(TomlTable):
-    """Balls at rest whose depths below the floor sum to exactly stop.tol: one is large, the others tiny."""
+    """Balls at rest whose depths below the floor (one large, others tiny) sum to exactly the tolerance."""
 
     terms: int = Field(
         default=8, ge=1, le=1_000_000, description="how many small penetrations make up the missing ulp"
@@ -137,7 +137,7 @@ class PenaltyContact(_Contact):
 
 
 class ProjectionContact(_Contact):
-    """The solver iterates y <- y + alpha k max(0, -y) until the rule in [stop] holds, then y <- max(y, 0)."""
+    """The solver iterates y <- y + alpha k max(0, -y) until the stopping rule holds, then y <- max(y, 0)."""
 
     kind: Literal["projection"]
     k: Positive = Field(description="gain (no unit)")

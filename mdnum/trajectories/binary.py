@@ -189,8 +189,8 @@ class XtcFile(XdrFile):
 def _walk(stream, atoms, whole, small):
     """Return the number of bits that the coordinates of all atoms occupy, or -8 if the stream is invalid.
 
-    The full coordinates of an atom occupy `whole` bits. A flag bit follows. If the flag is set, the next five
-    bits give two numbers: how many of the next atoms are stored as differences of `small` bits, and the
+    The full coordinates of an atom occupy `whole` bits. A flag bit follows. If the flag bit is set, the next
+    five bits give two numbers: how many of the next atoms are stored as differences of `small` bits, and the
     change of `small`.
     """
     at, done, run = 0, 0, 0

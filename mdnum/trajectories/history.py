@@ -22,7 +22,7 @@ _ROOM = 2**62
 
 
 class Sums:
-    """Counts for a subset of the pairs, which can be added to the counts for another subset."""
+    """Counts for a subset of the atom pairs, which can be added to the counts for another subset."""
 
     # what is the same for all pairs
     _common: tuple[str, ...] = ()
@@ -116,7 +116,7 @@ class Contacts(Columns):
     """Contacts (periods in which a pair is inside the cutoff), sorted by (i, j, image rank, first frame).
 
     During a contact, the pair is inside the cutoff at the frames `begin`, ..., `end - 1`. A contact begins
-    between the frames `begin - 1` and `begin`. A break that ends before the next frame is not detected.
+    between the frames `begin - 1` and `begin`. A break of contact between two frames is not detected.
     """
 
     i: Int[np.ndarray, "stays"]  # the pair; see `ledger.Members`

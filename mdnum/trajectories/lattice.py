@@ -177,7 +177,7 @@ def near_squares(x, i, j, lattice, y, squares):
 def image_square(x, i, j, rank, lattice):
     """Return the squared distance from i to an image of j; `rank` is the number of nearer images of j.
 
-    Either i < j, or i == j (opposite images count once). If there is no such image, the result is inf.
+    Either i < j, or i == j (opposite images count once). If no image of j has this rank, the result is inf.
     """
     vectors, periodic, widths = lattice.vectors, lattice.periodic, lattice.widths
     # the image that rounding names; nearest where that is near enough
@@ -296,7 +296,7 @@ class Candidates(NamedTuple):
 
     @classmethod
     def room(cls, certain: int, open: int) -> Candidates:
-        """Allocate buffers for the given numbers of certain pairs and of pairs still to be decided."""
+        """Allocate buffers for the given numbers of decided pairs and of pairs still to be decided."""
         i, j, i_open, j_open, code = (np.empty(n, np.int32) for n in (certain, certain, open, open, open))
         return cls(i, j, i_open, j_open, code, np.empty(open), np.zeros(3, np.int64))
 
@@ -436,7 +436,7 @@ def lattice_vector(code):
 
 @njit
 def _run(d0, d1, d2, b0, b1, b2, bins, last):
-    """Return a run of contiguous bins at offset d from bin b: lattice vector, first and last bin, next d2."""
+    """Return a row of contiguous bins at offset d from bin b: lattice vector, first and last bin, next d2."""
     n0, n1, n2 = (b0 + d0) // bins[0], (b1 + d1) // bins[1], (b2 + d2) // bins[2]
     c0, c1, low = b0 + d0 - n0 * bins[0], b1 + d1 - n1 * bins[1], b2 + d2 - n2 * bins[2]
     high = min(bins[2] - 1, low + last - d2)
@@ -446,7 +446,7 @@ def _run(d0, d1, d2, b0, b1, b2, bins, last):
 
 @njit
 def _most_around(bins, reach, start):
-    """Return upper limits of the number of atoms, and of runs of contiguous bins, within reach of one bin."""
+    """Return upper limits of the number of atoms, and of rows of contiguous bins, within reach of one bin."""
     atoms, runs = 0, 0
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
@@ -484,7 +484,7 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
 
 @njit
 def meet(atoms, limits, found):
-    """Record the neighbor pairs of all central atoms; return the numbers of certain and of undecided pairs.
+    """Record the neighbor pairs of all central atoms; return the numbers of decided and of undecided pairs.
 
     Pairs within one group are visited once, by examining half of the bins around each bin. For two groups,
     all bins around a center are examined; a pair of atoms in both groups is visited twice and counted once.

@@ -113,6 +113,6 @@ class RepeatedFrames:
         return back > 0
 
     def plain(self, most: int = 100) -> dict[str, Any]:
-        """Return the record of repeats as plain Python values; lists of ranges have up to `most` entries."""
+        """Return the record of repeated frames as plain Python values, with up to `most` ranges per list."""
         sizes = {"frames": self.frames, "stretches": len(self.stretches), "to_the_end": self._back > 0}
         return sizes | {"dropped": self.drop, "ranges": self.stretches[:most], "again": self.again[:most]}

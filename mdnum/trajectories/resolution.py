@@ -8,8 +8,8 @@ needed.
 Rounding of coordinates can move a cutoff crossing to another frame, hide a short contact, or create a
 crossing of a pair near the cutoff. The affected flips cannot be identified from one file, but their number is
 estimated by `grid_effect`. Random pairs near the cutoff are moved by displacements found in the file. Flips
-are then counted with and without rounding. Among nearest neighbors, a flip exchanges two atoms at similar
-distances from a third atom. For such rules, random triples of atoms are moved.
+are then counted with and without rounding. With a nearest-neighbor rule, a flip exchanges two atoms at
+similar distances from a third atom. For nearest-neighbor rules, random triples of atoms are moved.
 """
 
 from __future__ import annotations
@@ -72,12 +72,12 @@ class Resolution:
         """Return the largest error of a distance in a frame due to rounding of the data in the file.
 
         The bound, a length, is the worst case: rounding moves both atoms in opposite directions by half a
-        grid step along every axis. For pairs across the boundary, the error of the box is added. For float64
-        positions, the bound is the rounding error of the distance. A margin to a cutoff has the same error
-        bound as a distance. A margin among nearest neighbors (a difference of two distances) has twice the
-        bound. If `atoms` are given, the bound is valid for distances between the given atoms.
+        grid spacing along every axis. For pairs across the boundary, the rounding error of the box is added.
+        For float64 positions, the bound is the rounding error of the distance. The difference between a
+        distance and the cutoff has the same bound. The difference between two neighbors' distances has twice
+        the bound. If `atoms` are given, the bound is valid for distances between the given atoms.
 
-        Error: the bound is valid within one period of the box; each further period adds the box error.
+        Error: the bound is valid within one period of the box; further periods each add the error of the box.
         """
         if atoms is not None or not np.isfinite(frame.furthest):
             x = frame.positions if atoms is None else frame.positions[atoms]
@@ -117,7 +117,7 @@ class Resolution:
         return self.kind in ("float32", "unknown") or self.bits == 32
 
     def _half(self, frame: Frame) -> float:
-        """Return half the largest step of the decimal grid along an axis, in length units."""
+        """Return half the largest spacing of the decimal grid along an axis, in length units."""
         if not self.step or not len(frame.positions):
             return 0.0
         if self.kind == "fractions":
@@ -233,7 +233,7 @@ def _fixed(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values
 
 
 def _chance(parts: Float[np.ndarray, "values"]) -> float:
-    """Return the log probability that random values are as close to a grid as these fractions of a step."""
+    """Return the log probability that random values lie within these fractions of a spacing from a grid."""
     return float(np.log(np.maximum(parts, 1e-300)).sum())
 
 
@@ -326,7 +326,7 @@ def _drawn(
     draws: int,
     ranked: bool,
 ) -> tuple[Places, Places]:
-    """Draw random pairs near the radius, or triples with equal distances; return old and new positions."""
+    """Draw random pairs near the cutoff, or triples with equal distances; return old and new positions."""
     moved = [moves[random.integers(len(moves), size=draws)] for moves in (one, other, other)[: 2 + ranked]]
     # the distance of the middle one of three counts twice where the others are on opposite sides
     spread = float(np.sqrt((1 + ranked) * (one**2).mean() + (1 + ranked) * (other**2).mean()))
@@ -350,8 +350,8 @@ def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
 def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]:
     """Return the displacement of every atom from one frame to the next, corrected for rounding.
 
-    Displacements are measured over several frames, until they clearly exceed a step of the grid. The variance
-    due to rounding is subtracted.
+    Displacements are measured over several frames, until they clearly exceed the spacing of the coordinate
+    grid. The variance due to rounding is subtracted.
     """
     moves, lag, total = np.zeros_like(sample[0].positions), 0, 0.0
     for before, after in pairwise(sample):
@@ -370,9 +370,9 @@ def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]
 def unrounded(variance: float, size: float) -> float:
     """Return the variance that displacements had before positions were rounded to multiples of `size`.
 
-    For a displacement of n + f steps (integer n, 0 <= f < 1), rounding increases the mean square by size² f
-    (1 - f). For normally distributed displacements of variance v, the mean of size² f (1 - f) is, by a
-    Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
+    For a displacement of n + f grid spacings (integer n, 0 <= f < 1), rounding increases the mean square by
+    size² f (1 - f). For normally distributed displacements of variance v, the mean of size² f (1 - f) is, by
+    a Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
     """
     low, high, k = 0.0, variance, np.arange(1, 200)
     for _ in range(60):

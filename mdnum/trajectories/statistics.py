@@ -127,8 +127,8 @@ def mean_by_rate(found: Durations) -> tuple[float, float]:
 def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
     """Return, by lag, the fraction of pairs in contact at a frame that stay in contact without a break.
 
-    Lags begin at 0. Each fraction is an average over all possible first frames; nan if no pair was inside.
-    `pairs` is the number of pairs inside at each frame.
+    Lags begin at 0. Each fraction is an average over all possible first frames; nan if no pair was inside the
+    cutoff. `pairs` is the number of pairs inside the cutoff at each frame.
     """
     count, lags = found.all, np.arange(len(pairs))
     stays = np.cumsum(count[::-1])[::-1]
@@ -140,10 +140,10 @@ def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.nd
 
 
 def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Count pairs that are inside at a frame and at a later frame, even if they are outside in between.
+    """Count pairs that are in contact at a frame and at a later frame, even if they are apart in between.
 
-    The ratio of the two arrays is the residence (see `residence`) with interrupted contacts included. Counts
-    for disjoint subsets of the pairs can be added. Lags are between 0 and frames - 1.
+    The first array divided by the second is the residence (see `residence`) with interrupted contacts
+    included. Counts for disjoint subsets of the pairs can be added. Lags are between 0 and frames - 1.
 
     Returns:
         two arrays by lag, summed over frames: numbers of pairs inside at both frames, and at the first frame.
@@ -230,7 +230,7 @@ class ClassTally(Sums):
     def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> ClassTally:
         """Count flips and frames in contact by the classes of both atoms, over the given number of frames.
 
-        For directed rules, i -> j and j -> i are separate. Otherwise, the lower class index comes first.
+        Directed rules count i -> j and j -> i separately. For other rules, the lower class index comes first.
         """
         first, second = classes.of[stays.i], classes.of[stays.j]
         if not directed:

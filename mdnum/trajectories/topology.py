@@ -8,10 +8,10 @@ computed from MDAnalysis's box are silently wrong:
 - HOOMD's boxes have tilt factors, which MDAnalysis interprets as cosines of angles (in gsd files).
 - Boxes in H5MD files and DL_POLY's HISTORY files may have vectors in any direction.
 
-In a PDB file with many models, MDAnalysis loses boxes outside the models. Programs write CRYST1 once in the
-header (OpenMM), before each model (GROMACS), or inside each model. MDAnalysis reads a model from its MODEL
-record to the next MODEL record. MDAnalysis therefore never reads a box before the first model, and assigns a
-box between two models to the first of the two instead of the second.
+In a PDB file with many models, MDAnalysis ignores or misassigns CRYST1 records outside the models. Programs
+write CRYST1 once in the header (OpenMM), before each model (GROMACS), or inside each model. MDAnalysis reads
+a model from its MODEL record to the next MODEL record. MDAnalysis therefore never reads a box before the
+first model, and assigns a box between two models to the first of the two instead of the second.
 """
 
 from __future__ import annotations
@@ -205,7 +205,7 @@ def topology_universe(topology: str | Path) -> Any:
 
 
 def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
-    """Return the number of atoms in a trajectory, or None; some formats need the topology's number."""
+    """Return the number of atoms in a trajectory, or None; some formats need the topology's atom count."""
     from MDAnalysis.core._get_readers import get_reader_for
 
     for known in ({}, {"n_atoms": topology}):
@@ -257,7 +257,7 @@ class Boxes:
         self.own = self._matrix is not None or bool(self._models)
 
     def other(self, ts: Any, number: int) -> tuple[str, Box] | None:
-        """Return another possible box of a frame, given its timestep; see `Trajectory.other_box`."""
+        """Return another possible box of a frame (an MDAnalysis Timestep); see `Trajectory.other_box`."""
         instead = getattr(self._matrix, "instead", None)
         if instead is not None and (matrix := instead(number)) is not None:
             return "BOX_UNDECIDED", Box(matrix, np.ones(3, bool))
@@ -268,7 +268,7 @@ class Boxes:
         return ("BOX_NOT_MDANALYSIS", theirs) if differs else None
 
     def box(self, ts: Any, number: int) -> Box:
-        """Return the box of the frame with this number, whose MDAnalysis timestep is given."""
+        """Return the box of a frame, given its MDAnalysis Timestep object and its number."""
         dimensions = ts.dimensions
         # transformations may have set another
         if self._models and (dimensions is None or not self._changed):

@@ -199,7 +199,7 @@ def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dic
 
 
 def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
-    """Return the loss of the run, taken from a gradient method if one runs the same program."""
+    """Return the loss of the run, from a gradient method if one has already run the same program."""
     same = ("unrolled", "frozen", "event-aware")
     known = [made["value"] for made in gradient if made["method"] in same and not made["refused"]]
     return known[0] if known else problem.value()

@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step; with one solver per ball, those of the smallest |margin|."""
+    """Residual and stop margin of each step; for one solver per ball, of the ball of smallest |margin|."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

@@ -105,7 +105,7 @@ def _ended(view: FlipsView) -> Iterator[Finding]:
 
 
 def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
-    """Return the frames at which the number of pairs is not the previous number + entered - left."""
+    """Return frames whose pair count differs from the previous count plus pairs entered minus pairs left."""
     table = view.table("frames")
     rows = table["rule"] == place
     net = (table["entered"][rows] - table["left"][rows])[1:]
@@ -113,7 +113,7 @@ def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
 
 
 def _of_rules(view: FlipsView) -> Iterator[Finding]:
-    """Yield one finding per code, with the sentences on all neighbor rules."""
+    """Yield one finding for each finding code; its sentences cover all neighbor rules."""
     by_code: dict[str, list[Finding]] = {}
     for place, one in enumerate(view.summary["rules"]):
         for code, variants, values in _limits(view, place, one):

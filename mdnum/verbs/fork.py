@@ -299,7 +299,7 @@ def _page(view: View, what: str, about: str, keys: Mapping[str, Any], sections: 
 
 
 def page_screen(view: View, verdict: Verdict) -> Page:
-    """Return the report page that ranks all choices."""
+    """Return the report page that ranks all numerical choices."""
     s, rows, left = view.summary, view.summary["ranking"], view.summary["not_applicable"]
     same = [row["first_bit"] is None for row in rows]
     held = [whole for whole, row in zip(same, rows, strict=True) if row["must_hold"]]
@@ -326,7 +326,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """For each choice, draw the steps of the first different bit, first different decision, and split."""
+    """For each numerical choice, draw the steps where bits and decisions first differ and the runs split."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (

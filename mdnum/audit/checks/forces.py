@@ -359,8 +359,8 @@ def _two_energies(
 ) -> Iterator[Observed]:
     """Yield a finding if the energies `energy` and `free_energy` differ by more than a constant.
 
-    By ASE's definition, the forces are minus the gradient of `free_energy`. All other checks examine this
-    energy. If the two energies differ by at most a constant, the findings hold for both energies.
+    By ASE's definition, the forces are minus the gradient of `free_energy`. All other checks examine
+    `free_energy`. If `energy` and `free_energy` differ by at most a constant, the findings hold for both.
     """
     free, logged = subject.energies(atoms)
     if logged is None:

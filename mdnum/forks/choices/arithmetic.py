@@ -1,4 +1,4 @@
-"""Choices of arithmetic: the floating-point format of each role, and the order in which sums are computed.
+"""Choices of arithmetic: the floating-point formats of quantities such as forces, and the order of sums.
 
 The order of a sum is set by the reduction or the neighbor list. The order of pairs in a list depends on how
 and when the list is built. If every list is rebuilt in time, the order of a sum does not change which pairs
@@ -44,10 +44,10 @@ FORMATS = ("dense", "sparse", "ordered-sparse")
 
 @choice("precision")
 class PrecisionChoice(Choice):
-    """Another floating-point format for one or several roles, such as for the forces.
+    """Another floating-point format in one or several parts of the calculation, such as the forces.
 
-    In molecular dynamics, 16-bit floats are allowed only for pair forces. In any other role, 16-bit floats
-    would change the model, not only the rounding (see `mdnum.numerics.roles.check_role`).
+    In molecular dynamics, 16-bit floats are allowed only for pair forces. For other quantities, 16-bit
+    floats would change the model, not only the rounding (see `mdnum.numerics.roles.check_role`).
     """
 
     screened: ClassVar = {
@@ -157,7 +157,7 @@ def sums_residuals(system: Any) -> None:
 class Order(Summed):
     """The neighbors of each atom, or the balls of the batch, in another order.
 
-    For balls, `both` is "exact" (exact sums of residuals) or "alone" (each ball stopped separately).
+    For balls, both runs can use exact sums of residuals ("exact") or stop each ball separately ("alone").
     """
 
     worlds = ("md", "ball")

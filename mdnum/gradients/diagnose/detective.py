@@ -138,7 +138,7 @@ def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFi
 
 
 def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
-    """Return the arguments of a reverse pass, restricted to a range of rows (steps of a stretch)."""
+    """Restrict the arguments of a reverse pass to a range of time steps, and return these arguments."""
     out = list(arguments)
     for k in (4, 5, 7):
         out[k] = jax.tree.map(lambda leaf: leaf[first:end], out[k])

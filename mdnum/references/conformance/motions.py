@@ -205,7 +205,7 @@ def _reuse() -> Iterator[Case]:
 
 
 def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = None) -> Case:
-    """Return a test case that builds a new list at every step or, with `skins`, at each step with a skin."""
+    """Return a test case that builds a new list at every step, or only at steps with a skin in `skins`."""
     case = sequence(name, "reuse", path, _L, _R, max(filter(None, skins)) if skins else _SKIN)
     starts = zip(case.stills, skins or [None] * len(path), strict=True)
     stills = (replace(still, fresh=skin is not None or not skins, skin=skin) for still, skin in starts)
@@ -288,7 +288,7 @@ def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
 def _walk(
     room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float] = (0.0, 1.0)
 ) -> list[ndarray]:
-    """Return a path of two atoms that approach each other; the first moves by `share` of the approach."""
+    """Return a path of two approaching atoms; the first moves by the fraction `share` of the approach."""
     start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
