@@ -21,7 +21,7 @@ _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked abou
 
 
 class SequenceStep(NamedTuple):
-    """A structure in a sequence, its change from the previous one, and whether results are compared."""
+    """A structure of a sequence, its change from the previous structure, and whether results are checked."""
 
     what: str
     atoms: Atoms

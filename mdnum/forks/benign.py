@@ -112,7 +112,7 @@ def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations above which a principal component counts as an outlier.
 
     The outlier limit is two standard deviations, or more if over a tenth of the ensemble's runs would exceed
-    two. For a run, components are computed from other runs, because a run influences its own components.
+    two. Principal components for a run are computed from other runs, as a run influences its own.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -173,7 +173,7 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest score, in outlier limits, of the changes that must be detected; infinity without any."""
+        """Smallest score/limit ratio among deliberate changes that must be detected; infinity without any."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property
