@@ -125,7 +125,7 @@ def _order(derivatives: np.ndarray) -> int:
 
 
 def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float) -> list[dict[str, Any]]:
-    """Return discontinuities and other defects of a pair function between two distances, one per row."""
+    """Return discontinuities and other defects of a pair function between two distances, as table rows."""
     step = (r_cut - low) / _INTERVALS
     curve, high = Curve(at), r_cut * (1 + _BEYOND)
     grid = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)

@@ -66,7 +66,7 @@ class Route:
     direction: Float[np.ndarray, "3"]  # unit vector
 
     def at(self, along: float) -> Atoms:
-        """Return the structure with its moving atoms displaced by a given length along their line."""
+        """Return the structure with its moving atoms displaced by a given length along the route."""
         atoms = self.atoms.copy()
         atoms.positions[self.moving] += along * self.direction
         return atoms
@@ -336,7 +336,7 @@ class CrowdOrder(NamedTuple):
 
 @dataclass(frozen=True)
 class Crowd:
-    """A central atom with many neighbors, and the energy and force jumps when another neighbor enters."""
+    """A central atom with many neighbors, and the energy and force jumps when it gains another neighbor."""
 
     species: str  # of all atoms
     radius: float  # cutoff that the crowd is inside of, length

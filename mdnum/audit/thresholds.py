@@ -264,7 +264,7 @@ def _seen(
 
 
 def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThreshold | None:
-    """Return a threshold if its jump exceeds rounding errors; always return the end of an interaction."""
+    """Return a threshold if its jump exceeds rounding errors, or if the interaction ends at the threshold."""
     large = any(abs(jump) > STEPS * size for jump, size in zip(threshold.jumps[:2], quantum, strict=True))
     if threshold.order <= 1 and large:
         return threshold

@@ -44,7 +44,7 @@ class Reason(IntEnum):
 
 
 class Solve(NamedTuple):
-    """Record of an iterative solve; shape (balls,) if each ball stops separately, else () for all balls."""
+    """Record of one call of an iterative solver; shape (balls,) if each ball stops separately, else ()."""
 
     iterations: Int[Array, "..."]  # how often it went on
     reason: Int[Array, "..."]  # a `Reason`

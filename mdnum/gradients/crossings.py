@@ -59,7 +59,7 @@ class MetRows(NamedTuple):
     slots: Int[np.ndarray, "most"]  # numbers from 0, as many as the row with the most has, or a few more
 
     def row(self, span: Int[Array, "2"], atoms: int) -> Met:
-        """Return the crossings of one step, given the index of the first and the number of crossings."""
+        """Return the crossings of one time step, given the index of the first crossing and their number."""
         most = len(self.slots)
         own = Met(*(lax.dynamic_slice_in_dim(column, span[0], most, -1) for column in self.met))
         # behind them are those of the next row

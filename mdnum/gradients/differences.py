@@ -126,7 +126,7 @@ class DifferenceStep(NamedTuple):
 
 
 def choose_step(f: Callable[[float], float], x: float, first: float, spacing: float) -> DifferenceStep:
-    """Choose the step at which truncation error and noise of a central difference are about equal.
+    """Choose the step size at which truncation error and noise of a central difference are about equal.
 
     Args:
         first: the initial step, which is also the largest, because the function may differ in kind beyond it.
@@ -500,7 +500,7 @@ def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable
 
 
 def _share(high, low) -> float | None:
-    """Return the fraction of crossings that do not occur at the same step in both runs of a difference."""
+    """Return the fraction of cutoff crossings that do not occur at the same time step in both runs."""
     total = sum(len(a[1]) + len(b[1]) for a, b in zip(high, low, strict=True))
     differing = sum(len(a[1] ^ b[1]) for a, b in zip(high, low, strict=True))
     return differing / total if total else None

@@ -5,7 +5,7 @@ potential, for pairs inside the cutoff. The module `decide` determines which pai
 
 A cutoff is a class with a formula `cut`, a name and a smoothness. All other parts of the package find a
 cutoff by its name in `CUTOFFS`. A class may also define the independent implementation `reference` and the
-interval version `enclose`. By default, `reference` and `enclose` are derived from `cut`.
+interval-arithmetic version `enclose`. By default, `reference` and `enclose` are derived from `cut`.
 
 All formulas work with numpy and jax arrays; this module does not import jax.
 """

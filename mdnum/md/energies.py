@@ -78,7 +78,7 @@ class Call:
     name: str = "energy function"
 
     def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
-        """Return the energy in the function's own units, or its unchanged result if `returns` is empty.
+        """Return the energy in the function's own units; if `returns` is empty, return the function's result.
 
         Args:
             given: the keywords of the convention; for mdnum's own convention, "cell".

@@ -58,7 +58,7 @@ class Rows:
         return replace(self, x=x, v=v, cells=frame.boxes(self.cells, self.box))
 
     def cut(self, count: int) -> tuple[Rows, Rows]:
-        """Split the time steps into the first `count` steps and the remaining steps."""
+        """Split a group of time steps into the first `count` steps and the remaining steps."""
 
         def part(rows: slice, **changed: Any) -> Rows:
             columns = {name: getattr(self, name) for name in _COLUMNS}

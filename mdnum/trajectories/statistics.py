@@ -4,8 +4,8 @@ Three quantities describe the durations of contacts:
 
 - The **lifetime** is estimated from contacts whose beginning was observed. Contacts that continue after the
   last frame are right-censored (Kaplan and Meier, J. American Statistical Association 53, 457, 1958).
-- The **mean by rate** is the total contact time divided by the number of departures. The mean by rate
-includes partly observed contacts, and equals the mean lifetime if pairs leave at a constant rate.
+- The **mean by rate** is the total contact time divided by the number of times that a pair left. The mean by
+  rate includes partly observed contacts, and equals the mean lifetime if pairs leave at a constant rate.
 - The **residence** at a lag is the fraction of the pairs in contact at a frame that stay in contact during
   the lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more often,
   so the residence differs from the lifetime.
@@ -252,7 +252,7 @@ class ClassTally(Sums):
         return np.divide(self.exposure, self.left, out=none, where=self.left > 0)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return table rows for pairs of classes with any contacts, sorted by descending number of flips."""
+        """Return table rows for pairs of atom classes with contacts, sorted by descending number of flips."""
         stay = self.mean_stay
         rows = [
             {

@@ -191,7 +191,7 @@ class Topology:
 
 
 def topology_universe(topology: str | Path) -> Any:
-    """Return a Universe of a topology; coordinates are not read, since a reader might write index files.
+    """Return an MDAnalysis Universe of a topology, without coordinates (a reader might write index files).
 
     Raises:
         InputError: MDAnalysis cannot read the file.

@@ -182,7 +182,7 @@ def compared(
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Return where a variant diverges from the run (step and decision), and the variant's gradient.
+    """Return the step and decision at which a variant diverges from the run, and the variant's gradient.
 
     Args:
         found: the difference between the two runs.

@@ -51,8 +51,8 @@ class DynamicsCheck(AuditCheck):
     """Is the energy conserved in a short run at constant energy, and if not, why?
 
     The check reports the energy drift, its standard error, and the drifts due to integrator, flips and other
-    causes. The drift that flips and the work of the forces do not explain is due to the integrator. The
-    integrator's drift must fall to a quarter at half the time step; a second run tests this.
+    causes. The drift that flips and the work of the forces do not explain is due to the integrator. At half
+    the time step, the integrator's drift must fall to a quarter; a second run tests this.
     """
 
     name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
@@ -121,7 +121,7 @@ def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor
 
 
 def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult:
-    """Return the result of a short run that tests whether energies depend on earlier steps."""
+    """Return the result of a short run that tests whether energies depend on earlier time steps."""
     (differs, allowed), steps = stale, len(ran.potential) - 1
     change = 1e3 * largest(ran.total - ran.total[0]) / ran.positions.shape[1]
     seen = Measured(differs, "energy", allowed)

@@ -76,7 +76,7 @@ class PrecisionChoice(Choice):
 
     @property
     def name(self) -> str:
-        """Text form of the choice, such as "precision" or "precision.force=float64"."""
+        """Text form of the numerical choice, such as "precision" or "precision.force=float64"."""
         base = self.family if self.role is None else f"{self.family}.{self.role}"
         return base if self.dtype == "float32" else f"{base}={self.dtype}"
 

@@ -120,7 +120,7 @@ def _in_forward(tape: RunTape) -> NotFinite:
 
 
 def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFinite:
-    """Run the reverse pass of one step operation by operation, and find the operation that is the cause."""
+    """Run the reverse pass of one time step operation by operation; find the cause of non-finite numbers."""
     whole = back.arguments(stretch)
     loss, origin, *rest = whole[8]
     # the energy of the frame of step 0 is not known there, and nothing that is finite has used it
