@@ -276,9 +276,9 @@ def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]
         f"The target is that each kind of false verdict occurs for fewer than {target} of the starting "
         "states. The target is met with 95 % confidence if the upper bound of the rate of false verdicts is "
         f'below {target}. The upper bounds are given in the column "below (95 %)" of a table below. '
-        f"{shown or 'None'} of the {len(wrong)} upper bounds {'are' if shown > 1 else 'is'} below {target}. "
-        f"Each upper bound is based on {fewer} to {most} starting states. With more starting states, the "
-        "upper bounds would be smaller.",
+        f"{shown or 'None'} of the {len(wrong)} rates of false verdicts {'have' if shown > 1 else 'has'} an "
+        f"upper bound below {target}. Each rate is based on {fewer} to {most} starting states. With more "
+        "starting states, the upper bounds would be smaller.",
         'The following table gives the number of starting states for which the verdict is "undecided". In '
         "systems that are not listed, the verdict was never undecided.",
     )
