@@ -172,7 +172,7 @@ def turned(typingctx: Any, rows: Any, place: Any, apart: Any, out: Any, at: Any,
 
 @intrinsic
 def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: Any) -> Any:
-    """Return a bit mask of the atoms in a shifted cluster that are near a box (squared distance <= `reach`).
+    """Return a bit mask of the shifted atoms near a rectangular box (squared distance <= `reach`).
 
     The shifted coordinates are written to `out`.
     """
@@ -193,7 +193,7 @@ def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: 
 
 @intrinsic
 def near_atom(typingctx: Any, atom: Any, atoms: Any, low: Any, high: Any) -> Any:
-    """Return two bit masks of a cluster's atoms: squared distance from an atom below `low`, and `high`."""
+    """Return two bit masks of the atoms whose squared distance from one atom is below `low`, and `high`."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         atom, atoms, low, high = args

@@ -1,4 +1,4 @@
-"""Detect errors at certain indices in the list of atoms, such as at the last atom or at every eighth atom."""
+"""Detect errors at certain places in the list of atoms, such as the last atom or every eighth atom."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PLACES, _CANDIDATES = 48, 4  # places that are tried, and of them for an ordina
 
 @dataclass(frozen=True)
 class WrongPlaces:
-    """Atom indices at which energy or forces are wrong, regardless of which atom has the index."""
+    """Places in the list of atoms at which energy or forces are wrong, whichever atom is listed there."""
 
     places: tuple[int, ...]
     count: int  # of atoms
@@ -27,28 +27,28 @@ class WrongPlaces:
 
     @property
     def pattern(self) -> str:
-        """Pattern of the wrong atom indices: "first", "last", "every" (every nth) or "some"."""
+        """Pattern of the wrong places in the list: "first", "last", "every" (every nth atom) or "some"."""
         if len(self.places) == 1:
             return {0: "first", self.count - 1: "last"}.get(self.places[0], "some")
         return "every" if len(set(np.diff(self.places).tolist())) == 1 else "some"
 
     @property
     def values(self) -> dict[str, Any]:
-        """Values inserted into the text of a finding about wrong indices in the list of atoms."""
+        """Values for the text of a finding about places in the list of atoms with wrong results."""
         shown = ", ".join(map(str, self.places[:8])) + (", …" if len(self.places) > 8 else "")
         every = int(np.diff(self.places)[0]) if self.pattern == "every" else 0
         return {"places": shown, "every": every, "wrong_places": len(self.places), "count": self.count}
 
 
 def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) -> WrongPlaces | None:
-    """Find atom indices at which results are wrong, by exchanging atoms of one species between two indices.
+    """Find places in the list of atoms with wrong results, by exchanging atoms of one species in the list.
 
-    Exchanging two equal atoms between correct indices changes neither energy nor forces. An error tied to an
-    index appears at this index for any order of the atoms. An error that depends on the order of all atoms,
-    such as a neglected neighbor, appears at nearly all indices, or moves if atoms are reordered.
+    Exchanging two equal atoms between correct places in the list changes neither energy nor forces. An error
+    tied to a place appears there for any order of the atoms. An error that depends on the order of all atoms,
+    such as a neglected neighbor, appears at nearly all places in the list, or moves if atoms are reordered.
 
     Returns:
-        None if energy and forces are correct at all indices, or if they are wrong at nearly all indices.
+        None if energy and forces are correct at all places, or if they are wrong at nearly all places.
     """
     key = "places", atoms.positions.tobytes(), atoms.numbers.tobytes()
     if key not in subject.known:
@@ -75,10 +75,10 @@ def _wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor)
 def _at_places(
     subject: CalculatorSubject, atoms: Atoms, order: np.ndarray, places: Sequence[int], allowed: NoiseFloor
 ) -> dict[int, tuple[bool, bool]]:
-    """Test whether energy and forces change when an atom is exchanged with an atom at a correct index.
+    """Test whether energy and forces change if two atoms are exchanged in the list, one at a correct place.
 
     Returns:
-        for each tested index, whether energy and forces change; empty if most indices of a species are wrong.
+        for each tested place, whether energy and forces change; empty if most places of a species are wrong.
     """
     numbers, found = atoms.numbers[order], {}
     base = in_order(subject.fresh(), atoms, order)

@@ -84,7 +84,7 @@ class Pair:
     moves: Literal["atom", "molecule"] = "atom"
 
     def at(self, distance: float) -> Atoms:
-        """Return the pair with its two reference atoms at exactly the given distance, without rounding."""
+        """Return the two particles with their reference atoms at exactly the given distance, unrounded."""
         both = self._together.copy()
         both.positions[len(self.first) :, 0] += distance
         return both
@@ -94,7 +94,7 @@ class Pair:
         return self.surrounded(self.first + self.second)
 
     def surrounded(self, atoms: Atoms, middle: bool = False) -> Atoms:
-        """Put atoms into the cell of the pair; if `middle`, move the atoms to the center of this cell."""
+        """Put atoms into the cell of the two particles; if `middle`, move them to the center of this cell."""
         if self.box:
             atoms.set_cell([self.box] * 3)
             if middle:
@@ -231,7 +231,7 @@ def _molecules(subject: CalculatorSubject) -> list[Pair]:
 def _answered(
     subject: CalculatorSubject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
 ) -> tuple[Pair | None, str]:
-    """Return the pair in the simplest cell that the calculator supports, or None and the error message."""
+    """Return two particles in the simplest cell the calculator supports, or None and the error message."""
     why = ""
     for cell, periodic in _SURROUNDINGS:
         name = "-".join(part.get_chemical_formula() for part in (first, second))

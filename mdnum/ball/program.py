@@ -199,7 +199,7 @@ class BallProgram:
         return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
 
     def decision(self, other: BallProgram, flips: Sequence[CrossDecision], separation: float) -> Decision:
-        """Return the first decision that differs between two runs; in a step, contacts come before stops."""
+        """Return the first differing decision of two runs; at equal steps, contacts precede solver stops."""
         first = flips[0]
         return Decision(
             channel=first.channel,
@@ -311,7 +311,7 @@ def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
 
 
 def _apart(one: BallRun, other: BallRun, last: int) -> Float[np.ndarray, "times"]:
-    """Return the largest difference of heights at each step, m; infinite if a height is not finite."""
+    """Return two runs' largest height difference at each step, m; infinite if a height is not finite."""
     y = [run.y[: last + 1].astype(np.float64) for run in (one, other)]
     with np.errstate(invalid="ignore"):
         off = np.abs(y[0] - y[1])

@@ -28,7 +28,7 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """Record of a finished run. In an array with one row per step, row s describes the step to state s + 1.
+    """Record of a finished run. If an array has one row per step, row s is the step from state s to s + 1.
 
     Attributes:
         world: the bouncing-ball model that was simulated.
@@ -279,7 +279,7 @@ class CrossDecision(NamedTuple):
 
 @dataclass(frozen=True)
 class BallDifference:
-    """How two runs differ: first differing steps, numbers of differing decisions, differences of heights."""
+    """How two runs differ: first step with different bits, differing decisions, and heights."""
 
     seed: int | None  # first step whose state bits differ (0: the start itself); None where none do
     fork: int | None  # first step whose decisions differ; None where none do
@@ -296,7 +296,7 @@ class BallDifference:
 
 
 def first_difference(a: BallRun, b: BallRun) -> BallDifference:
-    """Compare two runs, and find the steps at which bits and decisions first differ.
+    """Compare two runs, and find the first step with different bits and the first with different decisions.
 
     Raises:
         InputError: the runs have different lengths or numbers of balls.

@@ -1,10 +1,10 @@
 """Find where two finished runs diverge, and how the runs differ, using only their folders.
 
-Neither run is repeated. The first differing bit and the fork (first differing decision) are read from the two
-folders. To compare positions, `twin_of` rebuilds the programs, and `mdnum.forks.fork` repeats the runs.
+Neither run is repeated. The first step with different bits and the fork (first differing decision) are read
+from both folders. To compare positions, `twin_of` rebuilds the programs; `mdnum.forks.fork` repeats the runs.
 
-Runs cannot be compared if the atoms, box, potential or contact of their systems differ. Runs may differ in
-any other parameter or numerical choice.
+Runs cannot be compared if the atoms, box, potential or contact model of their systems differ. Runs may differ
+in any other parameter or numerical choice.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def twin_of(found: FolderFork, objects: Sequence[Simulation] = ()) -> Twin:
     """Rebuild the programs of two molecular-dynamics runs from their folders (`objects`: see
     `simulation_in`).
 
-    A replay agrees bit for bit with the stored run if versions and processor are the same.
+    Repeated runs agree bit for bit with the stored runs if versions and processor are the same.
     """
     difference = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
     a, b = alike(*(simulation_in(path, objects) for path in (found.a, found.b)))
@@ -225,8 +225,8 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """Return the numerical choices that differ, given the keys with different values. The dtypes of all roles
-    form one choice; a cutoff and its parameters form another.
+    """Return the numerical choices that differ, given the keys with different values. All dtypes together
+    count as one numerical choice; so do a cutoff and its parameters.
     """
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}

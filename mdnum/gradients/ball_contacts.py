@@ -96,7 +96,7 @@ class Implicit(BallMethod):
     )
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """Compute the derivative by reverse mode.
+        """Compute the gradient of the loss by reverse-mode differentiation.
 
         Raises:
             InputError: the contact is not solved by iteration, or 1 - dG/dy is too ill conditioned.
@@ -153,7 +153,7 @@ class SoftImpact(eqx.Module):
     slow: Any  # in velocity, of the passage, m/s
 
     def acceleration(self, y, v, free, contact, r):
-        """Return the acceleration due to gravity, control and spring; the contact decision is not used."""
+        """Return the acceleration due to control, gravity and spring; the contact decision is not used."""
         depth = self.eps * jax.nn.softplus(-y / self.eps)
         share = self.restitution**2
         return free + self.k * depth * (share + (1 - share) * jax.nn.sigmoid(-v / self.slow))
@@ -184,7 +184,7 @@ class SoftFloor(BallMethod):
     )
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """Compute the loss of the smooth program and its derivatives by reverse mode.
+        """Compute the loss of the smooth program, and its gradient by reverse-mode differentiation.
 
         Raises:
             InputError: eps is not positive, or the smooth program does not have the parameter.
@@ -261,7 +261,7 @@ class ThroughContacts(BallMethod):
     Contact is decided at the end of each step. A ball that starts higher reaches the floor later. The
     derivative of the time steps omits the change of the contact time. A saltation matrix at every contact
     adds this change to the derivative. If impacts are located within a step, the program's own derivative
-    already contains the saltation matrix. A contact by projection is treated like an impact. Without a
+    already contains the saltation matrix. Contact by projection is differentiated like an impact. Without a
     damper, the force of a spring does not jump, and the result is the same as from the method `unrolled`.
     """
 
@@ -270,7 +270,7 @@ class ThroughContacts(BallMethod):
     description = "the derivative of the motion, the times of its contacts moving along (saltation at each)"
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """Compute the derivative by reverse mode.
+        """Compute the gradient of the loss by reverse-mode differentiation.
 
         Raises:
             NumericalError: a contact grazes the floor, so that its time has no derivative.

@@ -1,4 +1,4 @@
-"""Classes for gradients of a simulation: the problem, the result, and the base class of methods."""
+"""Classes for gradients of a loss: problem to be differentiated, result, and base class of methods."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Problem:
 
     @property
     def jumps(self) -> bool:
-        """True if the force jumps at the cutoff."""
+        """True if the pair force is discontinuous at the cutoff."""
         return bool(np.any(self.simulation.jumps()[1] != 0))
 
 
@@ -140,7 +140,7 @@ class Method:
         return None
 
     def __call__(self, problem: Any, names: Sequence[str], progress: Progress | None = None) -> Gradient:
-        """Compute the gradient; for a complex loss, run once for the real and once for the imaginary part.
+        """Compute the gradient; for a complex loss, apply the method to its real and imaginary parts in turn.
 
         Raises:
             InputError: the method does not apply to this problem, or a parameter does not exist.
@@ -246,7 +246,7 @@ def one_term(simulation: Simulation) -> str | None:
 
 
 def rounded(simulation: Simulation) -> str | None:
-    """Return why forces in a type of fewer than 32 bits have no derivative; None for other types."""
+    """Return why forces stored in fewer than 32 bits have no derivative; None for forces of 32 or 64 bits."""
     if simulation.policy.dtype("force").itemsize < 4:
         precision = simulation.policy.force
         return f"forces in {precision} are rounded after every operation, which has no derivative"
@@ -260,7 +260,7 @@ def scalars_only(problem: Problem, names: Sequence[str]) -> str | None:
 
 
 def in_phase(progress: Progress | None, phase: str) -> Callable[[int, int], None] | None:
-    """Return a callback that is called as (step, steps) and reports progress under the name of the phase."""
+    """Return a callback (step, steps) that reports progress under the name `phase`."""
     if progress is None:
         return None
     return lambda step, steps: progress(step, steps, phase)

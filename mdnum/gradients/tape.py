@@ -1,9 +1,9 @@
-"""A run recorded for gradients: its steps, in forward or reverse order, and the sums of the loss.
+"""A run recorded for gradients: its time steps, in forward or reverse order, and sums for the loss.
 
-Recorded stretches of steps are kept in memory as long as there is room. Stretches that do not fit into memory
-are run again from their first states. The repeated run has the same bits, because program, state and neighbor
-list are the same. A run in fixed-point numbers need not be stored. The steps of such a run are reversed, and
-must lead back to the start bit for bit.
+Recorded stretches of steps are kept in memory until the memory limit is reached. Stretches that do not fit
+into memory are computed again from the state at their first step. The repeated steps have the same bits,
+because program, state and neighbor list are the same. A run in fixed-point numbers need not be stored. The
+steps of such a run are reversed, and must lead back to exactly the initial state.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _FINGERPRINTS = 256
 
 @dataclass(frozen=True)
 class TapeStretch:
-    """States and decisions of successive steps with one neighbor list; atoms are in the list's order."""
+    """States and cutoff decisions of successive steps with one neighbor list, atoms in its order."""
 
     # first, rows: its first step and the number of rows in use; those beyond are void
     first: int
@@ -93,7 +93,7 @@ class TapeStretch:
         return (self.steps, *(getattr(self, name) for name in ("x", "v", "images", *_COLUMNS[4:])))
 
     def cell_of(self, row: int, cell: Cell) -> Cell:
-        """Return the box at a row (step); row -1 is the step before the first row.
+        """Return the simulation box at the step of a row; row -1 is the step before the first row.
 
         Args:
             cell: the box of a run whose box does not move.
@@ -120,14 +120,14 @@ def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) 
 
 
 class Pace(NamedTuple):
-    """Spacing and first step of the frames that a loss uses."""
+    """Number of steps between the frames that a loss uses, and the first step that the loss uses."""
 
     between: Int[Array, ""]  # steps from one frame to the next; 0 where they are not a series at equal times
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the number of frames per unit of time near a step. If the energy jumps earlier by dt, the
-        number of frames after the jump increases by dt times the result.
+        """Return the number of frames per unit of time near a step. If a jump of the energy comes earlier by
+        a time dt, the number of frames after the jump increases by dt times the result.
         """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
@@ -135,7 +135,7 @@ class Pace(NamedTuple):
 
 
 def pace_of(loss: Loss, steps: int) -> Pace:
-    """Return the spacing of frames that a loss uses in a run with a given number of steps."""
+    """Return the number of steps between the frames that a loss uses in a run of `steps` steps."""
     seen = np.flatnonzero(loss.looks_at(np.arange(steps + 1), steps))
     spacings = np.unique(np.diff(seen))
     between = int(spacings[0]) if len(spacings) == 1 else 0
@@ -253,7 +253,7 @@ class RunTape:
         return map(self._whole, self._made)
 
     def seen(self, stretch: TapeStretch) -> Bool[np.ndarray, "room"]:
-        """Return a mask of the steps of a stretch that the loss uses."""
+        """Return, for each step of a stretch of the run, whether the loss uses this step."""
         steps = stretch.steps
         return self.loss.looks_at(steps, self.steps) & (np.arange(len(steps)) < stretch.rows)
 
@@ -302,7 +302,7 @@ class ReversibleTape(RunTape):
 
     @property
     def nbytes(self) -> int:
-        """Memory (bytes) of the bits that friction discarded; the memory grows with the number of steps."""
+        """Memory (bytes) for bits that the thermostat's friction discarded, which grows with each step."""
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:

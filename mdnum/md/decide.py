@@ -1,7 +1,7 @@
 """Decisions on which pairs are inside the cutoff, by the comparison that the system file specifies.
 
 The compared quantity and its threshold are defined only in this module. The force loop, the check of neighbor
-lists and the code that writes the ledger use this module. All decisions are therefore bitwise the same.
+lists and the code that writes the ledger use this module. All decisions on a pair are therefore identical.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ class PairDecider:
         """Bounds on |computed margin - exact margin| by pair type, in units of the compared r or r².
 
         The exact margin is that of the stored positions, with box and threshold in double precision. For the
-        error analysis, see numerics.rounding. The bound is evaluated at a distance of 1.001 r_cut, and holds
-        for every pair up to this distance. For more distant pairs, the decision is correct, or the margin is
-        within the bound. If atoms are beyond `reach`, `bounds_at` gives valid bounds.
+        error analysis, see numerics.rounding. The error bound is computed for a pair distance of 1.001 r_cut,
+        and holds for all shorter distances. For more distant pairs, the cutoff decision is correct, or
+        |margin| is below the bound. If coordinates exceed `reach`, `bounds_at` gives valid bounds.
         """
         return tuple(float(bound) for bound in self._bounds(None))
 
@@ -97,7 +97,7 @@ class PairDecider:
         return narrows and len(self.reach.lattice) < 3
 
     def bounds_at(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows types"]:
-        """Return margin bounds of several states, with larger bounds for atoms beyond `reach`.
+        """Return error bounds of margins for several states, which are larger for coordinates beyond `reach`.
 
         The rounding error of a position increases with its magnitude. Positions are not wrapped along
         nonperiodic axes.
@@ -115,7 +115,7 @@ class PairDecider:
         return bounds
 
     def _bounds(self, seen: Float[np.ndarray, "rows 3"] | None) -> list:
-        """Return margin bounds by pair type, for coordinates up to the maximum of `reach` and `seen`."""
+        """Return error bounds of margins by pair type, for coordinates up to max(`reach`, `seen`)."""
         bound = squared_distance_bound if self.space == "r2" else distance_bound
         given = self.reach, np.dtype(self.dtype), np.dtype(self.state), seen
         return [
@@ -165,7 +165,7 @@ class Tables(NamedTuple):
     edges: Int[Array, "first second"] | None = None
 
     def groups(self) -> tuple[Int[Array, "groups 4 atoms"], UInt8[Array, "groups 4 atoms"] | None]:
-        """Return neighbors and pair types in groups of GROUP slots."""
+        """Return neighbor indices and pair types from the neighbor list, in groups of GROUP entries."""
         atoms = self.index.shape[-1]
         types = None if self.types is None else self.types.reshape(-1, GROUP, atoms)
         return self.index.reshape(-1, GROUP, atoms), types
@@ -181,18 +181,18 @@ class Decisions(NamedTuple):
 
 
 def packed(halves: UInt8[Array, "groups atoms"]) -> UInt8[Array, "words atoms"]:
-    """Pack decisions into bytes, two groups of slots per byte."""
+    """Pack cutoff decisions into bytes; each byte contains those on two groups of neighbors."""
     return halves[0::2] | (halves[1::2] << jnp.uint8(GROUP))
 
 
 def halves_of(bits: UInt8[Array, "words atoms"]) -> UInt8[Array, "groups atoms"]:
-    """Unpack each byte into the decisions of two groups of slots, in the low bits: inverse of `packed`."""
+    """Unpack each byte into the cutoff decisions of two groups of neighbors: inverse of `packed`."""
     mask = jnp.uint8((1 << GROUP) - 1)
     return jnp.stack([bits & mask, bits >> jnp.uint8(GROUP)], axis=1).reshape(-1, bits.shape[-1])
 
 
 def unpacked(half: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
-    """Return the decisions of one group of slots as booleans."""
+    """Return the cutoff decisions of one group of neighbors as booleans."""
     # slot by slot: shifted all at once, by a vector, the loops that use them are not vectorized and take
     # twice the time
     return jnp.stack([half & jnp.uint8(1 << k) != 0 for k in range(GROUP)])
@@ -241,7 +241,7 @@ class SlotJudge:
         return d, quantity, self.decider.inside(quantity, threshold), threshold
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return the decisions on a group of slots, one bit each, and the smallest |margin| of each atom."""
+        """Return the cutoff decisions for a group of neighbors as bits, and each atom's smallest |margin|."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         margin = jnp.abs(threshold - quantity)
         for k in range(GROUP):
@@ -261,12 +261,12 @@ class SlotJudge:
         return self.finish(nearest, halves)
 
     def finish(self, nearest, halves) -> Decisions:
-        """Return the decisions for the whole neighbor list, with two groups of slots per byte."""
+        """Return the cutoff decisions for the neighbor list, two groups of neighbors in each byte."""
         return Decisions(packed(halves), jnp.min(nearest, initial=jnp.inf).astype(jnp.float64))
 
 
 def displacements(components, cell: Cell, j):
-    """Return minimum images of x_j - x_i by component; padding indices are clamped to valid indices."""
+    """Return the components of minimum-image vectors x_j - x_i; padding indices become valid indices."""
     return cell.minimum_image(*(c.at[j].get(mode="promise_in_bounds") - c for c in components))
 
 
@@ -290,20 +290,20 @@ class Changes(NamedTuple):
 
     @classmethod
     def empty(cls, room: int, dtype: np.dtype) -> Changes:
-        """Return empty buffers with space for the given number of changes."""
+        """Return empty buffers with space for the given number of changed cutoff decisions."""
         return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(3, np.int64))
 
     def emptied(self) -> Changes:
-        """Return the same buffers, with the number of changes set to zero."""
+        """Return the same buffers, with the number of changed cutoff decisions set to zero."""
         return self._replace(count=jnp.zeros_like(self.count))
 
     @property
     def found(self) -> int:
-        """Number of changes found, including changes that did not fit into the buffers."""
+        """Number of changed cutoff decisions, including those that did not fit into the buffers."""
         return int(np.asarray(self.count)[0])
 
     def cut(self) -> Changes:
-        """Return buffers cut to about the number of changes, to reduce the transfer to the host."""
+        """Return buffers shortened to the changes found, to reduce the transfer to the host."""
         room = 1 << self.found.bit_length()
         if foreign.known() or room >= len(self.pairs):
             return self
@@ -366,7 +366,7 @@ class Changes(NamedTuple):
 
 @partial(jax.jit, static_argnames="room")
 def _cut(parts: tuple[Array, ...], room: int) -> tuple[Array, ...]:
-    """Return the first `room` rows of each array."""
+    """Return arrays that contain only the first `room` rows of the given arrays."""
     return tuple(part[:room] for part in parts)
 
 
@@ -415,8 +415,8 @@ def note(before, bits, index, x, v, row, pairs, ends, count):
 
     The array of previous decisions is overwritten with the present decisions.
 
-    Words of 64 decisions are processed in blocks, by separate passes that find changes, look up neighbors and
-    store rows. In a single pass, every change would cost a mispredicted branch and a wait for memory.
+    Groups of 64 decisions are processed in blocks, by separate passes that find changes, look up neighbors
+    and store rows. In a single pass, every change would cost a mispredicted branch and a wait for memory.
     """
     words, atoms = bits.shape
     size, flat = words * atoms, index.reshape(-1)

@@ -233,7 +233,7 @@ class PairSearch:
     Positions are passed to jax-md as fractional coordinates in [0, 1), with the perpendicular widths as the
     box. For positions outside the box, jax-md loses pairs without an error. The search also rejects some
     valid triclinic boxes. After every search, the overflow flag is read outside jit. After an overflow, the
-    list is enlarged.
+    neighbor list is enlarged.
 
     Args:
         cell: lattice vectors as rows, length.
@@ -266,7 +266,7 @@ class PairSearch:
         self._update = jax.jit(lambda folded, previous: previous.update(folded))
 
     def _frame(self, fractional: np.ndarray) -> None:
-        """Place the interval [0, 1) around the atoms on nonperiodic axes, with a margin for their motion."""
+        """Let [0, 1) cover the fractional coordinates of all atoms on nonperiodic axes, with a margin."""
         low, high = fractional.min(axis=0), fractional.max(axis=0)
         self._low = np.where(self.pbc, 0.0, low - self.r_list)
         self._span = np.where(self.pbc, 1.0, high - low + 2 * self.r_list)

@@ -33,8 +33,8 @@ class ManyBody(eqx.Module):
     """Base class of potentials whose energy is not a sum over pairs.
 
     Pair decisions are made before the energy is evaluated: the neighbor list contains only pairs inside the
-    cutoff. An entry equal to the number of atoms is padding. Every potential also tests r < r_cut, so that a
-    neighbor list with a skin gives the same energy.
+    cutoff. Neighbor indices equal to the number of atoms are padding. Every potential also tests r < r_cut,
+    so that a neighbor list with a skin gives the same energy.
 
     Attributes:
         pbc: which axes are periodic.

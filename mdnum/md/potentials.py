@@ -34,7 +34,7 @@ else:
 
 
 def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> Num[Array, "..."]:
-    """Return the entries of an array for given pair types (None for a single type), without bounds checks."""
+    """Return the array entries of given pair types (`None` if there is only one), without bounds checks."""
     return leaf[0] if types is None else leaf.at[types].get(mode="promise_in_bounds")
 
 
@@ -300,7 +300,7 @@ for _potential in (LennardJones, Morse, SoftSphere):
 
 
 class SumPotential(PairPotential):
-    """Potential terms with a common pair decision; energies and slopes are tuples with one entry per term."""
+    """Potential terms that share one cutoff decision per pair; energies and slopes are tuples over terms."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     parts: tuple[PairPotential, ...]
@@ -322,7 +322,7 @@ class SumPotential(PairPotential):
 
 
 class Together(Cutoff):
-    """Cutoffs of terms with one pair decision; onsets, energies and slopes have one entry per term."""
+    """Cutoffs of terms that share one decision per pair; onsets, energies, slopes: one entry per term."""
 
     def __init__(self, ends: tuple[Cutoff, ...]):
         self.ends = ends
@@ -348,7 +348,7 @@ class Together(Cutoff):
 
 
 class CutPotential(eqx.Module):
-    """Pair potential with its cutoff, or a sum of pair potentials with a common pair decision."""
+    """Pair potential with its cutoff, or a sum of pair potentials that share one cutoff decision per pair."""
 
     potential: PairPotential  # bare potential, parameters per pair type
     cutoff: Cutoff = eqx.field(static=True)  # how it ends
@@ -408,7 +408,7 @@ class CutPotential(eqx.Module):
         return AtCutoff(self.r_cut, self.r_onset, energy, jax.tree.map(lambda w: 2 * self.r_cut * w, w))
 
     def evaluate(self, r2, types, at: AtCutoff, *weights):
-        """Return energy and denergy/d(r²) of pairs inside the cutoff, by pair type.
+        """Return the energy u and du/d(r²) of pairs inside the cutoff, by pair type.
 
         Args:
             r2: squared distances.
@@ -421,7 +421,7 @@ class CutPotential(eqx.Module):
         return self.cutoff.cut(r2, u, w, here, *weights)
 
     def jumps(self) -> Float[np.ndarray, "2 terms types"]:
-        """Return jumps of energy and radial force if a weight-1 pair enters the cutoff, by term and type."""
+        """Return the jumps of energy and radial force of weight-1 pairs at the cutoff, by term and type."""
         # in numpy: to jax each operation on these few numbers is a program to compile
         made = self.cutoff.jumps(jax.tree.map(np.asarray, self).at_cutoff())
         return np.array(made).swapaxes(0, 1)
@@ -432,9 +432,9 @@ class CutPotential(eqx.Module):
 
 
 class Channels(eqx.Module):
-    """Sum of potentials with different cutoff radii, with one decision per pair and radius.
+    """Sum of pair potentials with different cutoff radii; each pair has one cutoff decision for each radius.
 
-    Decisions are numbered consecutively over the pair types of all channels.
+    Cutoff decisions are numbered consecutively over the pair types of all radii (channels).
     """
 
     parts: tuple[CutPotential, ...]

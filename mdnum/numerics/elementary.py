@@ -82,7 +82,7 @@ _EXP = (
 
 
 def _reduced(x: Any, low: Any = None) -> tuple[Any, Any]:
-    """Return p and n such that exp(x + low) = (1 + p) 2^n; n is stored in the last bits of a float."""
+    """Return p and n such that exp(x + low) = (1 + p) 2^n; n is in the last bits of the second result."""
     shifted = x * (1 / math.log(2)) + _ROUND
     n = shifted - _ROUND
     r = (x - n * _LN2[0]) - n * _LN2[1]

@@ -1,9 +1,9 @@
 """Saltation: the change of a tangent vector (a perturbation) when the trajectory passes an event.
 
-A perturbed trajectory reaches a threshold at a different time than the unperturbed trajectory. Between the
-two times, only one trajectory follows the new equation of motion. To first order, the difference between the
-two times changes the tangent vector by a rank-one term. Derivatives of a time-stepping program lack the
-rank-one term, because time steps do not move with the event.
+A perturbed trajectory reaches a threshold at a different time than the unperturbed trajectory. Between these
+two arrival times, only one of the two trajectories follows the new equation of motion. To first order, the
+difference between the arrival times changes the tangent vector by a rank-one term. Derivatives of a
+time-stepping program lack the rank-one term, because time steps do not move with the event.
 
 The functions accept numpy and jax arrays with any number of leading batch axes, also inside jit.
 """

@@ -1,7 +1,7 @@
 """Energies, forces and stress from the formulas alone, computed in plain numpy on ASE's neighbor list.
 
-The numpy code is independent of the code used in a run. Each cutoff has its own numpy `reference`. If ASE has
-no class for a potential or a cutoff, the numpy code is the only reference.
+The numpy code is independent of the code used in a run. Each class of cutoffs has a method `reference` in
+numpy. If ASE has no class for a potential or a cutoff, the numpy code is the only reference.
 
 A model takes directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
 the total energy with respect to every d. Forces and stress follow from the gradient g of the energy with
@@ -48,7 +48,7 @@ def edges_of(atoms: Atoms, reach: float) -> Edges:
 
     ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster for 500 atoms than ASE's
     neighbor_list. ASE lists only pairs with r < reach, but the model must also receive pairs with r = reach.
-    The list therefore extends beyond reach, by SLACK.
+    The neighbor list therefore contains pairs up to a distance of reach + SLACK.
     """
     arrays = (atoms.positions, atoms.numbers, atoms.cell.array, atoms.pbc)
     key = (*(array.tobytes() for array in arrays), reach)
@@ -142,7 +142,7 @@ class PairForm:
     compare: str  # what inside means: "r2 <", "r2 <=", "r <" or "r <="
 
     def inside(self, distance: Float[ndarray, "pairs"]) -> Bool[ndarray, "pairs"]:
-        """Return whether distances are inside the cutoff, by the comparison (< or <=) in the system file."""
+        """Return for each distance whether it is inside the cutoff, by the system file's `<` or `<=`."""
         space, comparison = self.compare.split()
         quantity, threshold = (distance**2, self.r_cut**2) if space == "r2" else (distance, self.r_cut)
         return quantity <= threshold if comparison == "<=" else quantity < threshold
@@ -285,7 +285,7 @@ class _OneSpecies(Model):
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:
-        """Return the energy of each atom and the gradient, given edges within reach and unit vectors."""
+        """Return the energy of each atom and the gradient with respect to each d, for edges within reach."""
 
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
         gradient, inside = np.zeros_like(edges.d), edges.r < self.reach

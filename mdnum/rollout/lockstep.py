@@ -1,8 +1,8 @@
 """Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other run imposed.
 
-Each run without imposed decisions has the same bits as a single run, because neighbor lists and compiled
-loops are separate. Cutoff decisions are compared by means of their changes in both runs. The cost of this
-comparison does not depend on the number of pairs; only pairs with different decisions are stored.
+Without imposed decisions, each run gives the same bits as if it were made alone, because neighbor lists and
+compiled loops are separate. The comparison of the two runs uses only changes of cutoff decisions. The cost of
+this comparison does not depend on the number of pairs; only pairs with different decisions are stored.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mdnum.systems.simulation import Simulation
 
 
 def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactual]) -> Iterator[PairRows]:
-    """Advance two runs and their counterfactual runs together, in groups of time steps.
+    """Advance two runs, and copies of these runs with imposed decisions, in groups of time steps.
 
     Args:
         leader, follower: the runs A and B; the counterfactual with the decisions of a run is its listener.
@@ -86,7 +86,7 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
 def beside(
     leader: Track, runs: Sequence[Track | Counterfactual]
 ) -> Iterator[list[Float[np.ndarray, "rows"]]]:
-    """Yield the distance of each run from a leading run at each step, in groups of time steps."""
+    """Yield, for groups of time steps, the distance of each run from the run `leader` at each step."""
     while leader.segment() is not None:
         rows = leader.until(end := leader.ready)
         yield [separation_of(rows, run.until(end)) for run in runs]
@@ -139,7 +139,7 @@ def _per_row(doubts: AmbiguousPairs, rows: Rows) -> Int[np.ndarray, "rows"]:
 
 
 def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarray, "rows"]:
-    """Return, for each step, a lower bound (a length) on the distance of any pair from its cutoff."""
+    """Return, for each step, a lower bound on |pair distance - cutoff radius| over all pairs."""
     if rows is None or rows.nearest is None:
         return np.full(len(clock), np.nan)
     margin = rows.nearest

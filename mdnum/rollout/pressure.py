@@ -44,7 +44,7 @@ class PressureParts:
         return self.simulation.jumps()[0] if self.simulation.pairwise else np.zeros(1)
 
     def take(self, segment: Segment) -> None:
-        """Sample the pressure at a segment's last step if the box is periodic and its volume is finite."""
+        """Compute the pressure at a segment's last step if the box is periodic and its volume is finite."""
         simulation, row = self.simulation.in_row(segment.cell_of(segment.rows - 1)), segment.rows - 1
         volume = simulation.cell.volume
         if not (np.isfinite(volume) and all(simulation.pbc)):

@@ -69,7 +69,7 @@ class RunResult:
 
 @dataclass
 class _Progress:
-    """Totals of a run up to the current step, which are stored in checkpoints."""
+    """Counts and sums from the start of a run to the current step, which are stored in checkpoints."""
 
     tally: RunTally
     health: ListHealth
@@ -186,7 +186,7 @@ class Rollout:
             self.shown(here, np.asarray(positions, np.float64))
 
     def _needs_rows(self) -> bool:
-        """True if steps are read so often that storing them is faster than computing them again."""
+        """True if time steps are read so often that storing them is faster than repeating them."""
         simulation = self.simulation
         policy = simulation.policy
         # in single precision most steps have a margin within its bound, and a bad list misses pairs

@@ -520,7 +520,7 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
 
 
 def in_fixed_point(simulation: Simulation) -> Simulation:
-    """Return the simulation with a fixed-point state; the box is adjusted to the fixed-point units."""
+    """Return the simulation with a fixed-point state; box edges are rounded to the spacing of positions."""
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(

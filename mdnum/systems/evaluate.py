@@ -109,7 +109,7 @@ class Evaluator:
         )
 
     def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:
-        """Compute only the potential energy and the numbers that `Simulation.numbers` returns with it."""
+        """Compute only the potential energy, forces, and smallest and largest pair distances."""
         own = self.simulation
         _, _, _, tables, x = self._sorted(positions, None)
         bare = own.potential if own.pairwise else None

@@ -7,8 +7,8 @@ A parameter is a number or an array of numbers, and its name is a path. Paths ar
 indices).
 
 `dynamics.temperature` is the temperature of the thermostat. Drawn velocities scale with the square root of
-temperature; velocities of the structure do not change. `velocity.scale` scales all velocities, drawn or not.
-Without switching, the onset of a cutoff follows `cutoff.radius`. `box.scale` scales box and positions.
+temperature; velocities read from a file do not change. `velocity.scale` scales all initial velocities. For a
+cutoff without switching, the onset equals `cutoff.radius`. `box.scale` scales lattice vectors and positions.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def by(simulation: Simulation, name: str) -> str:
 
 
 def is_weight(name: str) -> bool:
-    """Return True if a path refers to the atomic weights of a term of the potential."""
+    """Return True if a path refers to the weights of the atoms in a term of the potential."""
     return name.startswith("terms.") and name.split(".")[2:] == ["weight"]
 
 
@@ -198,8 +198,8 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
     """Return the parameter arrays of pair potentials and of their cutoffs, by path.
 
     The argument `shared` adds arrays that do not depend on the pair type, and `species` adds arrays with one
-    entry per species. If all radii agree, the path `cutoff.radius` is the radius of all terms. If radii
-    differ, each term has its own path, and terms with equal radii share one array.
+    entry per species. If all cutoff radii are equal, `cutoff.radius` is the path of this common radius. If
+    cutoff radii differ, each term has its own path, and terms with equal cutoff radii share one array.
     """
     found: dict[str, Any] = {}
     for part in model.parts:
@@ -218,7 +218,7 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
 
 
 def shared_radius(model: Any, name: str) -> tuple[str, ...]:
-    """Return the terms that share a cutoff radius, given the path of the radius; none if it is not shared."""
+    """Return the potential terms that share the cutoff radius at a path; none if only one term has it."""
     table, term, key = (*name.split(".", 2), "", "")[:3]
     if table != "terms" or key != "cutoff.radius":
         return ()
@@ -307,7 +307,7 @@ def _heated(simulation: Simulation, new: float) -> Simulation:
 
 
 class Entry(NamedTuple):
-    """The parameter, index and unit factor to which a path refers."""
+    """The parameter to which a path refers, index of the array entry, and conversion factor of the unit."""
 
     whole: str  # path of the parameter
     index: tuple[int, ...] = ()  # which of its entries; empty for all of it
@@ -461,7 +461,7 @@ def _changed(simulation: Simulation, key: str, given: Any) -> Simulation:
 
 
 def redrawn(simulation: Simulation) -> Simulation:
-    """Return the simulation with drawn velocities instead of those of its structure."""
+    """Return the simulation with velocities drawn at random instead of those of its structure."""
     if simulation.file is not None:
         return changed(simulation, {"structure.velocities": "drawn"})
     return _drawn(replace(simulation, draw=replace(simulation.draw, drawn=True)))

@@ -84,7 +84,7 @@ class Collective:
 
 
 def spreads(x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "3"]:
-    """Return the standard deviations along the principal axes, in length units and ascending order."""
+    """Return the standard deviations of positions along the principal axes, a length, in ascending order."""
     away = x - x.mean(axis=0)
     return np.sqrt(np.maximum(np.linalg.eigvalsh(away.T @ away / len(x)), 0.0))
 
@@ -93,8 +93,8 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
     """Describe the plane, line or point into which all atoms have collapsed; None without a collapse.
 
     Rippled sheets may become flat, and bent chains may become straight, in a correct file. A collapse is
-    reported only if the earlier spread across the sheet or chain exceeded the distance between neighboring
-    atoms. If a coordinate is constant, a spread above a fifth of the largest is enough for a report.
+    reported only if, in earlier frames, the sheet or chain was thicker than the distance between neighboring
+    atoms. For a constant coordinate, a thickness above a fifth of the largest extent suffices for a report.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):

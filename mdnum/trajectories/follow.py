@@ -282,7 +282,7 @@ def _measure_flux(one: Followed, frame: Frame, groups: Groups, species: list[str
 
 @dataclass
 class SetDifference:
-    """Pairs (i, j, rank) that are neighbors in only one of two trajectories, updated with all their flips."""
+    """Pairs (i, j, rank) that are neighbors in one of two trajectories only, updated with their flips."""
 
     only_a: set[Pair] = field(default_factory=set)
     only_b: set[Pair] = field(default_factory=set)
@@ -486,9 +486,9 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 def _apart(
     found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
 ) -> tuple[Separation, float]:
-    """Return the separation of two frames (without a common shift), and its error bound.
+    """Return the distances of atoms between frames of two files, without a common shift, and an error bound.
 
-    A shift common to all atoms is removed only if it explains nearly all of the separation. A shift can
+    A shift common to all atoms is removed only if it explains nearly all of these distances. Such a shift can
     result from different origins of two files, or from removal of center-of-mass motion in one file.
     """
     now = separation(a, b, atoms)

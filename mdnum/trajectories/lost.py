@@ -76,7 +76,7 @@ class FrameMotion:
             return None
 
         def variance(ways: Float[np.ndarray, "ways atoms 3"]) -> float:
-            """Return the variance of displacements along an axis, without the mean motion of all atoms."""
+            """Return the variance of displacements along one axis, without the mean motion of all atoms."""
             free = ways - ways.mean(axis=1, keepdims=True)
             return float(np.mean([(free[:, side] ** 2).mean() for side in sides]))
 
@@ -109,7 +109,7 @@ class LostFlips:
 def lost_flips(
     found: Strides, motion: FrameMotion | None = None, flux: Any = None, reach: float = math.nan
 ) -> LostFlips | None:
-    """Estimate the flips missed between frames; None if there are fewer than three strides, or no flips.
+    """Estimate the flips missed between frames; None for fewer than three frame intervals, or for no flips.
 
     Args:
         found: number of flips found at each stride.
@@ -171,7 +171,7 @@ def _of_thinning(found: Strides) -> Estimate:
 
 
 def _carried_on(taken: Float[np.ndarray, "doublings"], error: Float[np.ndarray, "doublings"]) -> Estimate:
-    """Estimate the fraction of missed flips at stride 1 from the flips found at larger strides."""
+    """Estimate the fraction of flips missed in successive frames, from flips found if frames are skipped."""
     misfit = sum(((law - one) / off) ** 2 for law, one, off in zip(_TAKEN, taken, error, strict=False))
     weight = np.exp(np.min(misfit) / 2 - misfit / 2 - _RARE)
     mean = float(np.average(_LOST, weights=weight))

@@ -157,7 +157,7 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return a directed rule's threshold distances at the last frame; nan for atoms that are not centers.
+        """Return a directed rule's cutoff distances at the last frame; nan for atoms that are not centers.
 
         Returns:
             (distance below which a neighbor stays one, distance below which another atom becomes a neighbor).
@@ -238,7 +238,7 @@ class Tracker:
     # ---- two frames
 
     def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
-        """Return the flips found with the current tiles; None if tiles cannot be used for a frame."""
+        """Return the flips found with the tiles (pairs of clusters); None if the tiles are unusable."""
         who, bound, horizon = self._who, self.bound + now.rounding, HORIZON * self._who.radius
         clear = max(bound, horizon)
         if self._list is not None and not self._list.serve(before, now, who.radius, clear):

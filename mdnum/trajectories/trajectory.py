@@ -96,7 +96,7 @@ class Trajectory(ABC):
         return self.table.species
 
     def other_box(self, number: int) -> tuple[str, Box] | None:
-        """Return a finding's code and another possible box of the frame; None if only one box is possible."""
+        """Return (code of a finding, another possible box of a frame); None if only one box is possible."""
         return None
 
     @property

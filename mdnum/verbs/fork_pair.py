@@ -56,7 +56,7 @@ class PairQuestion:
 
 
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
-    """Return the last step: `steps` if given, otherwise the system's number of steps (at most `most`).
+    """Return the last step of a run: `steps` or, by default, that of the system file (at most `most`).
 
     Raises:
         InputError: steps is below 1.
@@ -94,7 +94,7 @@ def of_md(
 
 
 def basics(system: Simulation | System | BallSystem, steps: int | None) -> dict[str, Any]:
-    """Return the entries of summary.json on a system: name, size, last step, time step."""
+    """Return summary.json's entries on a system: name, number of atoms or balls, last step, time step."""
     from mdnum.systems import BallSystem, System
 
     head: dict[str, Any] = {"system": system.name}
@@ -159,7 +159,7 @@ def followed(
 
 
 def _numbers(made: Fork) -> dict[str, Any]:
-    """Return summary entries of two runs: steps of divergence, verdict, and growth of their distance."""
+    """Return summary entries on two runs: when they diverge, the verdict, growth of their distance."""
     step, verdict, growth = made.twin.a.timestep, made.verdict, made.growth["B"]
     dates = {"first_bit": made.dates.first_bit, "fork": made.dates.fork, "split": made.dates.split}
     free, imposed, overridden = (
@@ -204,7 +204,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
 
 
 def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
-    """Return the strain between the boxes of A and B at the end and at the divergence, and its maximum."""
+    """Return the strain between simulation boxes of runs A and B: its maximum, and at end and divergence."""
     if "strain" not in made.series:
         return {}
     strain, free = made.series["strain"], made.series["B"]
@@ -217,7 +217,7 @@ def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
-    """Return the fit exp(intercept + rate * step) to the distance of two runs, and its range of steps."""
+    """Return the fit exp(intercept + rate * step) to the distance of two runs, and the steps of the fit."""
     if not np.isfinite(fit.rate):
         return dict.fromkeys(("rate", "r_squared", "first", "last", "intercept"))
     step = np.arange(fit.first, fit.last + 1)
@@ -226,7 +226,7 @@ def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
 
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Predict the step at which two runs will split, from their distance or the Lyapunov exponent."""
+    """Predict the step at which two runs split, from the distance between them or the Lyapunov exponent."""
     from mdnum.numerics.verdicts import expected
 
     exponent = summary.get("lyapunov")
@@ -251,7 +251,7 @@ def _separation(made: Fork) -> dict[str, Any]:
 
 
 def _decision(made: Fork) -> dict[str, Any] | None:
-    """Return the first decision that differs between the runs, as plain values."""
+    """Return the first decision that differs between runs A and B, as plain values."""
     decision = made.decision
     if decision is None:
         return None
@@ -391,7 +391,7 @@ def _exponent(made: Fork) -> dict[str, Any]:
 
 
 def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
-    """Run B again with decisions of A imposed; return the result, or the reason why this is impossible."""
+    """Repeat run B with decisions of run A imposed; return the result, or the reason why it is impossible."""
     from mdnum.forks.replays import parse_pin, pinned
 
     try:
@@ -408,7 +408,7 @@ def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
 
 
 def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
-    """Return a minimal set of overridden decisions that keeps the runs from splitting, if one is found."""
+    """Return a smallest set of imposed decisions that keeps run B close to run A, if one is found."""
     from mdnum.forks.replays import disagreements, minimal_cause
 
     try:

@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """Return a phrase on the number of repeats in which the decisions of A, imposed on B, delay the split."""
+    """Return a phrase on how many repeats of run B split later if the decisions of run A are imposed."""
     said: list[str] = []
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -114,7 +114,7 @@ def decided(decision: Mapping[str, Any]) -> str:
 
 
 def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the first differing decision as made by A and by B, and which run decided yes."""
+    """Return the values of a decision in runs A and B, and the name of the run in which it is true."""
     yes = "A" if decision["decided"]["A"] > decision["decided"]["B"] else "B"
     return {"yes": yes, "no": "B" if yes == "A" else "A", "a": decision["decided"]["A"],
             "b": decision["decided"]["B"]}  # fmt: skip
@@ -210,7 +210,7 @@ def judge_compare(view: View) -> Verdict:
 
 
 def judge_benign(view: View) -> Verdict:
-    """Return the verdict on whether the runs of B are consistent with the ensemble of runs of A."""
+    """Return the verdict on whether repeats of run B are consistent with the ensemble of repeats of run A."""
     summary = view.summary
     values = {"difference": summary["difference"], "step": summary["window"]}
     if summary["passed"]:

@@ -128,7 +128,7 @@ class Interrupted(KeyboardInterrupt):
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns True after control-C; a second control-C raises KeyboardInterrupt.
 
-    Python delivers signals only to the main thread; in others, the yielded function always returns False.
+    Python delivers signals only to the main thread; in other threads, the function always returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -73,7 +73,7 @@ class RunView(View):
 
     @property
     def cutoff(self) -> Mapping[str, Any]:
-        """Kind and radius of the cutoff, comparison of distances, and jumps; empty without a cutoff."""
+        """Kind, radius and comparison of the cutoff, energy and force jumps; empty without a cutoff."""
         return self.summary.get("cutoff") or {}
 
     @property
@@ -152,7 +152,7 @@ class RunView(View):
         return Measured(left, self.units.energy, self.summary.get("energy_budget_tolerance"))
 
     def total(self, key: str, column: str | None = None) -> int:
-        """Return a total of the run: the value in the summary or, if missing, the sum over neighbor lists."""
+        """Return a count for the whole run: from the summary or, if missing, the sum over neighbor lists."""
         return int(self.summary.get(key) or self.epochs[column or key].sum())
 
     def step(self, row: int | np.integer) -> int:
@@ -443,7 +443,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
 
 
 def _ranges(run: RunView) -> Iterator[Any]:
-    """Yield a table of quantities' ranges, and of the first step at which they exceed narrower formats."""
+    """Yield a table of quantities' ranges, and when they first exceed narrower floating-point formats."""
     examined, series, units = run.table("ranges"), run.series, vars(run.units)
     sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
     sums["step"] = series["step"]

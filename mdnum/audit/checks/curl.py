@@ -98,7 +98,7 @@ class CurlCheck(AuditCheck):
 
 
 def agreed(tried: Sequence[Loop]) -> Loop:
-    """Return the loop whose curl has the smallest error; if other radii give another curl, enlarge the error.
+    """Return the loop whose curl has the smallest error; enlarge this error if loops of other radii disagree.
 
     The curl is the same for every small circle, while the work due to a jump of the forces depends on the
     radius.
@@ -153,7 +153,7 @@ def around(
 ) -> Loop:
     """Compute the work of the forces on the circle x + radius (u cos t + v sin t), with orthonormal u and v.
 
-    Error: estimated from the force noise, and from the work computed with half or a third of the points.
+    Error: estimated from the force noise, and from the work with half or a third of the points of the circle.
     """
     angles = 2 * np.pi * np.arange(_POINTS) / _POINTS
     forces = [

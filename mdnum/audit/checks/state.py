@@ -170,7 +170,7 @@ class Comparison:
 
 
 def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
-    """Return sequences in which two atoms come within the cutoff; if there are none, return the reasons."""
+    """Return sequences of structures in which two atoms come within the cutoff, or why there are none."""
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)
@@ -187,7 +187,7 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep
 def _through(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, name: str
 ) -> Iterator[Comparison]:
-    """Evaluate a sequence with one calculator object, and compare each result with that of a new object."""
+    """Compare one calculator object's results for a sequence of structures with those of new objects."""
     used = subject.used()
     before: Atoms | None = None
     known: dict[int, Answered] = {}
@@ -237,7 +237,7 @@ def _again(
 
 
 def _how(repeats: Mapping[str, Any]) -> str:
-    """Return the name of the variant of a finding's text that describes repeated calls."""
+    """Return the name of the text for a finding about repeated calls of a calculator."""
     if not repeats["bit-identical"]:
         return "state_not_repeated"
     return "state_repeated" if repeats["bit-identical between objects"] else "state_not_between"
@@ -296,7 +296,7 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
     """Return the longest move (Å) of an atom or cell edge that leaves energy and forces unchanged, or 0.
 
-    A move is considered only if it should change several of the last digits of energy and forces. The
+    A move is considered only if it should change several of the last digits of the energy and the forces. The
     expected change is proportional to the length of the move.
     """
     # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate

@@ -77,12 +77,12 @@ class Turns:
 
     @property
     def gap(self) -> Float[np.ndarray, "turns"]:
-        """Distance to the cutoff in a run with shorter steps; negative if the pair crossed the cutoff."""
+        """Difference of r and r_cut in a run with shorter steps; negative if the pair crossed the cutoff."""
         return self.table["gap"] + self.table["side"] * self.table["finer"]
 
     @property
     def reach(self) -> Float[np.ndarray, "turns"]:
-        """Uncertainty of the distance at each turning point, estimated from its shifts in other runs."""
+        """Uncertainty of the pair distance at turning points, from its changes in other runs."""
         if not len(self):
             return np.zeros(0)
         shift = self.table["shift"]
@@ -94,14 +94,14 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """True if a distance equals the cutoff within its error, or if a pair crosses only between steps."""
+        """True if a distance equals the cutoff within its error, or if a crossing has no recorded flip."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
         """Magnitude of the contribution that the two crossings at each turning point may have. If distance
         and cutoff agree within the uncertainty, the pair is assumed to pass the cutoff by 1 % of the
-        uncertainty. Otherwise, the result is the change of the contribution in a run with shorter steps.
+        uncertainty. Otherwise, the result is the change of the contribution in a run with shorter time steps.
         """
         bend, reach = self.table["bend"], self.reach
 
@@ -139,7 +139,7 @@ class Turns:
 
 @dataclass
 class Near:
-    """Collector of extrema of pair distances, of their derivatives, and of their shifts in other runs."""
+    """Collector of extrema of pair distances, their derivatives, and their changes in other runs."""
 
     simulation: Simulation
     pace: Pace  # how often the loss looks
@@ -156,7 +156,7 @@ class Near:
         return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
 
     def reverse(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Find turning points in a stretch of steps, and compute their weights from cotangents."""
+        """Find turning points in a stretch of steps, and compute their weights from loss derivatives."""
         if not self.jumps:
             return
         simulation = self.simulation
@@ -182,7 +182,7 @@ class Near:
         found["weight"] = force * along + seen
 
     def tangents(self, part: StretchTangents) -> None:
-        """Compute from tangents how each parameter changes the distance to the cutoff at turning points."""
+        """Compute from tangents how each parameter changes r_cut - r at the turning points of pairs."""
         simulation, stretch = self.simulation, part.stretch
         if part.dr is not None and part.dr_cut is not None:
             self.moved.append(part.dr_cut - part.dr)

@@ -77,7 +77,7 @@ class Case:
 
     @property
     def atoms(self) -> int:
-        """Number of atoms in the test case; the largest number if the number changes between calls."""
+        """Number of atoms in the test case; the largest number if calls have different numbers of atoms."""
         return max(len(still.positions) for still in self.stills)
 
     @property
@@ -86,7 +86,7 @@ class Case:
         return len(self.stills)
 
     def until(self, steps: int) -> Case:
-        """Return the test case with only its first `steps` calls."""
+        """Return the test case with only its first `steps` calls of the neighbor list."""
         return replace(self, stills=self.stills[:steps])
 
     def only(self, atoms: ndarray) -> Case:
@@ -98,7 +98,7 @@ class Case:
         return replace(self, stills=stills, known=None if self.known is None else _among(self.known, atoms))
 
     def changed(self, positions: Any = None, cell: Any = None, **other: Any) -> Case:
-        """Return the test case with functions applied to the positions and to the cell at every call."""
+        """Return the test case with functions applied to positions and cell of every neighbor-list call."""
         same = lambda rows: rows  # noqa: E731
         x, box = positions or same, cell or same
         stills = tuple(replace(one, positions=x(one.positions), cell=box(one.cell)) for one in self.stills)
@@ -154,7 +154,7 @@ def sequence(
 
 
 def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
-    """Return the pairs between the given atoms; atoms are renumbered by their index in `atoms`."""
+    """Return the pairs in which both atoms are in `atoms`; atom indices become indices into `atoms`."""
     most = int(max(atoms.max(initial=-1), pairs.i.max(initial=-1), pairs.j.max(initial=-1))) + 1
     new = np.full(most, -1)
     new[atoms] = np.arange(len(atoms))

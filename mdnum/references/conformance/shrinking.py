@@ -30,9 +30,9 @@ Failures = Callable[[Case], Sequence[Failure]]
 
 
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
-    """Return the smallest test case, among those tried before the deadline, that fails with the same code.
+    """Return the smallest test case tried before the deadline that fails with the same error code.
 
-    `failures` runs a test case and returns its failures; an updatable list is created anew for each run.
+    `failures` runs a test case and returns its failures; an updatable list is created anew for each test.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)
@@ -73,13 +73,13 @@ def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None)
 
 
 def _only(case: Case, atoms: list[int]) -> Case:
-    """Return the test case with only the given atoms; up to 400 atoms, precomputed pairs are dropped."""
+    """Return the test case with only the given atoms, and without stored pairs for up to 400 atoms."""
     smaller = case.only(np.array(atoms, int))
     return replace(smaller, known=None) if len(atoms) <= 400 else smaller
 
 
 def _sensible(case: Case) -> bool:
-    """Return whether a test case has finite numbers, a nonsingular box and a limited number of images."""
+    """Return whether a test case has finite numbers, a nonsingular box and not too many periodic images."""
     pbc = np.array(case.pbc)
     if not (0 < case.r_cut < np.inf and all(np.isfinite(still.positions).all() for still in case.stills)):
         return False
@@ -130,8 +130,8 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 def deepest(failures: Failures, failed: Failed) -> Failed:
     """Move the two atoms of a missing pair closer together as long as the list still omits the pair.
 
-    Both atoms continue along their path. The reported failure then shows the smallest distance at which the
-    list omits the pair.
+    All atoms move further along their displacement from the first to the second call. The reported failure
+    then shows the smallest distance at which the list omits the pair.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:

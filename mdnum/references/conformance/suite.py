@@ -50,7 +50,7 @@ _REFUSALS = 6  # refusals that are examined; a list with more kinds of them has 
 
 
 class Examiner:
-    """Determines the conventions of a neighbor list, runs test cases on the list, and checks its pairs.
+    """Finds out the conventions of a neighbor list, runs test cases, and checks the pairs that are returned.
 
     Args:
         reuse: use one object of the neighbor list for all test cases.
@@ -105,8 +105,8 @@ class Examiner:
     def _find_padding(self) -> None:
         """Determine whether an updatable list returns pairs beyond the cutoff, and up to which distance.
 
-        The padding is the declared padding, or the distance from the cutoff to the nearest pair missing from
-        the list.
+        The padding is the declared padding, or the distance by which the nearest missing pair exceeds the
+        cutoff.
         """
         report = self.report
         crowd = replace(once("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
@@ -146,7 +146,7 @@ class Examiner:
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """Return the errors at the first wrong call of a test case; none if the case exceeds a limit."""
+        """Return the errors at the first wrong call of a test case; none if a limit excludes the case."""
         return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
@@ -184,7 +184,7 @@ class Examiner:
     def _judge(
         self, case: Case, step: int, answer: ListAnswer, how: Conventions
     ) -> tuple[list[Failure], tuple[float, float] | None, tuple[int, int]]:
-        """Return failures, the rounding error if only float32 is reached, and numbers of pairs at r_cut."""
+        """Return failures, the rounding error if it is that of float32, and numbers of pairs at r_cut."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
@@ -224,7 +224,7 @@ def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
 
 
 def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
-    """Return the exact pairs of a call, together with those of earlier calls since the list was built."""
+    """Return the correct pairs at a call, and those of earlier calls since the neighbor list was built."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
@@ -378,7 +378,7 @@ def _too_long(report: Report, case: Case) -> str | None:
 
 
 def _refusals(examiner: Examiner) -> list[RefusalKind]:
-    """Return the kinds of rejected test cases, with variants that the neighbor list does not reject.
+    """Return the kinds of rejected test cases, and variants of each that the neighbor list accepts.
 
     Each variant of a test case is run in a new process, or with a new object.
     """
