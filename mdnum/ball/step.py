@@ -179,7 +179,7 @@ class BallVerlet(eqx.Module):
 class ImplicitMidpoint(eqx.Module):
     """Implicit midpoint scheme, solved by Newton's method; it has order 2 and is stable for any time step.
 
-    The acceleration is evaluated in the middle of the step. Derivatives are implicit derivatives of the
+    The acceleration is evaluated in the middle of the time step. Derivatives are implicit derivatives of the
     solved equation, not derivatives of the iterations.
     """
 
@@ -281,8 +281,8 @@ class _Forceless(eqx.Module):
 class Penalty(eqx.Module):
     """Contact by a spring and a damper: the force is k p - damping v, where p is the depth below the floor.
 
-    In a smooth contact, p is a softplus of -y. If contact is imposed, the force is -k y for either sign of y.
-    The force thus continues smoothly above the floor, like an imposed pair force beyond its cutoff.
+    In a smooth contact, p is a softplus of -y (y: height). If contact is imposed, the force is -k y at any
+    height y. The force thus continues smoothly above the floor, like an imposed pair force beyond its cutoff.
 
     Source: soft contact of the discrete element method (Cundall and Strack 1979).
     """

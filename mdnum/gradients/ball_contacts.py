@@ -258,7 +258,7 @@ def _suitable(problem: BallProblem) -> float:
 class ThroughContacts(BallMethod):
     """Gradient method: derivative of the ball's motion in continuous time, including the times of contacts.
 
-    Contact is decided at the end of each step. A ball that starts higher reaches the floor later. The
+    Contact is decided at the end of each time step. A ball that starts higher reaches the floor later. The
     derivative of the time steps omits the change of the contact time. A saltation matrix at every contact
     adds this change to the derivative. If impacts are located within a step, the program's own derivative
     already contains the saltation matrix. Contact by projection is differentiated like an impact. Without a

@@ -1,8 +1,8 @@
 """Cell-list neighbor search on the host, compiled by numba, for building Verlet lists.
 
-Bins are at least half a list radius wide. An axis that is too short for five bins has a single bin, so that
-all atoms along this axis are compared. Distances are minimum-image distances; calling functions reject radii
-larger than half the smallest perpendicular width.
+Bins are at least half as wide as the list radius. An axis that is too short for five bins has a single bin,
+so that all atoms along this axis are compared. Distances are minimum-image distances; calling functions
+reject radii larger than half the smallest perpendicular width.
 """
 
 from __future__ import annotations

@@ -138,9 +138,9 @@ def rescaled(
 class CSVR(Integrator):
     """Stochastic velocity rescaling in the canonical ensemble: velocity Verlet, then a random scale factor.
 
-    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). The noise depends only on the random key
-    and the step number. Two runs can have the same noise, and a resumed run continues the noise sequence. The
-    effective energy (total energy minus heat, eq. 15 of the paper) is conserved.
+    Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). The random numbers depend only on the
+    random key and the step number. Two runs can have the same random numbers, and a resumed run continues
+    their sequence. The effective energy (total energy minus heat, eq. 15 of the paper) is conserved.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="csvr",

@@ -154,7 +154,7 @@ def log1p(x: Any) -> Any:
 
 
 def power(x: Any, y: Any) -> Any:
-    """Return x to the power y, an integer if x is negative. The error is below 1.5 + |y|/40 ulp."""
+    """Return x to the power y, an integer for x < 0. The error of the power is below 1.5 + |y|/40 ulp."""
     size, huge = jnp.abs(x), 2.0**1000
     n, m = _split(size)
     # the logarithm in two parts: s and the sum that divides it lose what the second one has
@@ -184,7 +184,7 @@ _SIN = [(-1) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1)]
 
 
 def cos_sin(x: Any) -> tuple[Any, Any]:
-    """Return cosine and sine of x, or NaN if |x| exceeds 8e5. The absolute error is below 2.5e-16."""
+    """Return cosine and sine of x, or NaN if |x| exceeds 8e5. The absolute error of both is below 2.5e-16."""
     n = jnp.round(x * (2 / math.pi))
     r = (x - n * _HALF_PI[0]) - n * _HALF_PI[1]
     square = r * r

@@ -59,7 +59,7 @@ def _fence_jvp(primals, tangents):
 def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
     """Return dx² + dy² + dz² with the same bits as in numpy, because every operation is rounded.
 
-    The error is at most gamma_3 r² for exact dx, dy, dz, where gamma_n = n u / (1 - n u) (Higham 2002, 3.1).
+    The error of r² is at most gamma_3 r² for exact dx, dy, dz; gamma_n = n u / (1 - n u) (Higham 2002, 3.1).
     """
     return (fence(dx * dx, zero) + fence(dy * dy, zero)) + fence(dz * dz, zero)
 
@@ -296,7 +296,7 @@ _FAR = (
 def normal_quantile(u: jax.Array, zero: jax.Array) -> jax.Array:
     """Return sqrt(2) erf⁻¹(u) in float64, a standard normal deviate if u is uniform between -1 and 1.
 
-    The relative error is about 1e-15.
+    The relative error of the result is about 1e-15.
     """
 
     def ratio(parts, r):

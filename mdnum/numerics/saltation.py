@@ -65,7 +65,7 @@ def carry(
     reset_rate: Any = 0.0,
     threshold_rate: Any = 0.0,
 ) -> Float[Any, "*batch state"]:
-    """Return the tangent after an event, DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
+    """Return the tangent vector after an event, DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
 
     The result is the product of the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-) and dx. The
     saltation matrix is never formed, so the function can be used for many atoms. For a ball with coefficient

@@ -111,7 +111,7 @@ def _range(text: str, low: Any, high: Any, step: Any) -> tuple[Any, ...]:
 
 
 def with_base(axis: Axis, base: Any) -> Axis:
-    """Return an axis with the base value added to its values; values that are numbers are sorted."""
+    """Return an axis (a varied choice) whose values include the base value; sort values that are numbers."""
     same = [one for one in axis.values if one == base and type(one) is not bool]
     values = axis.values if same else (base, *axis.values)
     made = Axis(axis.key, values)

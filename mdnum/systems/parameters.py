@@ -353,7 +353,7 @@ def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
 
 
 def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
-    """Find the parameter path for a given name, which can be a path, an alias or an unambiguous ending.
+    """Find the parameter path for a name, which can be a path, an alias or an unambiguous end of a path.
 
     Args:
         word: a path, an alias such as "r_cut" or "dt", or an ending that only one path has.

@@ -518,7 +518,7 @@ def _sets_at(
     now: Separation,
     before: Separation,
 ) -> None:
-    """Record the difference of two neighbor sets at a frame, and write the pairs that began to differ."""
+    """Record the difference of two neighbor sets at a frame, and write pairs that are now in only one set."""
     difference, first = one.difference, False
     if one.certain is None and len(difference):
         # all that differ: one that came to differ within the resolution may be beyond it by now

@@ -5,7 +5,7 @@ Missed flips are flips that would be found if every time step of the run were ex
 measured coverage. The estimates by thinning and persistence are extrapolated to shorter frame intervals t.
 The assumed laws for the rate of observed flips are (1 + (t/τ)^p)^(-s/p). The exponent p is 2 for smooth
 atomic motion and 1 for abrupt velocity changes. The exponent s is 1/2 for diffusive motion and 1 for atoms
-that stay at their sites. The result is the mean over all laws that fit the data.
+that stay at their sites. The estimate is the mean over all laws that fit the data.
 """
 
 from __future__ import annotations

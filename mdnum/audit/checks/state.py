@@ -297,7 +297,7 @@ def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
     """Return the longest move (Å) of an atom or cell edge that leaves energy and forces unchanged, or 0.
 
     A move is considered only if it should change several of the last digits of the energy and the forces. The
-    expected change is proportional to the length of the move.
+    expected change of energy and forces is proportional to the length of the move.
     """
     # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate
     line = np.zeros((len(atoms), 3))
