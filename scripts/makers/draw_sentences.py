@@ -80,15 +80,12 @@ def errors() -> Iterator[tuple[str, str]]:
 
 
 def docstrings() -> Iterator[tuple[str, str]]:
-    """Sentences of docstrings in the package."""
+    """Sentences of docstrings in the package, with what they describe, as `help()` shows them."""
     for file in sorted((ROOT / "mdnum").rglob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (
-                text := ast.get_docstring(node)
-            ):
-                for part in re.split(r"\n\s*\n", _SECTION.split(text)[0]):
-                    if not part.startswith((" ", "Example", ">>>")):
-                        yield from _split(file, part)
+        for of, text in _described(ast.parse(file.read_text()), ""):
+            for part in re.split(r"\n\s*\n", _SECTION.split(text)[0]):
+                if not part.startswith((" ", "Example", ">>>")):
+                    yield from ((f"{place}{of}", sentence) for place, sentence in _split(file, part))
 
 
 def documents() -> Iterator[tuple[str, str]]:
@@ -97,10 +94,20 @@ def documents() -> Iterator[tuple[str, str]]:
         # code, formulas, marks that are not shown, and the lines of a notebook before its title
         hidden = r"^(```|~~~|\$\$).*?^(```|~~~|\$\$)|<!--.*?-->|\A---\n.*?^---$"
         text = re.sub(hidden, "", file.read_text(), flags=re.S | re.M)
-        text = re.sub(r"^(\||#|---|\s*:::).*$", "", text, flags=re.M)
+        text = re.sub(r"^(\||#|---|\s*:::).*$|\*\*", "", text, flags=re.M)
         # paragraphs, and items of lists
         for part in re.split(r"\n\s*\n|\n\s*(?=(?:\d+\.|[-*]) )", text):
             yield from _split(file, part.lstrip("-*>0123456789. "))
+
+
+def _described(node: ast.AST, of: str) -> Iterator[tuple[str, str]]:
+    if isinstance(node, ast.ClassDef | ast.FunctionDef):
+        arguments = f"({ast.unparse(node.args)})" if isinstance(node, ast.FunctionDef) else ""
+        of = f"{of or ': '}{'.' * (len(of) > 2)}{node.name}{arguments}"
+    if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
+        yield of, text
+    for one in ast.iter_child_nodes(node):
+        yield from _described(one, of)
 
 
 def _texts(tables: Any, only: str = "") -> Iterator[str]:
