@@ -132,7 +132,7 @@ def test_a_potential_of_two_constants(site, tmp_path):
     simulation = mdnum.build("pair/at-cutoff", overrides)
     assert simulation.potential.evaluate(np.float64(4.0))[0] == pytest.approx(0.5 / 2**8)
     assert check_energy(simulation).ok
-    with pytest.raises(InputError, match="strength missing"):
+    with pytest.raises(InputError, match="no value of strength"):
         mdnum.load("pair/at-cutoff", {"potential.kind": "power", "potential.length": 1.0})
     with pytest.raises(InputError, match=r"key sigma; .*length, strength"):
         mdnum.load("pair/at-cutoff", {**overrides, "potential.sigma": 1.0})

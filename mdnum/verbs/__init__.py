@@ -31,7 +31,7 @@ def _check(module: Any) -> None:
     if lacking := [one for one in calls if not callable(getattr(module, one, None))]:
         raise TypeError(f"the module {name} has no function {lacking[0]}, which its .toml file names")
     if {*texts.get("kinds", ())} != {*getattr(module, "KINDS", ())}:
-        raise TypeError(f"the module {name} and its .toml file list different kinds of folders")
+        raise TypeError(f"KINDS of {name} are not the kinds of folders that its .toml file lists")
     for kind, said in texts.get("kinds", {}).items():
         Layout(kind, **said)
         if VERBS.place(home(kind)) != name:

@@ -104,7 +104,7 @@ def test_each_pair_of_species_is_examined_for_itself():
 
 def test_an_end_of_its_own_where_the_cutoff_is_is_refused():
     """What a pair brings there would count as nothing."""
-    with pytest.raises(InputError, match=r"ended: .*Ar-Ar.* 0 .*2\.5.*-0\.0"):
+    with pytest.raises(InputError, match=r"ended: .*Ar-Ar.* -0\.05.* 0 .*2\.5"):
 
         def ended(r):
             return jnp.where(r < RADIUS, wall(r), 0)

@@ -166,7 +166,7 @@ def test_a_scale_that_overflows_is_noticed(exponent, finite):
 
 @pytest.mark.parametrize("scale", [1000.0, 0.0, -2.0, math.inf, math.nan])
 def test_factors_that_are_not_exact_are_refused(scale):
-    with pytest.raises(InputError, match=f"^the scale .* {scale:g}; .*power"):
+    with pytest.raises(InputError, match=f"^the scale .* {scale:g}, .*power"):
         check_scale(scale)
     check_scale(2.0**-30)
 

@@ -149,7 +149,7 @@ def test_what_is_no_configuration_is_refused_and_never_answered():
         for system in ("silicon/tersoff-512", "silicon/stillinger-weber-512"):
             other = bulk(element, "diamond", a=5.43, cubic=True) * (2, 2, 2)
             other.calc = MdnumCalculator(system)
-            with pytest.raises(InputError, match=f"holds {element}, .*Si"):
+            with pytest.raises(InputError, match=f"contains {element}, .*Si"):
                 other.get_potential_energy()
 
 

@@ -247,7 +247,7 @@ def test_a_cutoff_that_is_made_to_switch_does_so_from_the_same_place(network):
 
 def test_what_has_another_shape_or_no_meaning_is_refused(network):
     for values, message in (
-        ({"potential.layers.0.bias": np.ones(2)}, r"layers\.0\.bias: .* shape \(2,\).*shape \(3,\)"),
+        ({"potential.layers.0.bias": np.ones(2)}, r"layers\.0\.bias .* shape \(2,\).*shape \(3,\)"),
         ({"potential.layers.0.bias.7": 1.0}, r"potential\.layers\.0\.bias\.7"),
         ({"velocity.scale": np.nan}, "expected finite"),
         ({"initial.positions": network.positions[:-1]}, r"shape \(107, 3\)"),

@@ -111,7 +111,7 @@ def test_keys_of_terms(file):
         (
             "[dynamics]",
             '[potential]\nkind = "lennard-jones"\nsigma = 1.0\nepsilon = 1.0\n[dynamics]',
-            "either",
+            r"\[terms\.NAME\.potential\]",
         ),
         (
             '[terms.tail.cutoff]\nkind = "hard"',

@@ -316,9 +316,9 @@ def test_variants_of_a_finding(good: BallView):
     assert (finding.values["names"], finding.values["places"]) == ("k", "in variant fragile")
     implicit = made("implicit", {"k": 0.0}, {"k": False})
     finding = codes(altered(good, gradient=[implicit]))["LOSS_INDEPENDENT"]
-    assert "fixed point" in finding.text and "branch" not in finding.text
+    assert "fixed point" in finding.text and "loop" not in finding.text
     both = [implicit, made("unrolled", {"k": 0.0}, {"k": False})]
-    assert "branch" in codes(altered(good, gradient=both))["LOSS_INDEPENDENT"].text
+    assert "loop" in codes(altered(good, gradient=both))["LOSS_INDEPENDENT"].text
     exact = {"gradient": {"k": -2.9e-5}, "height_error": 1e-9, "height_error_largest": 1e-9}
     both = [own, made("event-aware", {"k": -2.9e-5})]
     finding = codes(altered(good, gradient=both, exact=exact))["METHODS_DISAGREE"]

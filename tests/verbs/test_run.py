@@ -282,7 +282,7 @@ def test_remedies_name_what_the_system_has(good):
             good, {"cutoff": {**good.cutoff, "energy_jump": jump, "force_jump": 1e-3}, "ambiguous": 2},
             system=many_body, **tie,
         )  # fmt: skip
-        assert not any("cutoff." in each.remedy for each in judge(view).findings)
+        assert not any(re.search(r"cutoff\.\w", each.remedy) for each in judge(view).findings)
         assert ("HARD_CUTOFF" in found(view)) == bool(jump)
     rounding = {"cutoff": {**good.cutoff, "energy_jump": 9e-24, "force_jump": 1e-22}}
     assert not {"HARD_CUTOFF", "FORCE_JUMP"} & set(found(changed(good, rounding)))
