@@ -252,7 +252,7 @@ class EventLocated(eqx.Module):
         return r(y + drift), r(v + r(self.h * a))
 
     def push(self, pull, motion):
-        raise TypeError("the event-located integrator computes impacts, but no contact forces")
+        raise TypeError("the integrator event-located computes impacts, but no contact forces")
 
 
 # --- contact models -------------------------------------------------------------------------------------

@@ -117,7 +117,7 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
     where = f"{first.path} and {second.path}"
     if first.kind != second.kind:
         kinds = f"the folders hold runs of different kinds, {first.kind} and {second.kind}"
-        raise InputError(kinds, where=where, remedy="Compare two runs of atoms, or two runs of balls")
+        raise InputError(kinds, where=where, remedy="Give two folders of the same kind")
     with first.explained(), second.explained():
         return _compared(first, second, where)
 

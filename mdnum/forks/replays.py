@@ -190,8 +190,8 @@ def check_pins(fork: Fork) -> None:
         )
     if b.frame is not None and not b.frame.is_same:
         raise InputError(
-            "runs A and B list the atoms in different orders or use different axes",
-            remedy="Vary a choice that changes neither the order of the atoms nor the axes",
+            "runs A and B list the atoms in different orders or use different coordinate axes",
+            remedy="Compare runs with the same order of atoms and the same coordinate axes",
         )
 
 

@@ -87,7 +87,7 @@ class PairPotentialTable(TomlTable):
         if not pairs:
             missing = [key for key in self.constants if getattr(self, key, None) is None]
             if missing:
-                raise ValueError(f"no value of {', '.join(missing)} was given here or in [pairs]")
+                raise ValueError(f"no value of {', '.join(missing)} was given, either here or in [pairs]")
         return self
 
     @property

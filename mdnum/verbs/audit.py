@@ -297,7 +297,7 @@ def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: P
         )
     if isinstance(calculator, str) and state.named and calculator != state.name:
         raise InputError(
-            f"the folder contains an audit of {state.name}, not of {calculator}", remedy="Omit the calculator"
+            f"the folder contains an audit of {state.name}, not of {calculator}", remedy="Give no calculator"
         )
     return _loaded(state.name if calculator is None else calculator)
 

@@ -157,7 +157,7 @@ def conform(
         )  # fmt: skip
         if not pairs:
             raise InputError(
-                "no neighbor list was given", remedy="Give a name, package.module:function or a function"
+                "no neighbor list was given", remedy="Give the name of a known list, or a function"
             )
         tested = options.declared(load(pairs) if isinstance(pairs, str) else from_object(pairs))
         name = tested.name, tested.version

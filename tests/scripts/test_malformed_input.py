@@ -50,7 +50,7 @@ def write(folder: Path, text: str, **files: str) -> Path:
         # sizes from which no distance can be told
         ("22.0 0.0 0.0 0.0 22.0", "1e300 0.0 0.0 0.0 22.0", "cell vector a is 1e+300 Å long"),
         ("5.1 1.0 1.0", "1e200 1.0 1.0", "atom 1 (Ar) has a coordinate of 1e+200 Å"),
-        ("5.1 1.0 1.0", "1e17 1.0 1.0", "rounding error of 16 Å"),
+        ("5.1 1.0 1.0", "1e17 1.0 1.0", "coordinate is 16 Å"),
         # values that cannot be computed with
         ("steps = 4", "steps = " + "[" * 50 + "]" * 50, "nested more than 20 deep"),
         ("steps = 4", "steps = " + "[" * 50_000 + "]" * 50_000, "nested more than 20 deep"),
