@@ -58,7 +58,7 @@ def _kept(compiled: Callable[[bool], Any]) -> Any:
 
 
 def _attempt(use: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a method of the cache, so that errors from unreadable files or a full disk are recorded."""
+    """Wrap a method of numba's cache, so that errors from unreadable files or a full disk are recorded."""
 
     def attempt(*given: Any) -> Any:
         try:

@@ -48,7 +48,7 @@ class BallDecisions(NamedTuple):
 
 
 class BallRecord(NamedTuple):
-    """Record of one time step: height, contact decision, remaining penetration and iterative solve."""
+    """Record of one time step: height, contact decision, remaining penetration and solver iterations."""
 
     height: Float[Array, "balls"]  # what the contact decision compared with zero, m, shape (balls,)
     contact: Bool[Array, "balls"]  # the decision, shape (balls,)

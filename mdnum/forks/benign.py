@@ -111,8 +111,8 @@ class Space:
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
     """Return the number of standard deviations above which a principal component counts as an outlier.
 
-    The outlier limit is two standard deviations, or more if over a tenth of the ensemble's runs would exceed
-    two. Principal components for a run are computed from other runs, as a run influences its own.
+    The outlier limit is two standard deviations, or more if over a tenth of the ensemble would be outliers.
+    Principal components for a run are computed from other runs, as a run influences its own.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -133,7 +133,7 @@ def two_of_three(rate: float) -> float:
 
 
 def bounds(count: int, of: int) -> tuple[float, float]:
-    """Compute the exact (Clopper-Pearson) 95 % confidence interval of the rate `count` / `of` of trials."""
+    """Compute the exact (Clopper-Pearson) 95 % confidence interval of a rate, from `count` of `of` trials."""
     tail = 0.025
     low = betaincinv(count, of - count + 1, tail) if count else 0.0
     high = betaincinv(count + 1, of - count, 1 - tail) if count < of else 1.0
@@ -285,7 +285,7 @@ def calibrate(
 
 
 def choose(windows: Sequence[Window], name: str) -> Window:
-    """Return the latest step at which all deliberate changes are clearly seen, or the most sensitive step.
+    """Return the latest step at which all deliberate changes are well detected, or the most sensitive step.
 
     Raises:
         InputError: at no step are the deliberate changes distinguishable from rounding.

@@ -42,7 +42,7 @@ _NUMBERS = (
 
 
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
-    """Return the peak positions of the hat functions of the pair histogram, followed by the histogram's end.
+    """Return the peak positions of the hat functions of the pair histogram, then the histogram's upper end.
 
     The distances extend from the closest pairs of the initial state to the largest distance that is counted.
     """
@@ -108,7 +108,7 @@ def hats(
     """Count pair distances with hat functions: each distance contributes to the two nearest nodes.
 
     The contribution to a node grows linearly as the distance approaches the node. A distance below the first
-    node counts as this node. No count jumps when a distance passes the last node, which ends the range.
+    node is counted at this node. No count jumps when a distance passes the last node, which ends the range.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)
@@ -203,8 +203,8 @@ def planted(a: Simulation) -> tuple[Change, ...]:
     """Create the programs with deliberate changes that are possible for a simulation.
 
     The test must detect programs with a longer time step or a shorter cutoff. Programs with forces in another
-    precision, with pairs in another order or with another neighbor search must pass. The cutoff and the
-    precision of a many-body potential cannot be changed, so these two changes are omitted for it.
+    precision, with pairs in another order or with another neighbor search must pass the test. The cutoff and
+    the precision of a many-body potential cannot be changed, so these two changes are omitted for it.
     """
     longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
     search = next(name for name in BUILDERS if name != a.builder)

@@ -1,7 +1,7 @@
 """Find where two finished runs diverge, and how the runs differ, using only their folders.
 
-Neither run is repeated. The first step with different bits and the fork (first differing decision) are read
-from both folders. To compare positions, `twin_of` rebuilds the programs; `mdnum.forks.fork` repeats the runs.
+The fork (first differing decision) and the first step at which any bit of the states differs are read from
+both folders; no run is repeated. To compare positions, `twin_of` rebuilds the programs, `fork` repeats runs.
 
 Runs cannot be compared if the atoms, box, potential or contact model of their systems differ. Runs may differ
 in any other parameter or numerical choice.
@@ -225,8 +225,8 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """Return the numerical choices that differ, given the keys with different values. All dtypes together
-    count as one numerical choice; so do a cutoff and its parameters.
+    """Return the numerical choices in which two systems differ, given the keys whose values differ. All
+    dtypes together count as one numerical choice; so do a cutoff and its parameters.
     """
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}

@@ -8,8 +8,8 @@ added one by one to the sum over the atom's own row. An ordered-sparse list cont
 Forces from atoms with larger labels form one sum, and forces from atoms with smaller labels form another.
 
 Source: jax_md.smap.pair_neighbor_list of jax-md 0.2.29, whose forces are reproduced bit for bit
-(tests/forks/test_choices.py). XLA sums more than 32 slots of an atom in blocks of 32, which this module does
-not reproduce.
+(tests/forks/test_choices.py). For an atom with more than 32 slots, XLA adds the slots in blocks of 32, which
+this module does not reproduce.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Build the programs of systems (molecular dynamics or bouncing balls), and read and change parameters.
+"""Build the programs of systems (molecular dynamics or bouncing balls); read and change system parameters.
 
 Modules of molecular dynamics are imported inside functions, because they import jax_md, which is not required
 for a ball.
@@ -29,7 +29,7 @@ _BALL_ELSEWHERE = ("loss", "gradient", "variants", "precision", "fork")
 
 
 def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Program:
-    """Return the program that makes the run of a simulation or of a ball system.
+    """Return the program that runs a molecular-dynamics simulation or a bouncing-ball system.
 
     Args:
         steps: number of time steps of a ball's run; default the number in its file.
@@ -48,7 +48,7 @@ def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Pro
 def packed(system: Simulation | BallSystem, *more: Any) -> bytes:
     """Pickle a system and other objects for another process, where `unpacked` restores them bit for bit.
 
-    A system from a file is read again from the file, because code in the file exists only in this process.
+    The other process loads a system from its file, because code in the file exists only in this process.
     """
     import cloudpickle
 
@@ -97,8 +97,8 @@ def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> 
 
 
 def alike(a: Any, b: Any) -> tuple[Any, Any]:
-    """Return two systems whose decisions can be compared. If terms of the potential share decisions in only
-    one system, both returned systems decide separately for each term.
+    """Return two systems whose decisions can be compared. If terms of the potential share pair decisions in
+    only one system, both returned systems decide separately for each term.
     """
     if isinstance(a, BallSystem) or not (a.pairwise and b.pairwise):
         return a, b
@@ -125,7 +125,7 @@ def changes(a: Any, b: Any) -> dict[str, list[Any]]:
 
 
 def floats(system: Any) -> dict[str, float]:
-    """Return, by dotted key, the floating-point parameters of a system that affect a time step."""
+    """Return, by dotted key, the floating-point parameters of a system that enter into a time step."""
     if isinstance(system, BallSystem):
         data = system.spec.model_dump(mode="python", exclude_none=True, exclude=set(_BALL_ELSEWHERE))
         return {key: value for key, value in flat(data).items() if isinstance(value, float)}

@@ -210,7 +210,7 @@ class SoftFloor(BallMethod):
 
 
 def softened(problem: BallProblem, eps: float) -> BallProblem:
-    """Return the problem with a soft floor that yields by about eps (softplus, or a spring for impacts).
+    """Return the problem with a soft floor: a softplus of width eps or, for impacts, a spring.
 
     Raises:
         InputError: the ball would cross the soft floor of width eps in too few steps.
@@ -343,7 +343,7 @@ class _SaltatingProjection(_SaltatingReset, Projection):
 
 class _SaltatingPenalty(Penalty):
     def move(self, motion: Motion) -> Moved:
-        """Compute one step with a spring whose damper force jumps by -damping v at contact (saltation)."""
+        """Compute one step with a spring whose damper force jumps at contact; add the saltation term."""
         contact = super().move(motion).record.contact
         y, v = lax.stop_gradient((motion.y, motion.v))
         jump = jnp.where(contact, -1.0, 1.0).astype(v.dtype) * lax.stop_gradient(self.damping) * v

@@ -432,11 +432,11 @@ def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
 
 @dataclass(frozen=True)
 class SmoothedDifferences(Method):
-    """Gradient method: mean over replicas of central differences with steps that span many flips.
+    """Gradient method: mean over replicas of central differences with parameter steps that span many flips.
 
     The two runs of a difference use the same random numbers. Differences with steps h and h/2 are
     extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with those from
-    all narrower steps within twice the standard error. Single flips add more noise if steps are narrower.
+    all narrower steps within twice the standard error. Smaller steps increase the noise due to single flips.
     """
 
     relative: float = 0.002  # the widest step as a share of the parameter

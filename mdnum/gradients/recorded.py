@@ -75,7 +75,7 @@ def passed(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> ReversePass:
-    """Make the run of a problem and its reverse pass; callbacks receive the cotangents of groups of steps.
+    """Run a simulation and its reverse pass; callbacks receive the cotangents of groups of time steps.
 
     Args:
         names: full names of the parameters. saltation: whether to include the contribution of flips.
@@ -111,7 +111,7 @@ def passed(
 
 
 def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progress | None = None) -> RunTape:
-    """Make the run that a problem describes, and return the recorded run."""
+    """Run the simulation of a problem, and return the recorded run."""
     return RunTape(
         problem.simulation, problem.loss, problem.steps, flips=flips, budget=budget,
         progress=in_phase(progress, "run"),
@@ -267,7 +267,7 @@ class Reversible(Method):
 
 @dataclass(frozen=True)
 class Surrogate(Method):
-    """Gradient method: gradient for a switched version of the cutoff, so that the force does not jump."""
+    """Gradient method: derivative of another program, with a switching function so that no force jumps."""
 
     cutoff: str = "quintic"  # of the twin; one with an onset
     onset: float = ONSET_FRACTION  # where its switching begins, as a share of the cutoff
@@ -285,7 +285,7 @@ class Surrogate(Method):
         return self.method.reason_unavailable(self.twin(problem), names)
 
     def twin(self, problem: Problem) -> Problem:
-        """Return the problem with a switched cutoff, which is differentiated instead of the given problem."""
+        """Return the problem with a switching function at the cutoff, which is differentiated instead."""
         made = problem.simulation.with_cutoff(self.cutoff)
         onset = parameters.value(made, "cutoff.radius") * self.onset
         return replace(problem, simulation=made).at({"cutoff.onset": onset})

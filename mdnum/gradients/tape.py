@@ -126,8 +126,8 @@ class Pace(NamedTuple):
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the number of frames per unit of time near a step. If a jump of the energy comes earlier by
-        a time dt, the number of frames after the jump increases by dt times the result.
+        """Return the number of the loss's frames per unit of time near a step. If a jump of the energy comes
+        earlier by a time dt, the number of frames after the jump increases by dt times the result.
         """
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
@@ -414,7 +414,7 @@ def no_sums(loss: Loss, origin: LossFrame, around: LossContext) -> Any:
 
 
 def frame_of_start(start: Start, simulation: Simulation) -> LossFrame:
-    """Return the frame of step 0, with NaN for energies, which are not known at this point."""
+    """Return the frame of step 0, with NaN for energies, because they have not been computed yet."""
     state = start.state
     matrix = jnp.asarray(np.asarray(simulation.cell.matrix), jnp.float64)
     whole = state.x + (matrix.T @ state.images.astype(matrix.dtype)).astype(state.x.dtype)

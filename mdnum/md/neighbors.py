@@ -97,7 +97,7 @@ class PairTable:
         return (i + channel * len(self.order))[keep], j[keep]
 
     def listed(self, channels: int = 1) -> tuple[Int[np.ndarray, "pairs"], ...]:
-        """Return, for each pair and cutoff, the sorted indices of both atoms, and i and j as in `decided`."""
+        """Return, for each pair and cutoff, both indices in sorted order, and i and j as in `decided`."""
         slots, first = np.nonzero(self.index < len(self.order))
         second = self.index[slots, first]
         i, j = self.order[first], self.order[second]
@@ -107,7 +107,7 @@ class PairTable:
         return first, second, i + np.repeat(np.arange(channels), once.sum()) * len(self.order), j
 
     def unsorted(self) -> Int[np.ndarray, "atoms slots"]:
-        """Return neighbors in the input order, one row per atom, padded with the number of atoms."""
+        """Return each atom's neighbors in the input order; empty slots contain the number of atoms."""
         atoms = self.index.shape[1]
         labels = np.append(self.order, atoms).astype(np.int32)
         out = np.empty((atoms, self.slots), np.int32)
@@ -127,7 +127,7 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Return neighbor table, atom order and largest neighbor count; above `slots`, pairs are missing."""
+        """Return neighbor table, atom order and largest neighbor count (above `slots`: pairs are missing)."""
         ...
 
 

@@ -50,7 +50,7 @@ class FloatFormat:
 
     @property
     def smallest_subnormal(self) -> float:
-        """The smallest positive number; below the smallest normal number, numbers have this spacing."""
+        """The smallest positive number of the format, which is also the spacing of its subnormal numbers."""
         return 2.0 ** (self.emin + 1 - self.significand)
 
 
@@ -119,8 +119,8 @@ def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Arr
 
     The result has the dtype of x; an x that the format can represent is unchanged. Up to the largest number
     of the format, the expected value is x, and the standard deviation is at most half the spacing of numbers.
-    A long sum of small terms therefore does not stagnate. The random numbers have 53 bits. The derivative
-    with respect to x is 1. Source: Croci et al., R. Soc. Open Sci. 9, 211631 (2022).
+    A long sum of small terms therefore does not stagnate. The random numbers have 53 bits. The derivative of
+    the result with respect to x is defined as 1. Source: Croci et al., R. Soc. Open Sci. 9, 211631 (2022).
     """
 
     def up_or_down(places: Array) -> Array:
@@ -163,7 +163,7 @@ def scaled_gradient(function: Callable[..., Any], scale: float | Array, *args: A
 
 
 def check_scale(scale: float) -> None:
-    """Check that multiplication by a scaling factor of the loss is exact.
+    """Check that multiplying the loss by a scaling factor causes no rounding error.
 
     Raises:
         InputError: the factor is not a power of two.

@@ -76,7 +76,7 @@ class Reach:
         return cls(tuple(_three(row) for row in lattice), _three(coordinate))
 
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
-        """Return, by axis, the sum of |lattice components| over all rounded results, and the rounding count.
+        """Return, by axis, the sum of |lattice components| over all rounded results, and their number.
 
         After the first subtraction, a component of the displacement is d + n_1 a_1 + n_2 a_2 + n_3 a_3, where
         d is its final value and each n is -1, 0 or 1. Each further subtraction of a lattice vector removes
@@ -106,11 +106,11 @@ def displacement_bound(
 ):
     """Return a bound on the error (length of the error vector) of a computed displacement.
 
-    Each rounded result adds at most u times its magnitude to the error. If the dtype of the state has more
-    digits than `dtype`, the positions of both atoms are first rounded. If float64 has more digits than
-    `dtype`, the lattice vectors of the box are also rounded. The exact displacement is defined by the
-    positions of the state and the box of the system file. The nearest image found in `dtype` must be the true
-    nearest image. Therefore, r_cut must be below half the box width by more than the rounding error.
+    Each rounded result adds at most the unit roundoff times its magnitude to the error. If the dtype of the
+    state has more digits than `dtype`, the positions of both atoms are first rounded. If float64 has more
+    digits than `dtype`, the lattice vectors of the box are also rounded. The exact displacement is defined by
+    the positions of the state and the box of the system file. The nearest image found in `dtype` must be the
+    true nearest image. Therefore, r_cut must be below half the box width by more than the rounding error.
 
     Args:
         r: length(s) of the displacement.

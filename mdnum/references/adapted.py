@@ -43,7 +43,7 @@ class StepAtCutoff(ClassicalCalculator):
 
 
 class SpeciesSum(ClassicalCalculator):
-    """ASE calculator of a mixture. The energy of unlike atoms is that of all pairs minus that of like pairs.
+    """ASE calculator of a mixture. The energy of unlike pairs is that of all pairs minus that of like pairs.
 
     Args:
         parts: (calculator, species a, species b) for every pair of species in the structure.
@@ -122,7 +122,7 @@ def morse(form: PairForm, begin: float, end: float) -> Calculator:
 
 
 def short_listed_eam(file: Path) -> Calculator:
-    """Return ASE's EAM with a short neighbor list; ASE's own list reaches 2 (cutoff + skin) and is slow."""
+    """Return ASE's EAM with a short neighbor list; the default list, up to 2 (cutoff + skin), is slow."""
     from ase.calculators.eam import EAM
     from ase.neighborlist import NeighborList
 

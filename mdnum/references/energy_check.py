@@ -266,7 +266,7 @@ def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
 
 
 def _over(difference: float, scale: float) -> float:
-    """Return a difference divided by the scale of its quantity; 0 for a zero difference, even at scale 0."""
+    """Return a difference divided by the scale of its quantity; 0 if the difference is 0, even at scale 0."""
     return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
 
 
@@ -275,7 +275,7 @@ class _Scales:
     """Scales by which differences of energy, force and stress are divided.
 
     The energy scale is the sum of |energies|, the force scale the largest force on an atom or along a pair,
-    and the stress scale the sum of |virial terms| per volume. *_expected are expected rounding errors.
+    and the stress scale the sum of |virial terms| per volume. Fields *_expected are expected rounding errors.
     """
 
     energy: float

@@ -116,8 +116,8 @@ def all_searches(system: Simulation) -> tuple[Search, ...]:
 def own_searches(system: Simulation) -> tuple[Search, ...]:
     """Return the neighbor searches of mdnum, set up for a system.
 
-    The search "mdnum force loop" makes the cutoff decision of the force evaluation, without jit. The searches
-    "mdnum, host list" and "mdnum, jax-md list" use mdnum's two list builders, with the same decision.
+    The search "mdnum force loop" selects pairs like the force evaluation, but without jit. The searches
+    "mdnum, host list" and "mdnum, jax-md list" use mdnum's two list builders, and decide in the same way.
     """
     compare, dtype = system.decider.compare, system.policy.decision
     unit = _SINGLE if "float32" in (dtype, system.policy.state) else 2.0**-53
@@ -154,7 +154,7 @@ def _force_loop(system: Simulation) -> Callable[..., Any]:
 
 
 def _radii(system: Simulation) -> ndarray:
-    """Return the cutoff radius of every two species, shape (species, species)."""
+    """Return the cutoff radius of every pair of species, shape (species, species)."""
     rows, columns = np.triu_indices(len(system.symbols))
     table = np.zeros((len(system.symbols),) * 2)
     table[rows, columns] = table[columns, rows] = system.decider.r_cut

@@ -26,7 +26,7 @@ _META, _STORE = "mdnum meta", "mdnum store"
 def write(
     path: Path, state: Mapping[str, Any], store: Mapping[str, Any], beside: Mapping[str, list[str]]
 ) -> None:
-    """Write a checkpoint file, and list in the manifest this file and others written since the last one.
+    """Write a checkpoint file, and list in the manifest all files written since the previous checkpoint.
 
     Args:
         state: state of the run: arrays, and values that JSON can represent.
@@ -45,7 +45,7 @@ def write(
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the state and the lengths of files that are stored in a checkpoint.
+    """Return the state and the file lengths that a checkpoint contains.
 
     Raises:
         FolderError: the checkpoint is damaged, or it is compressed (mdnum does not compress checkpoints).

@@ -43,7 +43,7 @@ def names(world: Literal["md", "ball"] | None = None) -> list[str]:
 
 
 def world_of(name: Any) -> str:
-    """Return "ball" if an object or an unvalidated file describes a bouncing ball, otherwise "md".
+    """Return "ball" for a bouncing-ball system, otherwise "md"; the system file is not validated.
 
     Raises:
         InputError: no system has this name.
@@ -300,7 +300,7 @@ class BallSystem:
 
 
 def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> BallSpec:
-    """Change some keys in the tables of a system, and return the validated tables.
+    """Change the values of some keys of a system, and return the validated tables of the system file.
 
     Raises:
         InputError: the changed system cannot be run.

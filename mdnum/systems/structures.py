@@ -276,7 +276,7 @@ def repeats(cell: Cell, r_list: float) -> str:
 
 
 def smallest_distance(kind: str, units: str, sigmas: Sequence[float] = ()) -> float:
-    """Return the smallest distance that two atoms with this potential may have, in length units."""
+    """Return the smallest distance of two atoms that is allowed for this potential, in length units."""
     if kind == "soft-sphere":
         # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
         return 1e-9

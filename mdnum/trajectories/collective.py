@@ -94,7 +94,7 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
 
     Rippled sheets may become flat, and bent chains may become straight, in a correct file. A collapse is
     reported only if, in earlier frames, the sheet or chain was thicker than the distance between neighboring
-    atoms. For a constant coordinate, a thickness above a fifth of the largest extent suffices for a report.
+    atoms. If all atoms share a coordinate, the thickness must only exceed a fifth of the largest extent.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):

@@ -251,7 +251,7 @@ def _hand_on(
 
 
 def _threshold(rule: Rule, members: Members) -> tuple[float, bool]:
-    """Return a typical threshold distance, and True if most atoms have the largest number of neighbors."""
+    """Return a typical threshold distance, and whether most atoms have the maximum number of neighbors."""
     if isinstance(rule, CutoffRule | SpeciesCutoffs):
         return rule.reach, False
     if not len(members):
@@ -486,7 +486,7 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 def _apart(
     found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
 ) -> tuple[Separation, float]:
-    """Return the distances of atoms between frames of two files, without a common shift, and an error bound.
+    """Return each atom's distance between two files after removing a common shift, and an error bound.
 
     A shift common to all atoms is removed only if it explains nearly all of these distances. Such a shift can
     result from different origins of two files, or from removal of center-of-mass motion in one file.
@@ -545,7 +545,7 @@ def _sets_at(
 
 
 def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return growth rates of the distance between files, before and after neighbor sets first differ."""
+    """Return growth rates of the distance between two runs, before and after neighbor sets first differ."""
     cutoff, furthest = isinstance(one.rule, CutoffRule), float(table["furthest"].max(initial=0.0))
     limit = 0.1 * (one.rule.reach if cutoff else furthest)
     cut = frames if one.first is None else one.first["frame"]

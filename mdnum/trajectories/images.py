@@ -39,7 +39,7 @@ def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
 
 
 def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
-    """Return the lattice shift of an image of j, which is at x[j] + shift @ box; `rank` images are nearer.
+    """Return the lattice shift of an image of j, at x[j] + shift @ box; `rank` images of j are nearer to i.
 
     ASE, vesin and jax-md define shifts in the same way. For images of an atom itself, the returned shift has
     a positive first nonzero component.

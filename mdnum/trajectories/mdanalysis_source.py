@@ -252,7 +252,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factors(trajectory: Any) -> tuple[float, float]:
-    """Return two ratios of time steps in a DCD file: stored / MDAnalysis's value, byte-swapped / stored."""
+    """Return two ratios of DCD time steps: stored / MDAnalysis's value, and byte-swapped / stored value."""
     read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
     if not read:
         return 1.0, math.nan

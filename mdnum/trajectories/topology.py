@@ -191,7 +191,7 @@ class Topology:
 
 
 def topology_universe(topology: str | Path) -> Any:
-    """Return an MDAnalysis Universe of a topology, without coordinates (a reader might write index files).
+    """Return an MDAnalysis Universe of a topology file, without coordinates; no index file is written.
 
     Raises:
         InputError: MDAnalysis cannot read the file.
@@ -205,7 +205,7 @@ def topology_universe(topology: str | Path) -> Any:
 
 
 def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
-    """Return the number of atoms in a trajectory, or None; some formats need the topology's atom count."""
+    """Return the number of atoms in a trajectory; None if neither the file nor the topology gives it."""
     from MDAnalysis.core._get_readers import get_reader_for
 
     for known in ({}, {"n_atoms": topology}):

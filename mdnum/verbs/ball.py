@@ -143,7 +143,7 @@ def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun,
 def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return summary entries (loss, derivatives, variants) and a table of variants' height differences."""
+    """Return summary entries (loss, derivatives, variants) and a table of height differences of variants."""
     from mdnum.ball.rollout import first_difference
     from mdnum.verbs import ball_record
 

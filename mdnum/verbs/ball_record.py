@@ -142,7 +142,7 @@ def heights(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
-    """Return a table with the largest height difference between a variant and the run at each step."""
+    """Return a table with the largest height difference between a variant and the main run at each step."""
     size = len(found.separation)
     return {"variant": np.full(size, name), "step": np.arange(size), "separation": found.separation}
 
@@ -182,7 +182,7 @@ def compared(
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Return the step and decision at which a variant diverges from the run, and the variant's gradient.
+    """Return the step and decision at which a variant and the run diverge, and the variant's gradient.
 
     Args:
         found: the difference between the two runs.
@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step; for one solver per ball, of the ball of smallest |margin|."""
+    """Residual and stop margin of each step; for separate solvers, of the ball with smallest |margin|."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

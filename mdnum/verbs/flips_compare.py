@@ -131,7 +131,7 @@ class ComparisonView(FlipsView):
 
     @property
     def largest(self) -> tuple[str, str]:
-        """Largest distance between an atom's two positions, and the distance that rounding can explain."""
+        """Largest distance between an atom's positions in both files, and how much rounding can explain."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
@@ -248,14 +248,14 @@ def _evidence(view: ComparisonView) -> Iterator[str]:
 
 
 def _certain(one: Mapping[str, Any]) -> str:
-    """Return when neighbor sets certainly differ: at their first difference, later, or never."""
+    """Tell when neighbor sets differ by more than rounding: at their first difference, later, or never."""
     if one["first"]["pairs"] > one["first"]["ambiguous"]:
         return "some"
     return "never" if one["certain"] is None else "later"
 
 
 def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
-    """Classify which quantity differed first: positions, boxes or neighbor sets."""
+    """Return which quantity differed first: positions, boxes or neighbor sets."""
     at, beyond, certain = one["first"]["frame"], view.summary["beyond"], one["certain"]
     if beyond is not None and beyond < at:
         return "positions"

@@ -40,7 +40,7 @@ def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
 
 
 def stem(trajectory: Trajectory) -> str:
-    """Return the default stem of an output folder's name, from the name of a trajectory or of its run."""
+    """Return the first part of an output folder's default name: the name of the trajectory or of its run."""
     name = trajectory.path.name.split(".")[0]
     return trajectory.path.resolve().parent.name if name == "trajectory" else name
 

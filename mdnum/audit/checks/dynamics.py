@@ -51,8 +51,8 @@ class DynamicsCheck(AuditCheck):
     """Is the energy conserved in a short run at constant energy, and if not, why?
 
     The check reports the energy drift, its standard error, and the drifts due to integrator, flips and other
-    causes. The drift that flips and the work of the forces do not explain is due to the integrator. At half
-    the time step, the integrator's drift must fall to a quarter; a second run tests this.
+    causes. The drift that is explained neither by flips nor by the work of the forces is attributed to the
+    integrator. At half the time step, the integrator's drift must fall to a quarter; a second run tests this.
     """
 
     name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
@@ -113,7 +113,7 @@ class DynamicsCheck(AuditCheck):
 
 
 def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor) -> tuple[float, float]:
-    """Recompute energies of a run with new calculators; return the largest change and its limit, eV."""
+    """Recompute a run's energies with new calculators; return their largest change and its limit, in eV."""
     places = np.unique(np.linspace(0, len(ran.potential) - 1, count).astype(int))
     again = [subject.fresh().energy(ran.at(ran.positions[n])) for n in places]
     rounding = NoiseFloor(np.finfo(float).eps * largest(ran.potential), 0.0)

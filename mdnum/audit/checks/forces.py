@@ -72,16 +72,16 @@ class Slope:
 
     @property
     def agrees(self) -> bool:
-        """True if force and finite difference agree within the error of the finite difference."""
+        """True if the force agrees with the finite difference of the energy within its estimated error."""
         return self.gap <= _SIGNIFICANT * self.error
 
 
 class ForcesCheck(AuditCheck):
-    """Are the forces minus the gradient of the energy, and of which energy?
+    """Are the forces minus the gradient of the energy, and is this energy `energy` or `free_energy`?
 
-    The slope of the energy is a finite difference D(h). Its error is estimated as |D(h) - D(h/4)| plus noise
-    divided by h. Of nine steps h, the one with the smallest error is used. If the deviation of a finite
-    difference from the force grows like 1/h, the check reports a jump of the energy and not a wrong force.
+    The slope of the energy is a finite difference D(h). Its error is estimated as |D(h) - D(h/4)| plus
+    noise/h. Of nine steps h, the one with the smallest error is used. If the deviation of a finite difference
+    from the force is proportional to 1/h, the check reports a jump of the energy, not a wrong force.
     """
 
     name, title, order, basic, calls = "forces", "Forces", 10, True, 500
@@ -199,7 +199,7 @@ def _worst(slopes: list[Slope]) -> Slope:
 
 
 def _directions(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Displacement]]:
-    """Yield displacement directions: random for all atoms, and along each axis for a few single atoms."""
+    """Yield random displacements of all atoms, and displacements of a few single atoms along each axis."""
     for number in range(_DIRECTIONS):
         yield f"all atoms at random, {number + 1}", direction(len(atoms), rng)
     for who in sorted(rng.permutation(len(atoms))[:_ATOMS]):
@@ -257,7 +257,7 @@ def slope(
 def _best(
     gaps: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
 ) -> tuple[int, float]:
-    """Find the most accurate finite difference that other step lengths confirm; return its index and error.
+    """Find the most accurate finite difference that other steps confirm; return its index and its error.
 
     If the energy jumps at flips, finite differences with two step lengths may by chance contain the same
     jumps, and agree on a wrong slope. A wrong force, in contrast, causes equal deviations for all

@@ -269,7 +269,7 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice that can set the summation method of both runs; they must agree if order has no effect."""
+    """A choice that can set how both runs compute sums; the runs must agree if the order has no effect."""
 
     worlds = ("md",)
     both: str | None = None  # reduction of both runs; None for the system's own

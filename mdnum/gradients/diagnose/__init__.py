@@ -1,8 +1,8 @@
 """Diagnose a simulation's gradient: up to which step it can be trusted, and what contributes to it.
 
 Gradient methods compute different quantities: derivatives of the time steps, derivatives that include changes
-of flip times, slopes of the loss between shifted runs, slopes of an average, or derivatives of another
-program. The function `agreement` gives the reason for each difference between two gradients.
+of flip times, finite differences of the loss, finite differences of an ensemble average, or derivatives of
+another program. The function `agreement` gives the reason for each difference between two gradients.
 """
 
 from __future__ import annotations

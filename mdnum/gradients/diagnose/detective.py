@@ -41,7 +41,7 @@ _PARTS = (
 
 @dataclass(frozen=True)
 class NotFinite:
-    """The step, the operation and the pair at which numbers in a reverse pass become infinite or NaN."""
+    """The step, operation and pair of atoms at which numbers in a reverse pass become infinite or NaN."""
 
     found: bool = False  # whether it does at all
     forward: bool = True  # whether the forward run, its loss included, is finite
@@ -66,7 +66,7 @@ def detective(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> NotFinite:
-    """Find the first step, operation and pair for which a result of the reverse pass is not finite.
+    """Find the first step, operation and pair of atoms for which a result of the reverse pass is not finite.
 
     Args:
         problem: the loss of a rollout of a pair potential.
@@ -152,7 +152,7 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 def _pair(
     back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
-    """Return the atoms and distance of the pair to which a result belongs; -1, -1, NaN if there is none."""
+    """Return the atoms and distance of the pair of atoms to which a result belongs, or -1, -1, NaN."""
     nowhere = (-1, -1, float("nan"))
     if made is None or not made.index:
         return nowhere

@@ -1,9 +1,9 @@
 """Growth of a gradient and of perturbations with the number of steps, and overflow in narrow formats.
 
-The cotangent of the state h steps before the end is the gradient of a run of h steps (horizon h) from this
-state. One reverse pass over T steps therefore gives gradients for all horizons up to T. Each gradient belongs
-to a different start on the same trajectory. Cotangents of a chaotic run span many powers of two. Scaling the
-loss helps if all cotangents are small, but not if their range exceeds that of the narrow format.
+The cotangent of the state h steps before the last step is the gradient of a run of h steps (horizon h) from
+this state. One reverse pass over T steps therefore gives gradients for all horizons up to T. Each gradient
+belongs to a different start on the same trajectory. Cotangents of a chaotic run span many powers of two.
+Scaling the loss helps if all cotangents are small, but not if their range exceeds that of the narrow format.
 
 The largest singular value of a run's Jacobian bounds the gradient of any loss of the last state. Singular
 values are computed by subspace iteration with a random block of vectors (Halko, Martinsson and Tropp 2011).
@@ -397,7 +397,7 @@ def spectrum(
 ) -> Spectrum:
     """Compute singular values of the Jacobian of the whole run, and finite-time Lyapunov exponents.
 
-    Decisions are fixed to the recorded decisions, so the effect of flips on perturbations is not included.
+    Pair decisions are kept as recorded, so the effect of flips on perturbations is not included.
 
     Args:
         values: number of singular values. extra: additional vectors, for faster convergence.

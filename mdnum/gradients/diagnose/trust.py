@@ -60,7 +60,7 @@ TRUSTED, LIMITED, UNDECIDED = "trusted", "limited", "undecided"
 
 
 class Shorter(Loss):
-    """A loss evaluated for several runs that start together and end at different steps (horizons)."""
+    """A loss evaluated for several runs with the same initial state and different last steps (horizons)."""
 
     name = "shorter"
     inner: Loss = eqx.field(kw_only=True)  # the loss
@@ -133,7 +133,7 @@ class Horizons:
 
 
 def spread(problem: Problem, points: int) -> Int[np.ndarray, "points"]:
-    """Return evenly spaced horizons up to the length of the run, each with at least one frame of the loss."""
+    """Return evenly spaced horizons, in steps, up to which the loss uses at least one frame of the run."""
     steps = np.unique(np.round(np.linspace(0, problem.steps, points + 1)).astype(np.int64))[1:]
 
     def looks(h: int) -> bool:
@@ -246,11 +246,11 @@ class Trust(Judgment):
 
 
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
-    """Return a simulation that rounds differently, and the formats in use that are narrower than float64.
+    """Return a simulation that rounds differently, and the given simulation's formats narrower than float64.
 
-    If the given run uses formats narrower than float64, the run for comparison is in float64. No hardware
-    format is wider than float64. A float64 run is therefore compared with one whose initial state is shifted
-    by one rounding error. The shift shows how rounding affects the gradient, up to a factor of order one.
+    A run in formats narrower than float64 is compared with a float64 run. No hardware format is wider than
+    float64. A float64 run is therefore compared with one whose initial state is shifted by one rounding
+    error. The shift of the state shows how rounding affects the gradient, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -475,7 +475,7 @@ def _missed(
 
 
 def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
-    """Return contributions to a derivative as fractions of it, and their cumulative root sum of squares."""
+    """Return contributions divided by the derivative, and the cumulative root of the sum of their squares."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
         share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))
@@ -486,7 +486,7 @@ def _left_out(
     made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
     tolerance: float,
 ) -> Limit | None:  # fmt: skip
-    """Return a limit of trust if grazing flips or loss jumps, which gradients omit, contribute too much."""
+    """Return a limit of the trust horizon if grazing flips or jumps of the loss contribute too much."""
     tape, met = made.tape, made.crossings[::-1]
     energy, virial, speed, weight, slow = (
         joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")
@@ -528,7 +528,7 @@ def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "poi
 def last_below(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the last horizon before two successive values exceed a limit, and whether such values exist.
+    """Return the last horizon before two successive errors exceed a limit, and whether such errors exist.
 
     A single value beyond the limit is ignored (except at the last horizon), because relative errors are large
     where a gradient changes sign.
@@ -544,11 +544,11 @@ def last_below(
 def last_agreeing(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the longest horizon at which all values are below a limit, and whether a longer horizon exists.
+    """Return the longest horizon at which all errors are below a limit, and whether a longer horizon exists.
 
-    Disagreement of two gradients at shorter horizons is ignored. The relative error due to the time step may
-    decrease again, and a single flip among few may contribute a large part of the gradient. If two gradients
-    agree at one horizon, but not at adjacent horizons, the agreement is regarded as chance.
+    Disagreement of two gradients at shorter horizons is ignored. At longer horizons, the relative error due
+    to the time step may decrease, and a flip may contribute a smaller part. If two gradients agree at one
+    horizon, but not at adjacent horizons, the agreement is regarded as chance.
     """
     within = np.max(np.stack(list(values.values())), axis=0) <= limit
     if len(within) > 1:
@@ -558,7 +558,7 @@ def last_agreeing(
 
 
 def ambiguity(problem: Problem) -> Limit:
-    """Find the first decision of the run whose margin is smaller than its rounding bound."""
+    """Find the first decision of the run that is closer to its threshold than its rounding error bound."""
     recorder = PairRecorder(problem.simulation)
     for segment in Engine(problem.simulation, problem.steps).segments():
         close = recorder.doubtful(segment)

@@ -384,7 +384,7 @@ class Failed:
 class CaseAnswers:
     """Results of all test cases by case number, and failures reduced to a few atoms.
 
-    Test cases are not stored, because a resumed examination draws the same test cases from the same seed.
+    Test cases are not stored, because a resumed test generates the same test cases from the same seed.
     """
 
     cases: dict[str, CaseResult] = field(default_factory=dict)
@@ -437,7 +437,7 @@ class AreaTally:
 
     @property
     def silent(self) -> int:
-        """Number of failed test cases for which the neighbor list returned no pairs."""
+        """Number of failed test cases in which the neighbor list crashed, raised an error or timed out."""
         return sum(self.codes.get(code, 0) for code in SILENT)
 
     @property

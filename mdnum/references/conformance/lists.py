@@ -1,4 +1,4 @@
-"""Conversion of functions and classes to neighbor lists under test, with declared limits."""
+"""Convert functions and classes to neighbor lists that can be tested, with declared limits."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _WANTED = f"Give a function of ({', '.join(_GIVEN)}) that returns (i, j)"
 
 @dataclass(frozen=True)
 class ListLimits:
-    """Limits of a neighbor list; test cases beyond these limits are skipped and counted."""
+    """Limits on the inputs of a neighbor list; test cases beyond these limits are skipped and counted."""
 
     minimum_image: bool = False  # one image of a pair at most: no cell narrower than two cutoffs (and skins)
     orthorhombic: bool = False  # no cell with other than right angles
@@ -73,7 +73,7 @@ class ListLimits:
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
-        """Yield (whether a test case exceeds a limit, name of the limit), cheap checks first."""
+        """Yield, for each limit, whether a test case exceeds it, and the limit's name; cheap checks first."""
         pbc, cells = np.array(case.pbc), [still.cell for still in case.stills]
         least = min(len(still.positions) for still in case.stills)
         yield least < self.atoms, f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"

@@ -32,7 +32,7 @@ Failures = Callable[[Case], Sequence[Failure]]
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
     """Return the smallest test case tried before the deadline that fails with the same error code.
 
-    `failures` runs a test case and returns its failures; an updatable list is created anew for each test.
+    `failures` runs a test case and returns its failures; each time, it creates an updatable list anew.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)
@@ -73,7 +73,7 @@ def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None)
 
 
 def _only(case: Case, atoms: list[int]) -> Case:
-    """Return the test case with only the given atoms, and without stored pairs for up to 400 atoms."""
+    """Return the test case with only the given atoms; stored exact pairs are removed for up to 400 atoms."""
     smaller = case.only(np.array(atoms, int))
     return replace(smaller, known=None) if len(atoms) <= 400 else smaller
 
@@ -130,8 +130,8 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 def deepest(failures: Failures, failed: Failed) -> Failed:
     """Move the two atoms of a missing pair closer together as long as the list still omits the pair.
 
-    All atoms move further along their displacement from the first to the second call. The reported failure
-    then shows the smallest distance at which the list omits the pair.
+    All atoms move further along their displacement between the first and the second call of the neighbor
+    list. The reported failure then shows the smallest distance at which the list omits the pair.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
